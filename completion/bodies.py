@@ -42,6 +42,15 @@ class FixedBody:
         people = human_poses(self.template, self.skeleton, PEOPLE, np.random.default_rng(0))
         return self.pose_examples if people is None else np.concatenate([self.pose_examples, people])
 
+    def joints_from_known(self, pose: np.ndarray) -> np.ndarray:
+        """(J,) radians by which each joint of a pose (J, 3) is turned from the nearest known one; 0 for the root."""
+        if not len(self.known_poses):
+            return np.zeros(len(pose))
+        turns = np.swapaxes(rotations.exp(self.known_poses), -1, -2) @ rotations.exp(pose)
+        away = np.linalg.norm(rotations.log(turns), axis=-1).min(axis=0)
+        away[0] = 0
+        return away
+
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pose (..., J, 3), trans (..., 3) and betas (..., K)."""
         n = self.n_angles

@@ -2,32 +2,41 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from model.linear import Subject
+from scanprep.decimation.registered_set import decimate_set
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import Camera, look_around, upright
-from scanprep.pictures.shading import Dots, Shape, Solid, render, side_by_side
-from scanprep.pictures.sheets import gif_bytes
+from scanprep.pictures.camera import Camera, look_around, stance
+from scanprep.pictures.scene import Pane, picture_pane
+from scanprep.pictures.shading import Dots, Moving, Shape, Solid, render, side_by_side
 
 from .motion import Motion, spread_frames
 
-MARKER = (0.85, 0.25, 0.2)
+MARKER, LOST = (0.85, 0.25, 0.2), (0.78, 0.78, 0.78)
+LIGHT = 7000                         # triangles of a body in small pictures and in motion
+PLAYED, MOST_PLAYED = 30, 2000       # frames a second, and in all, that a page plays
+AT_ONCE = 128                        # frames made at a time
 TURN = 35.0                          # degrees from the front of the body where the camera stands
 
 
-def facing(subject: Subject, pose: np.ndarray, vertices: np.ndarray, turn: float = TURN) -> Camera:
-    """A camera that sees a posed body (N, 3) from so many degrees beside its front, wherever it faces."""
-    up, front = upright(subject.template)
-    across = [(up + 1) % 3, (up + 2) % 3]
-    ahead = np.zeros(3)
-    ahead[across] = np.cos(np.radians(front)), np.sin(np.radians(front))
-    now = (rotations.exp(pose[0]) @ ahead)[across]
-    return Camera.around(vertices, azimuth=float(np.degrees(np.arctan2(now[1], now[0]))) + turn, up=up)
+def upwards(motion: Motion, subject: Subject) -> np.ndarray:
+    """(3,) what is up in a motion."""
+    return stance(subject.template, rotations.exp(motion.poses[:, 0]))[0]
+
+
+def facing(subject: Subject, pose: np.ndarray, vertices: np.ndarray, turn: float = TURN,
+           vertical: np.ndarray | None = None) -> Camera:
+    """A camera that sees a body (..., 3) from so many degrees beside its front, wherever it faces and whatever is up.
+
+    `pose` (..., J, 3) is the body's, or all of its motion; for one frame of a motion `vertical` is what is up in it.
+    """
+    return look_around(subject.template, vertices, (turn,), rotations.exp(pose[..., 0, :]), vertical)[0]
 
 
 def worst_frames(motion: Motion, count: int) -> np.ndarray:
@@ -46,17 +55,79 @@ def frames_apart(frames: np.ndarray, count: int, apart: float) -> np.ndarray:
     return np.sort(found).astype(int)
 
 
-def picture_frames(motion: Motion, subject: Subject, markers: np.ndarray | None,
-                   frames: int | np.ndarray = 8, height: int = 360, turn: float = TURN) -> np.ndarray:
-    """Some frames, or so many of them, side by side, the measured markers (T, L, 3), metres, as dots."""
-    images = []
-    frames = spread_frames(len(motion.poses), frames) if isinstance(frames, int) else frames
-    for t, vertices in zip(frames, motion.vertices(subject, frames), strict=True):
-        shapes: list[Shape] = [subject.template.with_vertices(vertices)]
+@dataclass(frozen=True, eq=False)
+class LightMesh:
+    """Some of the vertices (n,) of a body and triangles (f, 3) between them, for small pictures and for motions."""
+
+    vertex_ids: np.ndarray
+    faces: np.ndarray
+
+    @staticmethod
+    def of(template: Mesh) -> LightMesh:
+        """At most `LIGHT` triangles; of a body that has no more its own."""
+        if len(template.faces) <= LIGHT:
+            return LightMesh(np.arange(len(template.vertices)), template.faces)
+        small = decimate_set(template, None, LIGHT)
+        return LightMesh(small.vertex_map, small.template.faces)
+
+    def mesh(self, vertices: np.ndarray) -> Mesh:
+        """The small mesh of a large one's vertices (N, 3)."""
+        return Mesh(vertices[self.vertex_ids], self.faces)
+
+
+Bodies = Callable[[np.ndarray], np.ndarray]            # frames (n,) -> vertices (n, N, 3), metres
+
+
+def played(motion: Motion) -> tuple[np.ndarray, float]:
+    """The frames that a page plays, and how many a second."""
+    step = max(1, round(motion.rate / PLAYED), -(-len(motion.poses) // MOST_PLAYED))
+    return np.arange(0, len(motion.poses), step), motion.rate / step
+
+
+def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.ndarray]] = (),
+                bodies: Bodies | None = None, light: LightMesh | None = None, label: str = "",
+                color: Sequence[float] | None = None) -> Pane:
+    """A body in motion with dots at places (n, L, 3) in the frames `played`; it stays in the middle of the picture.
+
+    Lost frames are grey. `bodies` says what it looks like, if not as the subject.
+    """
+    frames, rate = played(motion)
+    light = light or LightMesh.of(subject.template)
+    make = bodies or (lambda some: motion.vertices(subject, some))
+    shown = np.concatenate([make(frames[i:i + AT_ONCE])[:, light.vertex_ids].astype(np.float32)
+                            for i in range(0, len(frames), AT_ONCE)])
+    vertical = upwards(motion, subject)
+    middle = shown.mean(axis=1, keepdims=True) * (1 - np.abs(vertical)).astype(np.float32)
+    shown -= middle
+    first, lost = Mesh(shown[0].astype(float), light.faces), ~motion.converged[frames]
+    shapes: list[Moving] = []
+    for mask, name, look in ((~lost, "body", color), (lost, "lost frames", LOST)):
+        if mask.any():
+            seen = shown if mask.all() else np.where(mask[:, None, None], shown, np.float32(np.nan))
+            shapes.append(Moving(Solid(first, look, name=name), seen, rate))
+    shapes += [Moving(replace(these, points=(at - middle)[0]), at - middle, rate) for these, at in dots]
+    camera = facing(subject, motion.poses, shown[:: max(1, len(shown) // 50)].reshape(-1, 3))
+    return Pane(shapes, camera, label)
+
+
+def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray | None, frames: np.ndarray, turn: float = TURN
+                ) -> list[Pane]:
+    """Some frames, the measured markers (T, L, 3), metres, as dots."""
+    panes, light, vertical = [], LightMesh.of(subject.template), upwards(motion, subject)
+    for t, vertices, told in zip(frames, motion.vertices(subject, frames), seconds(motion, frames), strict=True):
+        shapes: list[Shape] = [light.mesh(vertices)]
         if markers is not None:
             shapes.append(Dots(markers[t], MARKER, radius=0.013))
-        images.append(render(shapes, facing(subject, motion.poses[t], vertices, turn), int(0.62 * height), height))
-    return side_by_side(images, seconds(motion, frames))
+        panes.append(Pane(shapes, facing(subject, motion.poses[t], vertices, turn, vertical), told))
+    return panes
+
+
+def picture_frames(motion: Motion, subject: Subject, markers: np.ndarray | None, count: int = 8, height: int = 360,
+                   turn: float = TURN) -> np.ndarray:
+    """So many frames side by side, each as large as fits, the measured markers (T, L, 3), metres, as dots."""
+    panes = frame_panes(motion, subject, markers, spread_frames(len(motion.poses), count), turn)
+    return side_by_side([picture_pane(pane, int(0.62 * height), height) for pane in panes],
+                        [pane.label for pane in panes])
 
 
 def seconds(motion: Motion, frames: np.ndarray) -> list[str]:
@@ -67,12 +138,14 @@ def seconds(motion: Motion, frames: np.ndarray) -> list[str]:
 def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, colors: np.ndarray | None = None,
                     height: int = 360, turn: float = TURN) -> list[np.ndarray]:
     """Pictures of bodies (n, N, 3) in poses (n, J, 3), all of one scale; `colors` (n, N, 3) of their vertices."""
-    size, up = 1.06 * np.ptp(bodies, axis=1).max(axis=0) / 2, upright(subject.template)[0]
-    floor, images = bodies[..., up].min(), []
+    size, images = 1.06 * np.ptp(bodies, axis=1).max(axis=0) / 2, []
+    vertical = stance(subject.template, rotations.exp(poses[:, 0]))[0]
+    up, sign = int(np.abs(vertical).argmax()), vertical.sum()
+    floor = sign * (sign * bodies[..., up]).min()
     for i, body in enumerate(bodies):
         middle = (body.min(axis=0) + body.max(axis=0)) / 2
-        middle[up] = floor + size[up] / 1.06                        # all on one line
-        camera = facing(subject, poses[i], np.stack([middle - size, middle + size]), turn)
+        middle[up] = floor + sign * size[up] / 1.06                        # all on one line
+        camera = facing(subject, poses[i], np.stack([middle - size, middle + size]), turn, vertical)
         images.append(render(Solid(subject.template.with_vertices(body), None if colors is None else colors[i]), camera,
                              int(0.62 * height), height))
     return images
@@ -84,28 +157,6 @@ def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames:
     chosen = spread_frames(len(frames), count)
     return side_by_side(bodies_in_a_row(subject, motion.poses[frames[chosen]], bodies[chosen]),
                         seconds(motion, frames[chosen]))
-
-
-def animated_picture(motion: Motion, subject: Subject, rate: float = 15.0, most: float = 2.4) -> bytes:
-    """The motion as an endless GIF, at most so many seconds of it, the camera following the body."""
-    span = max(1, min(len(motion.poses), round(most * motion.rate)))
-    frames = np.arange(0, span, max(1, round(motion.rate / rate)))
-    return moving_picture(motion.vertices(subject, frames), subject, motion.rate * len(frames) / span)
-
-
-def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int = 300, height: int = 400,
-                   faces: np.ndarray | None = None, pose: np.ndarray | None = None) -> bytes:
-    """Meshes (n, N, 3) as an endless GIF of `rate` pictures a second, the camera following them over the ground.
-
-    `faces` are theirs, if not the subject's; a body in `pose` (J, 3) is seen from its front, else as at rest.
-    """
-    centred = bodies - bodies.mean(axis=1, keepdims=True)
-    up, _ = upright(subject.template)
-    centred[..., up] = bodies[..., up]
-    camera = look_around(subject.template, centred, (int(TURN),))[0] if pose is None else \
-        facing(subject, pose, centred.reshape(-1, 3))
-    faces = subject.template.faces if faces is None else faces
-    return gif_bytes([render(Mesh(v, faces), camera, width, height, ground=True) for v in centred], rate)
 
 
 def mean_over(values: np.ndarray, axis: int) -> np.ndarray:

@@ -1,31 +1,33 @@
 """Pictures of a model: its parts and joints, and what its shape components do."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import look_around
-from scanprep.pictures.shading import Bones, Dots, Shape, Solid, part_colors, render, side_by_side
+from scanprep.pictures.scene import Pane, picture_panes
+from scanprep.pictures.shading import Bones, Dots, Shape, Solid, part_colors
 from scanprep.skeleton.tree import Skeleton
 
 from .body import BodyModel
 
 
+def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
+    """Parts in colour, then joints and bones inside a transparent body."""
+    camera, = look_around(template, turns=(15,))
+    return [Pane([Solid(template, part_colors(skeleton.part_of_face))], camera, f"{len(skeleton.parents)} parts"),
+            Pane(_joints_inside(template, skeleton.joints, skeleton), camera, "joints")]
+
+
 def picture_parts(template: Mesh, skeleton: Skeleton, height: int = 640) -> np.ndarray:
-    """Parts in colour from the front and the back, then joints and bones inside a transparent body."""
-    front, _, back, _ = look_around(template)
-    width = int(height * front.width / front.height) + 20
-    colored = Solid(template, part_colors(skeleton.part_of_face))
-    inside = _joints_inside(template, skeleton.joints, skeleton)
-    images = [render(colored, front, width, height), render(colored, back, width, height),
-              render(inside, front, width, height)]
-    return side_by_side(images, [f"{len(skeleton.parents)} parts, front", "back", "joints"])
+    """Parts and joints from the front, and the parts from the back."""
+    panes, (back,) = parts_panes(template, skeleton), look_around(template, turns=(195,))
+    return picture_panes([*panes, replace(panes[0], camera=back, label="back")], height)
 
 
-def picture_components(model: BodyModel, count: int = 4, deviations: float = 2.0, height: int = 420,
-                       tell: Callable[[int, int], None] | None = None, columns: int | None = None) -> np.ndarray:
+def component_panes(model: BodyModel, count: int = 4, deviations: float = 2.0) -> list[Pane]:
     """The mean person, then the first components at minus and plus some standard deviations.
 
     [SCAPE] Eq. 7
@@ -39,13 +41,15 @@ def picture_components(model: BodyModel, count: int = 4, deviations: float = 2.0
     bodies = [model.template.with_vertices(model.vertices(np.zeros((J, 3)), betas, np.zeros(3)))
               for _, betas in wanted]
     camera = look_around(bodies[0], np.stack([b.vertices for b in bodies]))[0]
-    width = int(height * camera.width / camera.height) + 10
-    images = []
-    for i, body in enumerate(bodies):
-        images.append(render(body, camera, width, height))
-        if tell:
-            tell(i + 1, len(bodies))
-    return side_by_side(images, [name for name, _ in wanted], columns=columns)
+    return [Pane([body], camera, name) for body, (name, _) in zip(bodies, wanted, strict=True)]
+
+
+def picture_components(model: BodyModel, height: int = 420) -> np.ndarray:
+    """What `component_panes` show.
+
+    [SCAPE] Eq. 7
+    """
+    return picture_panes(component_panes(model), height)
 
 
 def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np.ndarray:
@@ -59,12 +63,10 @@ def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np
     poses = examples[chosen].reshape(-1, *rest.shape)
     poses[:, 0] = 0
     bodies = model.vertices(poses, np.tile(betas, (len(poses), 1)))
-    camera = look_around(body)[0]
-    width = int(height * camera.width / camera.height) + 10
-    images = [render(Solid(body, part_colors(skeleton.part_of_face)), camera, width, height),
-              render(_joints_inside(body, joints, skeleton), camera, width, height)]
-    images += [render(model.template.with_vertices(v), look_around(body, v, (35,))[0], width, height) for v in bodies]
-    return side_by_side(images, ["parts", "joints", *[f"pose {k + 1}" for k in range(len(poses))]])
+    panes = [*parts_panes(body, replace(skeleton, joints=joints)),
+             *(Pane([model.template.with_vertices(v)], look_around(body, v, (35,))[0], f"pose {k + 1}")
+               for k, v in enumerate(bodies))]
+    return picture_panes(panes, height)
 
 
 def _joints_inside(body: Mesh, joints: np.ndarray, skeleton: Skeleton) -> list[Shape]:

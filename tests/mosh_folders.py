@@ -15,9 +15,10 @@ from config_files import config_file
 
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.mosh import cli, pictures, report
+from completion.mocap.mosh import cli
 from completion.mocap.mosh.work import Work
 from scanprep.batch.workspace import HOME
+from scanprep.pictures import scene
 from scanprep.pictures.page import Page
 
 FRAMES = 40
@@ -70,7 +71,7 @@ def run(place, *words, **settings):
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (report, pictures, motion_pictures):
+        for module in (scene, motion_pictures):
             patch.setattr(module, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 

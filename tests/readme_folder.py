@@ -4,6 +4,8 @@ import re
 import shlex
 import shutil
 from pathlib import Path
+from unittest.mock import patch
+from urllib.request import urlopen
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from completion.__main__ import main
 from model import load_model
 from scanprep import write_mesh
 from scanprep.synthetic.data_set import read_views
+from scanprep.viewer import server
 
 ROOT = Path(__file__).parents[1]
 SET_UP = {"pip install . && scape demo", 'pip install ".[test]" && pytest'}
@@ -34,7 +37,14 @@ def run_commands(readme):
         words = shlex.split(line)
         assert words[0] == "scape"
         words = ["own.ply" if w == "template.ply" and "views" in words else w for w in words]    # it is there already
-        assert main(words[1:]) == 0, line
+        with patch.object(server, "serve", opened_once):
+            assert main(words[1:]) == 0, line
+
+
+def opened_once(app, *_given):
+    """In place of a server that runs until Ctrl-C: one that a browser asks once for its page."""
+    with server.Server(app) as running, urlopen(running.opening()) as answer:
+        assert answer.status == 200 and b"scapekit.start" in answer.read()
 
 
 def user_folder(demo, folder):

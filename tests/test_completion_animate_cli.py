@@ -7,12 +7,12 @@ from completion_bodies import MEAN, worm_with_prior
 from config_files import config_file
 from glb_reader import Glb
 
-from completion import motion_pictures
 from completion.__main__ import main
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.files.motion_files import write_glb
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
+from scanprep.pictures import scene
 
 FRAMES = 30
 BETAS = np.array([0.9, -0.6, 0.4])
@@ -24,7 +24,7 @@ WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joi
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motion_pictures, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        patch.setattr(scene, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 
 

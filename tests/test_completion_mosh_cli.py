@@ -8,12 +8,13 @@ import pytest
 from completion_bodies import worm_with_prior
 from glb_reader import Glb
 from mosh_folders import FRAMES, run, small_pictures, write_people
+from scene_reader import scenes_of
 
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
-from completion.mocap.mosh.pictures import every
 from completion.mocap.mosh.recordings import Grouping, find_actors
 from completion.mocap.mosh.takes import held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
+from completion.motion_pictures import played
 from model.learning.sexes import SexPlane
 
 PERSON = {"subject.json", "layout.json", "report.html", "report.json", "picture.png"}
@@ -125,6 +126,13 @@ def test_pages_lead_to_each_other_and_tell_the_markers(done):
     assert 'href="walk/report.html"' in person and "Markers before and after" in person and ">M33<" in person
     take = (done / "ann" / "walk" / "report.html").read_text()
     assert "M7 (held out)" in take and "Soft tissue" in take and "Marker artefacts" in take
+    worn = scenes_of(person)[0].layer("markers as found")
+    assert "M33" in {label.split(":")[0] for label in worn["labels"]}
+    moving = scenes_of(take)[0]
+    motion = Motion.load(done / "ann" / "walk" / "motion.npz")
+    assert moving.layer("body")["motion"]["frames"] == len(played(motion)[0])
+    seen = np.isfinite(moving.frames(moving.layer("held-out markers"))).all(axis=2).any(axis=0)
+    assert [moving.layer("held-out markers")["labels"][i] for i in np.flatnonzero(seen)] == ["M7", "M9"]
 
 
 def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
@@ -201,9 +209,12 @@ def test_a_table_says_who_is_who(tmp_path, ending):
     assert names(found) == {"u": ["2", "x_1"], "v": ["y_1"]}
 
 
-@pytest.mark.parametrize("count, step", [(1, 1), (56, 1), (57, 2), (280, 5), (494, 10), (2751, 50), (10**6, 20000)])
-def test_every_so_many_frames_are_a_round_number(count, step):
-    assert every(count) == step
+@pytest.mark.parametrize("count, rate, step", [(1, 120, 4), (500, 25, 1), (494, 60, 2), (2751, 120, 4),
+                                               (10**5, 120, 50), (10**5 + 1, 25, 51)])
+def test_a_page_plays_no_more_frames_than_it_can_carry(count, rate, step):
+    motion = Motion(np.zeros((count, 1, 3)), np.zeros((count, 3)), None, rate, np.zeros((count, 0)))
+    frames, shown = played(motion)
+    assert frames[1:2].tolist() == [step][:count - 1] and shown == rate / step and len(frames) <= 2000
 
 
 def test_the_model_of_the_sex_that_the_markers_tell(place, tmp_path):

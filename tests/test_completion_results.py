@@ -7,7 +7,7 @@ import pytest
 from completion_bodies import worm_with_prior
 
 from completion.bodies import FixedBody
-from completion.partial.completion import Completion, doubts, load_completion, save_completion
+from completion.partial.completion import Completion, doubts, left_over, load_completion, save_completion
 from completion.partial.confidence import expected_error
 from completion.partial.fit import ScanFit, Solved, solve_jointly
 from completion.partial.scan import prepare_scan
@@ -91,7 +91,7 @@ def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():
 
 
 def test_a_bend_that_the_model_never_saw_is_named():
-    poses = np.random.default_rng(0).normal(0, 0.4, (6, 4, 3)) * np.array([0, 1, 0.01, 1])[:, None]
+    poses = np.random.default_rng(0).normal(0, 0.4, (60, 4, 3)) * np.array([0, 1, 0.01, 1])[:, None]
     fit = ScanFit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
                   np.zeros(0, dtype=np.int64), np.zeros((0, 3)), CompletionConfig())
     x = np.zeros(15)
@@ -113,3 +113,24 @@ def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide
     fit = SimpleNamespace(config=CompletionConfig(), misfit=lambda x: (wide, narrow)[x[0]])
     solved = solve_jointly(fit, np.zeros(1), lambda done: None)
     assert solved.x[0] == kept and reaches[0] > reaches[1] and solved.rounds > CompletionConfig().rounds
+
+
+def test_a_joint_held_as_in_no_known_pose_is_named_and_a_known_way_is_not():
+    poses = np.zeros((1, 4, 3))
+    poses[0, 1, 0] = np.radians(120)
+    fit = ScanFit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
+                  np.zeros(0, dtype=np.int64), np.zeros((0, 3)), CompletionConfig())
+    x, fine = np.zeros(15), (np.full(398, 0.004), np.ones(398, dtype=bool))
+    x[:3] = 1.0                                                       # the whole body may stand anyhow
+    for degrees, told in ((120, 0), (80, 0), (170, 1), (0, 1)):
+        x[3] = np.radians(degrees)
+        found = [reason for reason in doubts(fit, x, *fine) if "known to be held" in reason]
+        assert len(found) == told, (degrees, found)
+    assert f"{120 - degrees} degrees" in found[0]
+
+
+@pytest.mark.parametrize(("explained", "told"), [(0.98, False), (0.95, True)])
+def test_a_limbs_worth_of_scan_without_a_body_is_told(explained, told):
+    fit = ScanFit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
+                  np.zeros((0, 3)), CompletionConfig())
+    assert left_over(fit, explained) == (["5.0% of the scan has no body near: clutter, or a limb elsewhere"] * told)

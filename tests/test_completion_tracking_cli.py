@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 from recordings import FRAMES, arguments, quick_page, track, write_recording
+from scene_reader import scenes_of
 
 from completion import Motion
 from completion.tracking import cli
@@ -118,7 +119,10 @@ def test_the_command_writes_all_it_promises(recording, output):
     for table in ("joint_angles", "joint_centres", "residuals"):
         assert len((output / f"{table}.csv").read_text().splitlines()) == 1 + FRAMES
     page = (output / "report.html").read_text()
-    assert "Lost frames: 5" in page and "image/gif" in page and page.count("<figure") == 3
+    assert "Lost frames: 5" in page and page.count("<figure") == 2
+    scene, = scenes_of(page)
+    lost = np.isfinite(scene.frames(scene.layer("lost frames"))).all(axis=(1, 2))
+    assert list(np.flatnonzero(lost)) == [5] and "measured points" in [layer["name"] for layer in scene.layers]
     told = {m["metric"]: m["value"] for m in json.loads((output / "report.json").read_text())["metrics"]}
     assert told["frames"] == FRAMES and told["frames lost"] == 1 and told["cameras"] == 2
     assert told["model"].endswith("model.npz") and 0.1 < told["distance of the points to the body, mean"] < 4

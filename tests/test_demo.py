@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from browser import wait_until
+from scene_reader import scenes_of
 
 from completion import Motion
 from completion.demo import chain
@@ -68,10 +70,22 @@ def test_outputs_are_whole(demo_folder):
 def test_page_stands_alone(demo_folder):
     page = (demo_folder / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
-    assert page.count("<img") >= 12 and 'download="walk.glb"' in page
+    scenes = scenes_of(page)
+    assert len(scenes) == 9 and len(page) < 4_000_000 and "animation/walk.glb" in page
+    assert scenes[-1].layer("body")["motion"]["frames"] == 66
     for stage in ("Scans", "Template", "Registration", "Skeleton", "Body shape", "Completion", "Animation"):
         assert re.search(rf"<h2[^>]*>{stage}</h2>", page)
     assert (demo_folder / "animation" / "walk.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_every_figure_of_the_page_turns(demo_folder, new_page):
+    page = new_page(offline=True)
+    page.goto((demo_folder / "report.html").as_uri())
+    figures = page.locator("figure[data-scene]")
+    for number in range(figures.count()):
+        figures.nth(number).scroll_into_view_if_needed()
+        wait_until(page, f"'turns' in document.querySelectorAll('figure[data-scene]')[{number}].dataset", 60)
+    assert not page.errors and len(page.requests) == 1
 
 
 def test_goes_on_where_it_was(demo_folder, tmp_path, figures):

@@ -12,7 +12,7 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 from scanned_shapes import ball as sphere
 
-from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
+from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import main
 from completion.mocap.animate.work import Work as Follow
 from completion.mocap.pose.robust import motion_problem
@@ -32,6 +32,7 @@ from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.judgement import Judgement
+from scanprep.pictures import scene
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.skeleton.find import skeleton_problem
 
@@ -45,7 +46,7 @@ QUICK = CompletionConfig(random_starts=4, rounds=3, scan_points=600, model_point
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motion_pictures, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        patch.setattr(scene, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 
 

@@ -16,7 +16,7 @@ from model.evaluation.errors import (
     shape_errors,
     vertex_components,
 )
-from model.evaluation.page import picture_error_map
+from model.evaluation.page import error_pane
 from model.evaluation.sampling import sample_bodies, specificity, unposed
 from model.fitting import FitConfig, ShapeFitter
 from model.posing.cli import mesh as mesh_command
@@ -24,6 +24,7 @@ from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.pictures.scene import picture_panes
 
 
 @pytest.fixture(scope="module")
@@ -291,5 +292,5 @@ def test_sample_command_writes_what_the_mesh_command_reads(files):
 
 def test_error_map_shows_where_the_error_is(model):
     far = np.where(model.template.vertices[:, 0] > 0.3, 0.02, 0.0)
-    clean, spotted = (picture_error_map(model.template, d, "") for d in (0 * far + 1e-4 * (far > 1), far))
+    clean, spotted = (picture_panes([error_pane(model.template, d, "")], 300) for d in (0 * far + 1e-4, far))
     assert clean.shape == spotted.shape and (clean != spotted).any(axis=2).mean() > 0.05

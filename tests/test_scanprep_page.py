@@ -1,10 +1,12 @@
 """The page of a set: worst first, every scan on it, nothing that must be fetched; and the figures behind it."""
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scan_folders import MARKS, WITH_PICTURES, ball, write_scans
+from scene_reader import scenes_of
 from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, write_landmarks, write_mesh
@@ -69,13 +71,28 @@ def test_everything_is_in_the_page(folder):
     sources = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert all(s.startswith(("data:image/", "#")) for s in sources)
     assert sum(s.startswith("data:image/webp") for s in sources) == 4
-    assert page.count('loading="lazy"') == 4
+    turning = scenes_of(page)
+    assert turning and page.count('loading="lazy"') == 4 - len(turning)
+    first = turning[0].header["panes"]
+    assert [pane["label"] for pane in first] == ["scan", "the template on it"]
+    assert first[0]["camera"] == first[1]["camera"]
+    registered = turning[0].layer("registered template")
+    assert [shade["name"] for shade in registered["shades"]] == ["distance to the scan", "confidence", "plain"]
 
 
 def test_size_is_sane(folder):
     """Two hundred scans make a page of a few megabytes."""
-    largest = max(p.stat().st_size for p in (folder / "pictures").iterdir())
-    assert 1000 < largest < 20_000
+    strips, scenes = ([p.stat().st_size for p in (folder / "pictures").glob(f"*.{kind}")]
+                      for kind in ("webp", "scene"))
+    assert 1000 < max(strips) < 20_000 and len(strips) == len(scenes) and max(scenes) < 200_000
+
+
+def test_a_set_of_an_earlier_version_has_no_scenes(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "set")
+    for path in (tmp_path / "set" / "pictures").glob("*.scene"):
+        path.unlink()
+    page = pictures.write_set_page(tmp_path / "set").read_text()
+    assert not scenes_of(page) and page.count('loading="lazy"') == 4
 
 
 def test_pictures_show_what_they_say(folder):
@@ -165,9 +182,13 @@ def test_missed_points(template):
 
 
 def test_tables_keep_their_numbers(tmp_path):
-    rows = [replace(GOOD, name="b", landmarks=np.nan), replace(GOOD, name="a", distance=1 / 3, converged=False)]
+    rows = [replace(GOOD, name="b", landmarks=np.nan),
+            replace(GOOD, name="a", distance=1 / 3, converged=False, rolled=True)]
     write_figures(tmp_path, rows)
     assert [repr(f) for f in read_figures(tmp_path)] == [repr(rows[1]), repr(rows[0])]
+    table = tmp_path / "registration.csv"
+    table.write_text("\n".join(line.rpartition(",")[0] for line in table.read_text().splitlines()))
+    assert [f.rolled for f in read_figures(tmp_path)] == [False, False]           # a table of before
     write_failures(tmp_path, {"x": 'a, "b"\tc'})
     assert read_failures(tmp_path) == {"x": 'a, "b"\tc'}
     (tmp_path / "registration.csv").write_text("name,distance\na,1\n")

@@ -22,6 +22,7 @@ from scanprep.batch.pool import Workers, run_jobs
 from scanprep.batch.room import Failure, Job
 from scanprep.cleaning.clean_scan import CleanScanConfig
 from scanprep.correspondence.correspondences import Correspondences
+from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import RegisterScan, prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
@@ -59,6 +60,21 @@ def test_scans_and_what_is_known_of_them(scans):
     (scans / "cloud.xyz").write_text("0 0 0\n1 0 0\n")
     (scans / "notes.txt").write_text("Tuesday")
     assert [t.name for t in find_scans(scans)] == ["body0", "body1", "body2", "cloud"]
+
+
+def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, template, monkeypatch):
+    """What a scan was registered with is what its limbs are tried again with, and the table says that they were."""
+    given, person = [], object()
+
+    def repaired(body, scan, fit, parts, landmarks, config, correspondences):
+        given.append((parts, len(landmarks[0]), config, correspondences))
+        return dataclasses.replace(fit, rolled=parts is person)
+
+    monkeypatch.setattr(one_scan, "repaired", repaired)
+    task = find_scans(scans)[0]
+    assert one_scan.register_scan(task, template, MARKS, QUICK.scan, person).figures.rolled
+    assert not one_scan.register_scan(task, template, MARKS, QUICK.scan).figures.rolled
+    assert given == [(who, len(MARKS), QUICK.scan.registration, None) for who in (person, None)]
 
 
 def test_folders_that_cannot_be_meant(scans, tmp_path):

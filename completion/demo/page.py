@@ -1,28 +1,33 @@
 """The page of the demonstration: a picture of every stage."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from model.report import picture_components, picture_parts
+from model.report import component_panes, parts_panes
 from scanprep.console import Metric
-from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh
-from scanprep.pictures.camera import look_around, upright
-from scanprep.pictures.gltf import animated_glb
+from scanprep.geometry.landmarks import match_landmarks
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, side_by_side
-from scanprep.pictures.sheets import save_png
+from scanprep.pictures.scene import Pane, picture_panes
+from scanprep.pictures.shading import CLAY, Dots, Heat, Solid, part_colors
+from scanprep.pictures.sheets import save_png, webp_bytes
+from scanprep.pictures.thinning import thinned
 
-from ..motion_pictures import animated_picture, chart_residuals, picture_frames
-from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance
+from ..mocap.files.motion_files import write_glb
+from ..motion_pictures import MARKER, chart_residuals, moving_pane, played
+from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
 from .chain import PARTS, Demo
 from .truth import surface_error
 
 FAR = 0.01                 # metres at the end of the heat maps
+SMALL = 15_000             # triangles of one of many bodies
 
 
 def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], None], to: Path) -> None:
@@ -36,12 +41,12 @@ def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], Non
     for i, stage in enumerate(stages):
         stage(demo, page)
         tell(i + 1, len(stages))
-    save_png(to / "overview.png", overview(demo))
+    save_png(to / "overview.png", picture_panes(overview_panes(demo), 400))
     page.write(to / "report.html")
 
 
-def overview(demo: Demo, height: int = 400) -> np.ndarray:
-    """The chain in one row of pictures: scan, registration, parts, body shapes, completion, animation."""
+def overview_panes(demo: Demo) -> list[Pane]:
+    """The chain: scan, registration, parts, body shapes, completion, animation."""
     template, model, done = demo.template, demo.model, demo.completion
     name = demo.scans[1].name                       # the first pose after rest
     registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
@@ -49,7 +54,7 @@ def overview(demo: Demo, height: int = 400) -> np.ndarray:
     people = [template.with_vertices(model.vertices(rest, betas)) for betas in (np.array([-1.8]), np.array([1.8]))]
     walking = demo.motion.vertices(demo.subject, np.array([0, len(demo.motion.poses) // 4]))
     colors = np.where(done.seen[:, None], MEASURED, COMPLETED)
-    shown: list[tuple[Shape, np.ndarray, float, str]] = [
+    shown: list[tuple[Mesh | Solid, np.ndarray, float, str]] = [
         (read_mesh(demo.folder / "scans" / f"{name}.ply"), registered.vertices, 25, "scan"),
         (registered, registered.vertices, 25, "registered"),
         (Solid(template, part_colors(model.skeleton.part_of_face)), template.vertices, 0, "parts found"),
@@ -57,32 +62,36 @@ def overview(demo: Demo, height: int = 400) -> np.ndarray:
         (Solid(demo.half_scan[0], MEASURED), done.completed.vertices, -30, "half a view"),
         (Solid(done.completed, colors), done.completed.vertices, 30, "completed"),
         *((template.with_vertices(v), v, 40.0, "animated") for v in walking)]
-    images = []
-    for shape, fits, turn, _ in shown:
-        camera = look_around(template, fits, (turn,))[0]
-        images.append(render(shape, camera, max(150, int(height * camera.width / camera.height) + 8), height))
-    return side_by_side(images, [label for *_, label in shown])
+    return [_pane(demo, shape, fits, label, turn) for shape, fits, turn, label in shown]
+
+
+def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str, turn: float = 25.0) -> Pane:
+    solid = shape if isinstance(shape, Solid) else Solid(shape)
+    return Pane([thinned(solid, SMALL)], look_around(demo.template, fits, (turn,))[0], label)
+
+
+def _in_rows(page: Page, panes: Sequence[Pane], caption: str) -> None:
+    """Figures of two pairs each."""
+    for i in range(0, len(panes), 4):
+        page.bodies(panes[i:i + 4], caption, 340)
 
 
 def _scans(demo: Demo, page: Page) -> None:
     page.section("Scans", "Four range views of each person, as a scanner sees them: 2 mm noise, holes under the arms, "
                  "between the legs and wherever nothing was in sight. Seen from behind, a surface is dark.")
     chosen = demo.scans[:3] + [s for s in demo.scans if s.subject != "subject"][:3]
-    images = []
-    for one in chosen:
-        mesh = read_mesh(one.path)
-        images.append(render(mesh, look_around(demo.template, mesh.vertices, (25,))[0], 300, HEIGHT))
-    page.picture(side_by_side(images, [s.name for s in chosen]), "six of the scans")
+    meshes = [read_mesh(one.path) for one in chosen]
+    page.bodies([_pane(demo, mesh, mesh.vertices, one.name) for one, mesh in zip(chosen, meshes, strict=True)],
+                "six of the scans", 340)
 
 
 def _template(demo: Demo, page: Page) -> None:
     page.section("Template", "A careful scan of the subject at rest: its views merged in a volume, its holes filled, "
                  "decimated to well-shaped triangles. All other scans are described by bending it.")
-    mesh, (front, side, back, _) = demo.template, look_around(demo.template)
-    colored = picture_distance(mesh, surface_error(mesh, demo.rest), [front, back], FAR,
-                               title="distance to the true surface")
-    triangles = render(Solid(mesh, smooth=False), side.closer(1.0), 300, HEIGHT)
-    page.pictures([triangles, colored], [f"{len(mesh.faces):,} triangles", "error of the template"])
+    mesh = demo.template
+    error = Heat(surface_error(mesh, demo.rest), 0, FAR, "distance to the true surface")
+    page.bodies([Pane([Solid(mesh, smooth=False)], look_around(mesh, turns=(25,))[0], f"{len(mesh.faces):,} triangles"),
+                 Pane([Solid(mesh, error)], look_around(mesh, turns=(25,))[0], "error of the template")])
 
 
 def _registration(demo: Demo, page: Page) -> None:
@@ -96,15 +105,13 @@ def _registration(demo: Demo, page: Page) -> None:
         meshes[name] = demo.template.with_vertices(vertices)
         errors[name] = surface_error(meshes[name], demo.truths[name])
     order = sorted(names, key=lambda name: -errors[name].mean())
-    images = []
+    panes = []
     for name in order[:4]:
-        camera = look_around(demo.template, meshes[name].vertices, (25,))[0]
-        scan = render(read_mesh(demo.folder / "scans" / f"{name}.ply"), camera, 300, 420)
-        images.append(side_by_side([scan, render(meshes[name], camera, 300, 420),
-                                    render(Solid(meshes[name], heat(errors[name], 0, FAR)), camera, 300, 420)],
-                                   [name, "registered", f"{1000 * errors[name].mean():.1f} mm from the truth"]))
-    page.text("The four worst, with heat from 0 (light) to 10 mm (dark).")
-    page.picture(side_by_side(images[:2])).picture(side_by_side(images[2:]))
+        fits, off = meshes[name].vertices, Heat(errors[name], 0, FAR, "distance to the truth")
+        panes += [_pane(demo, read_mesh(demo.folder / "scans" / f"{name}.ply"), fits, name),
+                  _pane(demo, Solid(meshes[name], off, shades={"plain": np.array(CLAY)}), fits,
+                        f"{1000 * errors[name].mean():.1f} mm from the truth")]
+    _in_rows(page, panes, "the worst: the scan, and the template on it")
     page.table([(f.name, 1000 * f.distance, 1000 * float(errors[f.name].mean()), 100 * f.seen)
                 for f in sorted(demo.prepared.figures, key=lambda f: -errors[f.name].mean())],
                ("scan", "to the scan (mm)", "to the truth (mm)", "with data (%)"))
@@ -114,41 +121,47 @@ def _skeleton(demo: Demo, page: Page) -> None:
     page.section("Skeleton", f"The {PARTS} parts that move most rigidly, found from the registered "
                  "poses of the subject, and the joints between them.")
     skeleton = demo.model.skeleton
-    page.picture(picture_parts(demo.template, skeleton), "parts and joints")
+    page.bodies(parts_panes(demo.template, skeleton), "parts and joints")
 
 
 def _shapes(demo: Demo, page: Page) -> None:
     page.section("Body shape", "The mean person and the first principal components of the shape deformations, each at "
                  "two standard deviations to either side.")
-    page.picture(picture_components(demo.model), "mean and components")
+    page.bodies(component_panes(demo.model), "mean and components", 300)
 
 
 def _poses(demo: Demo, page: Page) -> None:
     page.section("Poses that were never scanned", "The model in held-out poses, coloured by the distance of "
                  "corresponding points to the truth.")
-    images = []
+    panes = []
     for truth in demo.held_out:
         wanted = demo.truth_map.vertices(truth)
         found = demo.fitted(wanted)
         error = np.linalg.norm(found - wanted, axis=1)
-        camera = look_around(demo.template, found, (25,))[0]
-        mesh = Solid(demo.template.with_vertices(found), heat(error, 0, 3 * FAR))
-        pair = [render(truth.mesh, camera, 260, 400), render(mesh, camera, 260, 400)]
-        images.append(side_by_side(pair, ["truth", f"model, {1000 * error.mean():.1f} mm"]))
-    page.picture(side_by_side(images, columns=3), "heat from 0 (light) to 30 mm (dark)")
+        off = Heat(error, 0, 3 * FAR, "distance of corresponding points")
+        panes += [_pane(demo, truth.mesh, found, "truth"),
+                  _pane(demo, Solid(demo.template.with_vertices(found), off), found,
+                        f"model, {1000 * error.mean():.1f} mm")]
+    _in_rows(page, panes, "the truth, and the model beside it")
 
 
 def _completion(demo: Demo, page: Page, to: Path) -> None:
     page.section("Completion", "One camera saw the person from one side, in a pose that is in no training scan. Blue "
                  "was measured, yellow was filled in by the model.")
     half, marks, truth = demo.half_scan
-    image = picture_completion(half, demo.completion, demo.template)
+    done = demo.completion
+    image = picture_completion(half, done, demo.template)
     save_png(to / "completed" / "completion.png", image)
-    error = np.linalg.norm(demo.completion.completed.vertices - demo.truth_map.vertices(truth), axis=1)
-    views = look_around(demo.template, demo.completion.completed.vertices, (-30, 150))
-    page.picture(image, f"{len(marks)} landmarks, then the scan itself")
-    page.picture(picture_distance(demo.completion.completed, error, views, 3 * FAR,
-                                  title="distance of corresponding points"))
+    error = np.linalg.norm(done.completed.vertices - demo.truth_map.vertices(truth), axis=1)
+    names, vertices, points = match_landmarks(demo.template_landmarks, marks)
+    scan, whole = completion_panes(half, done, demo.template, landmarks=(vertices, points),
+                                   names=dict(zip(vertices.tolist(), names, strict=True)))
+    title = "distance of corresponding points"
+    shades = {title: Heat(error, 0, 3 * FAR, title)}
+    shapes = [replace(shape, shades={**shape.shades, **shades}) if isinstance(shape, Solid) and
+              shape.name == "completed body" else shape for shape in whole.shapes]
+    page.bodies([scan, replace(whole, shapes=shapes)], f"{len(marks)} landmarks and the scan, what became of it, and "
+                "as a colour how far it is from the truth", HEIGHT, webp_bytes(image))
 
 
 def _animation(demo: Demo, page: Page, to: Path) -> None:
@@ -156,10 +169,9 @@ def _animation(demo: Demo, page: Page, to: Path) -> None:
     motion, subject = demo.motion, demo.subject
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
                  "that follows them.")
-    glb = animated_glb(subject.template.faces, motion.vertices(subject), motion.rate, up=upright(subject.template)[0])
-    with storage.writing(to / "animation" / "walk.glb") as beside:
-        beside.write_bytes(glb)
-    page.picture(picture_frames(motion, subject, sequence.positions), "some frames with the measured markers")
-    page.picture(animated_picture(motion, subject), "the walk")
+    write_glb(to / "animation" / "walk.glb", motion, subject)
+    at = sequence.positions[played(motion)[0]]
+    dots = Dots(at[0], MARKER, 0.013, name="measured markers", labels=sequence.labels)
+    page.bodies([moving_pane(motion, subject, [(dots, at)])], "the walk with the measured markers", 480)
     page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
-    page.download("walk.glb", glb, "the walk as an animated GLB")
+    page.text("animation/walk.glb, beside this page, plays in any viewer of glTF.")

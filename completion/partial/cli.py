@@ -13,8 +13,9 @@ from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Outcome, bar, failures_of, judgement_of, say
+from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, say
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
+from scanprep.pipeline.scans import find_scans
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig
@@ -26,12 +27,12 @@ AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y"
         "z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0)}
 
 
-def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
+def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
                   subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
                   unit: Unit | Literal["unknown"] | None = None,
-                  up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
+                  up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None, interactive: bool = False,
                   config: CompletionConfig = CompletionConfig(),  # noqa: B008
-                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:                 # noqa: B008
+                  workers: Workers = Workers(), space: Workspace) -> Outcome:                    # noqa: B008
     """The whole body from a scan of some of it.
 
     Several scans are views of one body in one frame. A folder is completed scan by scan, each into a folder of its
@@ -56,21 +57,23 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
         unit: Unit of the scan and landmarks; "unknown": it is found together with the body.
         up: The axis of the scan that points up, where it is known: people mostly stand. Of a depth camera that stands
             upright it is -y, written --up=-y, of one upside down y.
+        interactive: In the browser: click landmarks, complete, look at the body from all sides, correct, save. A scan
+            can also be dropped on the page.
         config: Settings.
         workers: Who completes the scans of a folder.
     """
-    if not scans:
+    if not scans and not interactive:
         raise ValueError("SCAN: expected at least one scan, or a folder of scans")
     if unit == "unknown":
         config, unit = replace(config, free_scale=True), None
     if up is not None:
         config = replace(config, up=AXES[up])
+    if interactive:
+        return _in_browser(scans, output, model, subject, template_landmarks, unit, config)
     folder = scans[0] if len(scans) == 1 and scans[0].is_dir() else None
     found = folder_inputs(folder, landmarks, _only(mask)) if folder else {}
     loaded, name = read_model(model)
-    body: BodyModel | Subject = loaded
-    if subject is not None or not loaded.n_betas:
-        body = read_subject(loaded, None if subject in (None, "template") else Path(str(subject)), unit)
+    body = _body(loaded, subject, unit)
     inputs = Inputs(scans, landmarks or landmarks_beside(scans[0]), mask)
     wanted = any(one.landmarks for one in found.values()) if folder else inputs.landmarks is not None
     marks = _template_landmarks(loaded, template_landmarks, name) if wanted else {}
@@ -86,8 +89,34 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
     with bar("completing scans") as progress:
         results = space.run(work, [Task(name, one, name) for name, one in found.items()], workers, progress)
     with space.staging("page") as staged:
-        folder_page(results.values, list(results.failures.values())).write(staged.folder / "report.html")
+        folder_page(results.values, list(results.failures.values()), space.folder).write(staged.folder / "report.html")
     return Outcome(output, summary(results.values, len(results.fresh), len(found)), settings, failures_of(results))
+
+
+def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subject: str | None,
+                template_landmarks: Path | None, unit: Unit | None, config: CompletionConfig) -> Outcome:
+    """Complete scans by hand in the browser."""
+    from scanprep.viewer.server import serve
+
+    from .interactive import CompleteApp
+
+    loaded, name = read_model(model)
+    marks = _template_landmarks(loaded, template_landmarks, name)
+    files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]
+    app = CompleteApp(loaded, Work(_body(loaded, subject, unit), name, marks, config, unit), files, output)
+    serve(app)
+    if not app.saved:
+        return Outcome(None, [Metric("bodies saved", 0)], {"complete": config, "model": name})
+    return Outcome(output, [Metric("bodies saved", len(app.saved)),
+                            *(Metric(scan.name, app.made[scan].completion.judgement.verdict) for scan in app.saved)],
+                   {"complete": config, "model": name})
+
+
+def _body(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:
+    """The model where the person's shape is to be found, else a body of known shape."""
+    if subject is None and model.n_betas:
+        return model
+    return read_subject(model, None if subject in (None, "template") else Path(str(subject)), unit)
 
 
 def _only(masks: tuple[Path, ...]) -> Path | None:

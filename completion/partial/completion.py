@@ -21,7 +21,7 @@ from scanprep.threads import one_thread
 from ..bodies import as_body
 from .alternation import turns_of
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
-from .fit import ScanFit, solve_jointly
+from .fit import STRANGE, ScanFit, solve_jointly
 from .free_space import free_space_violation
 from .free_surface import distance_to, free_surface
 from .inputs import in_metres
@@ -29,7 +29,7 @@ from .limbs import with_limbs
 from .scale import ScaledBody
 from .scan import Scan
 from .settings import CompletionConfig
-from .starts import best_starts, first_starts
+from .starts import best_starts, first_starts, going_on
 
 Progress = Callable[[int, int], None]
 
@@ -43,6 +43,7 @@ PART_SHOWN = 0.5                     # share of a part within the picture, below
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
 UNLIKELY = 150.0                     # squared deviations of a pose from those that are known, all joints together
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
+LEFT_OVER = 0.03                     # share of a scan without a body near that is clutter, or a limb elsewhere
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 UNJUDGED = Judgement.of(check=["no judgement was made"])
 ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
@@ -106,7 +107,7 @@ class Completion:
 @one_thread()
 def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: CompletionConfig | None = None, progress: Progress | None = None,
-             masked: np.ndarray | None = None) -> Completion:
+             masked: np.ndarray | None = None, start: Completion | None = None) -> Completion:
     """The whole body from a scan of some of it.
 
     Parameters
@@ -123,21 +124,25 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
         Called with (done, total).
     masked : (n,) bool, optional
         Points, one view after the other, that are clothing or hair: the body is somewhere inside.
+    start : Completion, optional
+        Of the same scan and model, to go on from when landmarks were moved or added: no search, a few seconds.
 
     Raises
     ------
     ValueError
-        Fewer than 3 landmarks, landmarks or a scan that cannot be used.
+        Fewer than 3 landmarks, landmarks or a scan that cannot be used; a start where the scale is to be found.
 
     [SCAPE] Eq. 10
     """
+    if start is not None and config is not None and config.free_scale:
+        raise ValueError("start: expected none where the unit of the scan is not known")
     config, tell = config or CompletionConfig(), progress or (lambda done, total: None)
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
     given = in_metres(person, scan, landmarks, masked, config)
     sized = ScaledBody(person) if config.free_scale else person
     fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
-    starts = first_starts(fit)                                # [SCAPE] §7
+    starts = first_starts(fit) if start is None else going_on(fit, start.pose, start.trans, start.betas)   # [SCAPE] §7
     tell(1, total)
     x, rival = with_limbs(fit, best_starts(fit, starts))
     tell(2, total)
@@ -159,7 +164,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance))
     problem = completion_problem(done, given.cloud.points, config.free_scale)
-    found = doubts(fit, solved.x, error, seen) + ambiguous(fit, solved.x, rival)
+    found = doubts(fit, solved.x, error, seen) + left_over(fit, done.explained) + ambiguous(fit, solved.x, rival)
     return replace(done, judgement=Judgement.of(problem, found))
 
 
@@ -178,12 +183,22 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
                 "nothing of it was seen"
             found.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {share}")
     angles = np.linalg.norm(fit.body.split(x)[0], axis=1)
+    stiff = [j for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
     found += [f"the {joint_in_words(names[j])} is bent by {np.degrees(angles[j]):.0f} degrees, "
-              f"and never was when the model was learned"
-              for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
+              f"and never was when the model was learned" for j in stiff]
+    strange = fit.body.joints_from_known(fit.body.split(x)[0])
+    found += [f"the {joint_in_words(names[j])} is {np.degrees(strange[j]):.0f} degrees from any way that it is known "
+              "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE and j not in stiff]
     if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE:
         found.append(f"the model was {1000 * left_out:.0f} mm off in poses that it was not learned from: it needs more")
     return found + strayed(fit, x)
+
+
+def left_over(fit: ScanFit, explained: float) -> list[str]:
+    """What of a scan no body is near, where that is a limb's worth; of a picture `strayed` tells."""
+    if fit.cloud.person is not None or 1 - explained <= LEFT_OVER:
+        return []
+    return [f"{100 * (1 - explained):.1f}% of the scan has no body near: clutter, or a limb elsewhere"]
 
 
 def ambiguous(fit: ScanFit, x: np.ndarray, rival: np.ndarray | None) -> list[str]:

@@ -33,6 +33,7 @@ MIN_COSINE = 0.6                     # between the normals of a match
 # Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
 # this is far fewer than there are points.
 EVIDENCE = 400.0
+STRANGE, ODD = np.radians(45), 0.05  # from the nearest known joint on: strange; and what that may vary, radians
 UNDER_CLOTHES = 0.1                  # weight of a match of skin below what a depth camera saw, against skin above it
 
 
@@ -124,7 +125,12 @@ class ScanFit:
         for weight, ids, found_out in self.objections(mesh):
             apart += weight * (np.minimum(found_out.excess, cap)**2).sum() / len(ids)
         off = ((mesh.vertices[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
-        return float(EVIDENCE * apart / config.scan_sd**2 + off) + self.unlikely(x)
+        return float(EVIDENCE * apart / config.scan_sd**2 + off) + self.unlikely(x) + float(self.strange(x).sum())
+
+    def strange(self, x: np.ndarray) -> np.ndarray:
+        """Energy (J,) of joints of unknowns (P,) that are held as in no known pose; for choices, not for steps."""
+        beyond = self.body.joints_from_known(self.body.split(x)[0]) - STRANGE
+        return (np.maximum(beyond, 0) / ODD)**2
 
     def quick_misfits(self, x: np.ndarray, cap: float = 0.1) -> np.ndarray:
         """How badly bodies (n, P) explain the scan, on few vertices whose normals rotate with their parts."""

@@ -75,7 +75,7 @@ def limbs_amiss(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[
 
 
 def amiss(fit: ScanFit, x: np.ndarray, limb: list[int]) -> float:
-    """Energy of what is wrong with a limb, and of what it could explain."""
+    """Energy of what is wrong with a limb, of how strangely it is held, and of what it could explain."""
     mesh, J = fit.mesh(x), len(fit.body.skeleton.parents)
     mine = np.isin(np.arange(J), limb)[fit.part]
     wrong = sum(float(weight * (np.minimum(found.excess, CAP)**2 * mine[ids]).sum() / len(ids))
@@ -85,7 +85,8 @@ def amiss(fit: ScanFit, x: np.ndarray, limb: list[int]) -> float:
     reach = np.linalg.norm(fit.body.template.vertices[mine] - joint, axis=1).max() + CAP
     hangs = mesh.vertices[fit.body.skeleton.ring(fit.body.template, limb[0])].mean(axis=0)
     near = np.linalg.norm(lost - hangs, axis=1) < reach
-    return EVIDENCE / fit.config.scan_sd**2 * (wrong + (EXPLAINED**2 * near.sum()) / len(fit.thin.points))
+    apart = EVIDENCE / fit.config.scan_sd**2 * (wrong + (EXPLAINED**2 * near.sum()) / len(fit.thin.points))
+    return apart + float(fit.strange(x)[limb].sum())
 
 
 def _reinitialised(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:

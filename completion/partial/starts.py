@@ -46,6 +46,14 @@ def first_starts(fit: ScanFit) -> np.ndarray:
     return np.concatenate([more, marked])
 
 
+def going_on(fit: ScanFit, pose: np.ndarray, trans: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
+    """The body (1, P) in which an earlier fit of the scan ended: pose (J, 3), trans (3,), and betas if it has some."""
+    x = fit.body.join(pose[None], trans[None])
+    if fit.body.n_betas and betas is not None:
+        x[:, fit.body.n_angles + 3:] = betas
+    return x
+
+
 def from_landmarks(fit: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: float) -> np.ndarray:
     """The likeliest bodies (n, P) that meet landmarks (L,), (L, 3) to within sd metres, distinct and best first."""
     body = fit.body

@@ -16,20 +16,22 @@ from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
+from scanprep.geometry import storage
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.page import Page
-from scanprep.pictures.sheets import save_png
+from scanprep.pictures.scene import SCENE, small_scene, worst_that_turn
+from scanprep.pictures.sheets import save_png, small_picture
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
 from scanprep.pipeline.scans import find_scans
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, save_completion
 from .masks import read_mask
-from .report import completion_page, picture_completion
+from .report import completion_page, completion_panes, picture_completion
 from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
 
@@ -106,10 +108,17 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
         marks = np.zeros((0, 3)) if landmarks is None else landmarks[1]
         person = prepare_picture(depth, size(work.body.template), marks)
         files = ScanFiles((PointCloud(person.points, person.normals),), (None,))
-    views, output = list(files.views), room.folder
-    scan = views if depth is None else depth
+    scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
+    return write_results(work, inputs, files, done, landmarks, masked, room.folder)
+
+
+def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion,
+                  landmarks: tuple[np.ndarray, np.ndarray] | None, masked: np.ndarray | None, output: Path
+                  ) -> list[Metric]:
+    """Write a completion with its colours, its pictures and its page into a folder; the figures."""
+    views = list(files.views)
     if files.colored:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
@@ -118,8 +127,11 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     save_png(output / "picture.png", picture)
     rows = [(m.name, m.value, m.unit) for m in metrics]
     name = ", ".join(path.name for path in inputs.scans)
-    completion_page(views, done, work.body.template, name, rows, picture, masked, landmarks).write(
-        output / "report.html")
+    panes = completion_panes(views, done, work.body.template, masked, landmarks,
+                             {vertex: name for name, vertex in work.marks.items()})
+    completion_page(panes, name, rows, picture, masked is not None).write(output / "report.html")
+    if work.command:
+        storage.write(output / SCENE, small_scene(panes))
     return metrics
 
 
@@ -231,18 +243,21 @@ def summary(metrics: Mapping[str, Sequence[Metric]], fresh: int, count: int) -> 
     return rows
 
 
-def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]) -> Page:
-    """The page of all scans, those worst explained first."""
-    page = Page(f"{len(metrics)} scans completed", "Worst first; each picture leads to the page of its scan.")
+def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str], folder: Path) -> Page:
+    """The page of all scans, those worst explained first; what is told of them lies in the folder."""
+    page = Page(f"{len(metrics)} scans completed", "Worst first; each name leads to the page of its scan.")
     if failures:
         page.section("Failed").table([(line,) for line in failures])
 
     def explained(name: str) -> float:
         return next((float(m.value) for m in metrics[name] if m.name == MEANS[1]), 0.0)
 
-    for name in sorted(metrics, key=explained):
+    names = sorted(metrics, key=explained)
+    turning = worst_that_turn([folder / name / SCENE for name in names])
+    for name, scene in zip(names, turning, strict=True):
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
+        shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
+            page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
         page.markup(f'<div class="scan"><div><a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>{told}</div>'
-                    f'<a href="{escape(name)}/report.html"><img src="{escape(name)}/picture.png" '
-                    f'alt="{escape(name)}, completed"></a></div>', _STYLE)
+                    f"{shown}</div>", _STYLE)
     return page

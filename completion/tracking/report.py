@@ -1,4 +1,4 @@
-"""Pictures and the page of a tracked motion."""
+"""The page of a tracked motion."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -7,46 +7,38 @@ from typing import Any
 import numpy as np
 
 from model.linear import Subject
-from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Dots, Shape, Solid, render, side_by_side
+from scanprep.pictures.scene import Pane
+from scanprep.pictures.shading import Dots
 
-from ..motion import Motion, spread_frames
-from ..motion_pictures import animated_picture, chart_residuals, seconds
+from ..motion import Motion
+from ..motion_pictures import chart_residuals, moving_pane, played
 
-POINTS, BODY, LOST = (0.16, 0.42, 0.72), (0.90, 0.78, 0.55), (0.78, 0.78, 0.78)
-SIDES = (35.0, 215.0)                # degrees from the front
+POINTS, BODY = (0.16, 0.42, 0.72), (0.90, 0.78, 0.55)
+MOST = 300_000                       # points of all frames together
 
 Cloud = Callable[[int], np.ndarray]
 
 
-def picture_tracked(motion: Motion, subject: Subject, cloud: Cloud, count: int = 7, height: int = 340) -> np.ndarray:
-    """Some frames: the points that were measured, and the body from two sides; a lost frame is grey.
-
-    `cloud` frame -> (n, 3), metres.
-    """
-    frames = spread_frames(len(motion.poses), count)
-    measured, bodies = [], []
-    for t in frames:
-        vertices = motion.vertices(subject, np.array([t]))[0].astype(float)
-        body = Solid(subject.template.with_vertices(vertices), BODY if motion.converged[t] else LOST)
-        cameras, points = look_around(subject.template, vertices, SIDES), cloud(int(t))
-        # points of a frame in a picture
-        dots: list[Shape] = [Dots(points[::max(1, len(points) // 2500)], POINTS, radius=0.006)] if len(points) else []
-        measured.append(render(dots, cameras[0], int(0.6 * height), height))
-        bodies.append([render(body, camera, int(0.6 * height), height) for camera in cameras])
-    front, behind = (list(images) for images in zip(*bodies, strict=True))
-    last = side_by_side(behind, seconds(motion, frames))
-    return side_by_side([side_by_side(measured), side_by_side(front), last], columns=1)
+def tracked_pane(motion: Motion, subject: Subject, cloud: Cloud) -> Pane:
+    """The motion with some of the points of each frame; `cloud` frame -> (n, 3), metres."""
+    frames, _ = played(motion)
+    count = int(np.clip(MOST // len(frames), 100, 1000))
+    points = np.full((len(frames), count, 3), np.nan)
+    for row, t in enumerate(frames):
+        measured = cloud(int(t))
+        some = measured[np.linspace(0, len(measured) - 1, min(count, len(measured))).astype(int)]
+        points[row, :len(some)] = some
+    dots = Dots(points[0], POINTS, radius=0.006, name="measured points")
+    return moving_pane(motion, subject, [(dots, points)], color=BODY)
 
 
 def track_page(motion: Motion, subject: Subject, cloud: Cloud, name: str, numbers: list[int],
                rows: list[tuple[str, Any, str]]) -> Page:
     """The page of `scape track`; numbers are those of the frames in their files."""
-    page = Page(f"{name}, tracked", "Some frames: the points that were measured, then the body from the same side "
-                "and from behind. Where it is grey the frame was lost.")
-    page.picture(picture_tracked(motion, subject, cloud))
-    page.picture(animated_picture(motion, subject, most=4.0), "the first seconds")
+    page = Page(f"{name}, tracked", "The body, and some of the points that were measured in each frame. Where it is "
+                "grey the frame was lost.")
+    page.bodies([tracked_pane(motion, subject, cloud)], "Press the triangle to play, drag the body to turn it.", 520)
     page.section("Distance of the points to the body").chart(
         chart_residuals(motion, "points", lost=True), "mean over the points of a frame, before smoothing")
     lost = np.array(numbers)[~motion.converged]

@@ -135,7 +135,7 @@ class ViewApp:
         shown = [self.contents[i] for i in self.shown]
         self.cameras, panes = over_each_other(shown, self.up) if self.over else side_by_side(shown, self.up)
         self.number += 1
-        self._scene = [Message("scene", {"number": self.number}, pack_scene(panes)), *self._residuals()]
+        self._scene = [Message("scene", {"number": self.number}, pack_scene(panes, whole=True)), *self._residuals()]
         self._notes = tuple(note for content in shown for note in content.notes)
         self.controls.take([Shown(self.bodies[i], self.contents[i].name, pane, layer)
                             for i, pane, layer in self._places() if i in self.bodies])

@@ -16,12 +16,12 @@ from scanprep.pictures.camera import Camera, upright
 from scanprep.pictures.colors import part_colors
 from scanprep.pictures.scene import NO_INDEX
 from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
-from scanprep.pictures.thinned import thinned
+from scanprep.pictures.thinning import thinned
 
 from ..bodies import at_rest
 from ..partial.completion import Completion
 
-POINTS = 150_000                     # of a cloud that are shown
+POINTS, TRIANGLES = 150_000, 120_000             # of a cloud or mesh that are shown
 SHOWN_OFF = 0.03                     # metres: residual of a marker that is darkest
 MARKER = (0.85, 0.25, 0.2)
 ELEVATION, TURN = 8.0, 20.0          # degrees from which a body is seen at first
@@ -108,9 +108,9 @@ def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray
         every = max(1, len(mesh.vertices) // POINTS)
         return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stance,
                        f"{len(mesh.vertices):,} points")
-    few = thinned(mesh)
-    notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * (len(few.faces) < len(mesh.faces))
-    shown = Solid(few, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {})
+    shown = thinned(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), TRIANGLES)
+    few = len(shown.mesh.faces) < len(mesh.faces)
+    notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * few
     return Content(name, [shown, *marks], stance, sizes(mesh), notes=notes)
 
 

@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import look_around, upright
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Solid, color_bar, heat, render, side_by_side
+from scanprep.pictures.scene import Pane, picture_panes
+from scanprep.pictures.shading import Heat, Solid
 
 from ..body import BodyModel
-from ..report import picture_components
+from ..report import component_panes
 from .errors import Errors, PoseErrors, ShapeErrors, compactness
 from .sampling import Samples, Specificity
 
 MM = 1000.0
+MOST = 12                            # random bodies on the page
 Tell = Callable[[int, int], None]
 
 
@@ -61,10 +63,10 @@ def _pose_section(page: Page, model: BodyModel, found: Findings) -> None:
                  "does not know about how the body bends.")
     page.chart(chart_bodies(poses.errors, names), "distance of corresponding vertices, each body")
     rest = model.template.with_vertices(model.vertices(np.zeros_like(poses.poses[0]), poses.betas))
-    page.picture(picture_error_map(rest, poses.errors.by_vertex, "mean over the bodies"),
-                 "where the error lies: mean of all bodies, shown on the body at rest")
-    page.picture(picture_extremes(model, poses.errors, names, bodies, lambda i: poses.vertices(model, i), poses.poses),
-                 "the best and the worst body: as given, then the fitted body coloured by its error")
+    page.bodies([error_pane(rest, poses.errors.by_vertex, "mean over the bodies")],
+                "where the error lies: mean of all bodies, shown on the body at rest")
+    page.bodies(extreme_panes(model, poses.errors, names, bodies, lambda i: poses.vertices(model, i), poses.poses),
+                "the best and the worst body: as given, then the fitted body coloured by its error")
     page.table(_part_rows(model, poses.errors, names), ("part", "mean (mm)", "worst body (mm)", "which"))
 
 
@@ -77,11 +79,10 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
                                              "pose held (mm)", "vertex PCA (mm)"))
     last, count = shapes.errors[-1], int(shapes.counts[-1])
     rest = model.template.with_vertices(model.vertices(np.zeros_like(shapes.poses[0, 0]), np.zeros(1)))
-    page.picture(picture_error_map(rest, last.by_vertex, f"mean over the people, {count} components"),
-                 "where the error lies: mean of all people, shown on the mean person")
-    page.picture(picture_extremes(model, last, names, bodies, lambda i: shapes.vertices(model, -1, i),
-                                  shapes.poses[-1]),
-                 "the best and the worst person: as given, then the fitted body coloured by its error")
+    page.bodies([error_pane(rest, last.by_vertex, f"mean over the people, {count} components")],
+                "where the error lies: mean of all people, shown on the mean person")
+    page.bodies(extreme_panes(model, last, names, bodies, lambda i: shapes.vertices(model, -1, i), shapes.poses[-1]),
+                "the best and the worst person: as given, then the fitted body coloured by its error")
     page.chart(chart_bodies(last, names), f"distance of corresponding vertices, each person, {count} components")
 
 
@@ -89,14 +90,14 @@ def _space_section(page: Page, model: BodyModel, found: Findings) -> None:
     page.section("Space of shapes", "How much of the training people's variance the components explain, and what "
                  "they do.")
     page.chart(chart_compactness(model), "compactness")
-    page.picture(picture_components(model, height=320, columns=5), "the mean person, then the first components")
+    page.bodies(component_panes(model), "the mean person, then the first components", 260)
     if found.specificity is not None:
         page.text("Specificity: random bodies of the model against the nearest training person. Small is good, as "
                   "long as it is not far below the distance between people themselves. The people were brought to "
                   "rest: each was fitted with all components, and what the fit leaves was turned back with the parts.")
         page.chart(chart_specificity(found.specificity), "mean vertex distance to the nearest training person")
     if found.samples is not None:
-        page.picture(picture_samples(model, found.samples), "random bodies")
+        page.bodies(sample_panes(model, found.samples)[:MOST], "random bodies", 220)
 
 
 def _part_rows(model: BodyModel, errors: Errors, names: Sequence[str]) -> list[tuple[str, float, float, str]]:
@@ -112,53 +113,44 @@ def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, fl
             for k, e, held, plain in zip(shapes.counts, shapes.errors, shapes.pose_held, pca, strict=True)]
 
 
-def picture_error_map(body: Mesh, distance: np.ndarray, title: str, height: int = 400) -> np.ndarray:
-    """A body coloured by a distance (N,) in metres, from the front and the back, with its colour bar."""
-    front, left, back, _ = look_around(body)
+def error_pane(body: Mesh, distance: np.ndarray, title: str) -> Pane:
+    """A body coloured by a distance (N,) in metres."""
     high = _round_up(float(np.percentile(distance, 99.5)))
-    colored = Solid(body, heat(distance, 0.0, high))
-    images = [render(colored, view, int(height * view.width / view.height) + 20, height)
-              for view in (front, left, back)]
-    return side_by_side([side_by_side(images), color_bar(0.0, high, title)], columns=1)
+    return Pane([Solid(body, Heat(distance, 0.0, high, title))], look_around(body, turns=(20,))[0])
 
 
-def picture_extremes(model: BodyModel, errors: Errors, names: Sequence[str], bodies: np.ndarray,
-                     make: Callable[[int], np.ndarray], poses: np.ndarray, height: int = 400) -> np.ndarray:
-    """The best and the worst body as given, then as fitted (`make(i)`) from both sides, coloured by error.
+def extreme_panes(model: BodyModel, errors: Errors, names: Sequence[str], bodies: np.ndarray,
+                  make: Callable[[int], np.ndarray], poses: np.ndarray) -> list[Pane]:
+    """The best and the worst body as given, and beside each as fitted (`make(i)`), coloured by error.
 
-    The cameras turn about the vertical with the bodies' poses (M, J, 3).
+    `poses` (M, J, 3) are those of the bodies.
     """
-    images, labels = [], []
     shown = [("best", int(errors.mean.argmin())), ("worst", int(errors.mean.argmax()))]
     made = [make(i) for _, i in shown]
     high = _round_up(max(float(np.percentile(np.linalg.norm(y - bodies[i], axis=1), 99))
                          for y, (_, i) in zip(made, shown, strict=True)))
+    panes = []
     for (word, i), y in zip(shown, made, strict=True):
-        turn = _turn(model, poses[i])
-        views = look_around(model.template, bodies[i], (turn + 25, turn + 205))
-        width = int(height * max(v.width / v.height for v in views)) + 10
-        colored = Solid(model.template.with_vertices(y), heat(np.linalg.norm(y - bodies[i], axis=1), 0.0, high))
-        given = model.template.with_vertices(bodies[i])
-        images += [render(given, views[0], width, height), *(render(colored, v, width, height) for v in views)]
-        labels += [f"{word}: {names[i]}", f"{MM * errors.mean[i]:.1f} mm, up to {MM * errors.worst[i]:.0f}", "behind"]
-    return side_by_side([side_by_side(images, labels, columns=3), color_bar(0.0, high, "distance")], columns=1)
+        turned = model.skeleton.part_rotations(poses[i])[0]
+        camera, = look_around(model.template, bodies[i], (25,), turned)
+        off = Heat(np.linalg.norm(y - bodies[i], axis=1), 0.0, high, "distance")
+        panes += [Pane([model.template.with_vertices(bodies[i])], camera, f"{word}: {names[i]}"),
+                  Pane([Solid(model.template.with_vertices(y), off)], camera,
+                       f"{MM * errors.mean[i]:.1f} mm, up to {MM * errors.worst[i]:.0f}")]
+    return panes
 
 
-def picture_samples(model: BodyModel, samples: Samples, columns: int | None = None, height: int = 300) -> np.ndarray:
-    """A contact sheet of random bodies, numbered."""
+def sample_panes(model: BodyModel, samples: Samples) -> list[Pane]:
+    """Random bodies, numbered."""
     camera = look_around(model.template, samples.vertices, (25,))[0]
-    width = int(height * camera.width / camera.height) + 6
-    images = [render(model.template.with_vertices(v), camera, width, height) for v in samples.vertices]
-    rows = max(1, round(np.sqrt(len(images) / 2.5)))
-    return side_by_side(images, [str(i + 1) for i in range(len(images))], columns=columns or -(-len(images) // rows))
+    return [Pane([model.template.with_vertices(v)], camera, str(i + 1)) for i, v in enumerate(samples.vertices)]
 
 
-def _turn(model: BodyModel, pose: np.ndarray) -> float:
-    """How far the root is turned about the vertical, degrees."""
-    up, _ = upright(model.template)
-    a, b = (up + 1) % 3, (up + 2) % 3
-    R = model.skeleton.part_rotations(pose)[0]
-    return float(np.degrees(np.arctan2(R[b, a] - R[a, b], R[a, a] + R[b, b])))
+def picture_samples(model: BodyModel, samples: Samples, height: int = 300) -> np.ndarray:
+    """A contact sheet of random bodies, numbered."""
+    panes = sample_panes(model, samples)
+    rows = max(1, round(np.sqrt(len(panes) / 2.5)))
+    return picture_panes(panes, height, -(-len(panes) // rows))
 
 
 def _round_up(length: float) -> float:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
+from scanprep.pictures.scene import Pane, picture_panes
+from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Shape, Solid, part_colors, render, side_by_side
+from scanprep.pictures.sheets import webp_bytes
+from scanprep.pictures.thinning import MOST, thinned
 from scanprep.synthetic.people import named_pose, walk
 
 from .control.files import humanoid
@@ -20,6 +24,8 @@ from .detail.subdivision import subdivide
 from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
+MOVED = MOST // 2                    # triangles of one of several bodies beside each other
+THINNED = "Shown with fewer triangles than it has."
 WORST = 0.003                        # metres: the end of the colours of errors
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
 
@@ -34,70 +40,68 @@ def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 
 
 def statue_picture(scan: Mesh, statue: Statue, level: Level) -> np.ndarray:
     """Scan, control mesh and reconstruction from the front, and the scan and the reconstruction from behind."""
-    front, back = cameras(statue, scan, (20, 200))
-    bare = Mesh(scan.vertices, scan.faces)
-    control = Solid(statue.control.mesh, part_colors(statue.control.skeleton.part_of_face), smooth=False)
-    return _row([(bare, front), (control, front), (level.mesh, front), (bare, back), (level.mesh, back)],
-                ("scan", "control mesh", f"reconstruction, {level.name}", "scan", "reconstruction"))
+    back, = cameras(statue, scan, (200,))
+    bare, control, made = first_panes(scan, statue, level)
+    return picture_panes([bare, control, made, replace(bare, camera=back), replace(made, camera=back)], HEIGHT)
+
+
+def first_panes(scan: Mesh, statue: Statue, level: Level) -> list[Pane]:
+    """Scan, control mesh in the colours of its parts, and reconstruction."""
+    camera, = cameras(statue, scan, (20,))
+    coverage = np.array([KINDS[kind] for kind in coverage_of_vertices(statue)])
+    control = Solid(statue.control.mesh, part_colors(statue.control.skeleton.part_of_face), smooth=False,
+                    shades={"measured, folded, hole": coverage})
+    return [Pane([Mesh(scan.vertices, scan.faces)], camera, "scan"), Pane([control], camera, "control mesh"),
+            Pane([level.mesh], camera, f"reconstruction, {level.name}")]
 
 
 def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], rows: list[tuple[str, Any, str]],
                 adaptive: Level, frames: Sequence[tuple[str, Mesh]], picture: np.ndarray) -> Page:
     """The page of `scape statue fit`: levels, coarsest first, rows of the table, the statue in other poses."""
-    finest = levels[-1]
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
-    page.picture(picture)
+    page.bodies(first_panes(scan, statue, levels[-1]), THINNED + " The control mesh can also be coloured by what the "
+                "scan told: blue was measured, red is folded, not one-to-one with it, yellow is a hole of the scan.",
+                HEIGHT, webp_bytes(picture))
     page.table(rows, ("metric", "value", "unit"))
-    _fit(page, scan, statue)
-    _map(page, statue, scan)
-    _errors(page, scan, statue, levels)
-    page.section("Level of detail", "The same map on ever fewer triangles, and on triangles that are small only where "
-                 "the displacement asks for it.")
-    shown = [*reversed(levels), adaptive]
-    camera = cameras(statue, scan, (20,))[0]
-    page.picture(_row([(Solid(one.mesh, smooth=one is not finest), camera) for one in shown],
-                      [f"{one.name}: {len(one.mesh.faces):,} triangles" for one in shown]))
-    if frames:
-        page.section("In motion", "The skeleton moves the control mesh, and the detail stands on its moving normals.")
-        page.picture(side_by_side([_picture(mesh, cameras(statue, mesh, (20,))[0]) for _, mesh in frames],
-                                  [label for label, _ in frames]))
-    return page
-
-
-def _fit(page: Page, scan: Mesh, statue: Statue) -> None:
-    control, joints = statue.control, statue.control.skeleton.joints
-    marks = control.mesh.vertices[list(control.landmarks.values())]
-    inside: list[Shape] = [Solid(Mesh(scan.vertices, scan.faces), opacity=0.35),
-                           Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True),
-                           Dots(joints, on_top=True), Dots(marks, (0.15, 0.45, 0.75), 0.006, True)]
-    page.section("Joints and control mesh", "Red: joint centres. Blue: feature points of the control model. Below, the "
-                 "control mesh; its colours are the parts of the skeleton.")
-    page.picture(_row([(inside, camera) for camera in cameras(statue, scan)], ("front", "left", "back", "right")))
-    parts = Solid(control.mesh, part_colors(control.skeleton.part_of_face), smooth=False)
-    page.picture(_row([(parts, camera) for camera in cameras(statue, scan)], ("front", "left", "back", "right")))
-
-
-def _map(page: Page, statue: Statue, scan: Mesh) -> None:
+    page.section("Joints", "Red: joint centres. Blue: feature points of the control model.")
+    page.bodies([_inside(scan, statue)], height=HEIGHT)
     page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "
                  "measured; red is folded, not one-to-one with the control mesh; yellow is a hole of the scan. Red and "
                  "yellow were filled smoothly.")
-    page.picture(side_by_side(map_pictures(statue.map), ("displacement", "coverage")))
-    colors = np.array([KINDS[kind] for kind in coverage_of_vertices(statue)])
-    page.picture(_row([(Solid(statue.control.mesh, colors), camera) for camera in cameras(statue, scan)],
-                      ("front", "left", "back", "right")))
+    page.picture(webp_bytes(side_by_side(map_pictures(statue.map), ("displacement", "coverage"))))
+    _errors(page, scan, statue, levels, adaptive)
+    if frames:
+        page.section("In motion", "The skeleton moves the control mesh, and the detail stands on its moving normals.")
+        page.bodies([Pane([thinned(Solid(mesh), MOVED)], cameras(statue, mesh, (20,))[0], label)
+                     for label, mesh in frames], THINNED, HEIGHT)
+    return page
 
 
-def _errors(page: Page, scan: Mesh, statue: Statue, levels: Sequence[Level]) -> None:
-    page.section("Distance to the scan", "From the reconstruction at each level to the scan; grey in its holes, which "
+def _inside(scan: Mesh, statue: Statue) -> Pane:
+    control, joints = statue.control, statue.control.skeleton.joints
+    marks, names = list(control.landmarks.values()), list(control.landmarks)
+    shapes: list[Shape] = [
+        thinned(Solid(Mesh(scan.vertices, scan.faces), opacity=0.35, name="scan"), MOVED),
+        Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True, name="skeleton"),
+        Dots(joints, on_top=True, name="joints", labels=control.skeleton.names),
+        Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)]
+    return Pane(shapes, cameras(statue, scan, (20,))[0])
+
+
+def _errors(page: Page, scan: Mesh, statue: Statue, levels: Sequence[Level], adaptive: Level) -> None:
+    page.section("Levels of detail, and their distance to the scan", "The same map on ever fewer triangles, and on "
+                 "triangles that are small only where the displacement asks for it. Grey: holes of the scan, which "
                  "do not count.")
     page.table([(one.name, len(one.mesh.vertices), f"{1000 * one.mean:.2f}", f"{1000 * one.rms:.2f}")
                 for one in levels], ("level", "vertices", "mean, mm", "RMS, mm"))
-    surface, camera = Surface(scan), cameras(statue, scan, (20,))[0]
-    colored = [(Solid(one.mesh, heat(np.where(one.shown, surface.closest(one.mesh.corners.mean(axis=1)).distances,
-                                              np.nan), 0.0, WORST), smooth=False), camera) for one in levels]
-    page.picture(side_by_side([_row(colored, [one.name for one in levels]),
-                               color_bar(0.0, WORST, "distance to the scan")], columns=1))
+    surface, camera, panes = Surface(scan), cameras(statue, scan, (20,))[0], []
+    for one in [*reversed(levels), adaptive]:
+        far = surface.closest(one.mesh.vertices).distances
+        far[one.mesh.faces[~one.shown]] = np.nan
+        solid = Solid(one.mesh, Heat(far, 0.0, WORST, "distance to the scan"), shades={"plain": np.array(CLAY)})
+        panes.append(Pane([thinned(solid, MOVED)], camera, f"{one.name}: {len(one.mesh.faces):,} triangles"))
+    page.bodies(panes, THINNED, 420)
 
 
 def map_pictures(map_: DisplacementMap, size: int = 640) -> tuple[np.ndarray, np.ndarray]:
@@ -116,14 +120,6 @@ def coverage_of_vertices(statue: Statue) -> np.ndarray:
     """(N,) what the map says at each vertex of the control mesh: MEASURED, FOLDED or HOLE."""
     whole = subdivide(statue.control.mesh, statue.control.chart, 0)
     return coverage_at(statue.control, statue.map, whole.parent, whole.bary)
-
-
-def _row(shown: Sequence[tuple[Shape | Sequence[Shape], Camera]], labels: Sequence[str]) -> np.ndarray:
-    return side_by_side([_picture(shapes, camera) for shapes, camera in shown], labels)
-
-
-def _picture(shapes: Shape | Sequence[Shape], camera: Camera) -> np.ndarray:
-    return render(shapes, camera, int(HEIGHT * camera.width / camera.height) + 10, HEIGHT)
 
 
 def parts_without_data(statue: Statue) -> list[str]:

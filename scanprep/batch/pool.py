@@ -31,7 +31,7 @@ class Workers(Settings):
 
     workers: Annotated[Processes, FLAG] = 0
     scheduler: Annotated[str | None, FLAG] = None
-    ship: Annotated[bool, FLAG] = False
+    ship: bool = False
 
 
 def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress | None = None

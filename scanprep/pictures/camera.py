@@ -1,12 +1,15 @@
 """Where a picture is taken from, also of a body whose axes nobody has named."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..geometry.mesh import Mesh
+
+LEANING = 0.6                        # cosine: a body that leans no further is not laid over
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +32,19 @@ class Camera:
         the +z side when y is up; `elevation`, degrees. `lens` is the distance of the camera in sizes of the subject
         (inf for parallel rays), `margin` the extent of the picture over that of the subject.
         """
-        points = _points(subject)
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        a, e = np.radians(azimuth), np.radians(elevation)
+        a = np.radians(azimuth)
         vertical, first, second = np.eye(3)[[up, (up + 1) % 3, (up + 2) % 3]]
-        back = np.cos(e) * (np.cos(a) * first + np.sin(a) * second) + np.sin(e) * vertical
-        right = np.cos(a) * second - np.sin(a) * first
+        return cls.from_side(subject, np.cos(a) * first + np.sin(a) * second, vertical, elevation, lens, margin)
+
+    @classmethod
+    def from_side(cls, subject: Any, side: np.ndarray, vertical: np.ndarray, elevation: float = 8.0, lens: float = 6.0,
+                  margin: float = 1.06) -> Camera:
+        """As `around`, seen from where a direction `side` (3,) points, with the unit vector `vertical` (3,) up."""
+        points, e = _points(subject), np.radians(elevation)
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        flat = side - (side @ vertical) * vertical
+        flat = flat / np.linalg.norm(flat)
+        back, right = np.cos(e) * flat + np.sin(e) * vertical, np.cross(vertical, flat)
         axes = np.stack([right, np.cross(back, right), back])
         size = max(float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))), 1e-9)
         x, y, depth = ((points - middle) @ axes.T).T
@@ -50,10 +60,6 @@ class Camera:
         """(3,) float, metres; of a camera with parallel rays, a point far behind the scene."""
         away = self.distance if np.isfinite(self.distance) else 10 * (self.width + self.height)
         return self.target + away * self.axes[2]
-
-    def closer(self, factor: float) -> Camera:
-        """The same view `factor` times as large."""
-        return replace(self, width=self.width / factor, height=self.height / factor)
 
     def rays(self, width: int, height: int, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Origins, relative to the target, and unit directions of the rays of a picture, row by row.
@@ -129,12 +135,36 @@ def _toes(flat: np.ndarray, height: np.ndarray, weights: np.ndarray) -> np.ndarr
     return lower - upper
 
 
-def look_around(body: Mesh, poses: np.ndarray | None = None, turns: tuple[float, ...] = (0, 90, 180, 270)
-                ) -> list[Camera]:
+def look_around(body: Mesh, poses: np.ndarray | None = None, turns: Sequence[float] = (0, 90, 180, 270),
+                turned: np.ndarray | None = None, vertical: np.ndarray | None = None) -> list[Camera]:
     """Cameras around a standing body: by default from its front, its left, its back and its right.
 
     `turns` are degrees from the front; `poses` (..., 3), metres, is what has to fit into the picture if not the body.
+    `turned` (..., 3, 3) are the rotations of its root there, `vertical` (3,) what is up if they do not tell: see
+    `stance`.
+    """
+    vertical, ahead = stance(body, turned, vertical)
+    subject = body.vertices if poses is None else np.asarray(poses, dtype=float).reshape(-1, 3)
+    aside = np.cross(vertical, ahead)
+    return [Camera.from_side(subject, np.cos(a) * ahead + np.sin(a) * aside, vertical) for a in np.radians(turns)]
+
+
+def stance(body: Mesh, turned: np.ndarray | None = None, vertical: np.ndarray | None = None
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """Up, along an axis, and ahead of a standing body, unit vectors (3,); `turned` (..., 3, 3) are turns of its root.
+
+    Up is the body's own axis unless the turns, on average, lay it over: then it is the axis nearest to its head. One
+    frame of a motion is told what is `vertical` in all of it.
     """
     up, front = upright(body)
-    subject = body.vertices if poses is None else np.asarray(poses, dtype=float).reshape(-1, 3)
-    return [Camera.around(subject, azimuth=front + turn, up=up) for turn in turns]
+    own, first, second = np.eye(3)[[up, (up + 1) % 3, (up + 2) % 3]]
+    ahead = np.cos(np.radians(front)) * first + np.sin(np.radians(front)) * second
+    turned = np.eye(3)[None] if turned is None else np.asarray(turned).reshape(-1, 3, 3)
+    mean = turned.mean(axis=0)
+    if vertical is None:
+        now = mean @ own
+        nearest = np.sign(now[np.abs(now).argmax()]) * np.eye(3)[np.abs(now).argmax()]
+        vertical = own if now @ own > LEANING else nearest
+    ways = [way - (way @ vertical) * vertical for way in (mean @ ahead, turned[0] @ ahead, turned[0] @ own)]
+    ahead = next(way for way in ways if np.linalg.norm(way) > 0.1)     # the mean of a turn on the spot says nothing
+    return vertical, ahead / np.linalg.norm(ahead)

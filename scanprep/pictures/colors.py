@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -30,15 +31,17 @@ class Heat:
     values: np.ndarray  # (N,) float
     low: float
     high: float
-    title: str = ""  # what the values are; lengths are in metres
+    title: str = ""  # what the values are
+    unit: Literal["mm", "%"] = "mm"  # that the legend is in: of lengths in metres, or of shares
+    colormap: str = HEAT
 
     def colors(self) -> np.ndarray:
         """(N, 3) in [0, 1]."""
-        return heat(self.values, self.low, self.high)
+        return heat(self.values, self.low, self.high, self.colormap)
 
     def bar(self) -> np.ndarray:
         """The legend as a picture."""
-        return color_bar(self.low, self.high, self.title)
+        return color_bar(self.low, self.high, self.title, self.colormap, 1000 if self.unit == "mm" else 100, self.unit)
 
 
 def color_bar(low: float, high: float, title: str, colormap: str = HEAT, scale: float = 1000.0, unit: str = "mm"

@@ -5,7 +5,6 @@ import base64
 import functools
 import gzip
 import io
-import mimetypes
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
@@ -14,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..geometry.storage import write
-from .scene import Pane, pack_scene
-from .shading import Moving, render
-from .sheets import png_bytes, side_by_side, webp_bytes
+from .scene import Pane, framed_alike, pack_scene, picture_panes
+from .sheets import png_bytes, webp_bytes
 
 VIEWER = Path(__file__).parents[1] / "viewer"
+PICTURE, WIDEST = 300, 1400          # pixels: height and width of pictures that stand for bodies
 # The viewer travels compressed: a browser that cannot take it apart, or has no WebGL, goes on showing the pictures.
 START = """(async () => {
 const raw = atob(document.getElementById("viewer").textContent), bytes = Uint8Array.from(raw, (c) => c.charCodeAt(0));
@@ -69,25 +68,19 @@ class Page:
 
         Where there is no WebGL, and until they are drawn, stands a picture of them, by default what the cameras see.
         """
+        panes = framed_alike(panes)
         if picture is None:
-            views = [render([shape.shape if isinstance(shape, Moving) else shape for shape in pane.shapes], pane.camera,
-                            max(110, int(height * pane.camera.width / pane.camera.height) + 10), height)
-                     for pane in panes]
-            picture = webp_bytes(side_by_side(views, [pane.label for pane in panes]))
-        self._scenes.append(pack_scene(panes))
-        still = _figure(picture, caption, "")
-        self._parts.append(still.replace("<figure>", f'<figure data-scene="scene{len(self._scenes)}" '
-                                                     f'data-height="{height}">', 1))
+            low, camera = min(height, PICTURE), panes[0].camera
+            columns = max(1, int(WIDEST / max(110, low * camera.width / camera.height + 18)))
+            picture = picture_panes(panes, low, columns)
+        self._parts.append(self.turning(pack_scene(panes), picture, caption, height))
         return self
 
-    def pictures(self, images: Sequence[np.ndarray | bytes], captions: Sequence[str] = ()) -> Page:
-        """Pictures in a row that wraps on narrow screens."""
-        if captions and len(captions) != len(images):
-            raise ValueError(f"captions: expected {len(images)}, one for each image, got {len(captions)}")
-        figures = [_figure(image, caption, "") for image, caption in
-                   zip(images, captions or [""] * len(images), strict=True)]
-        self._parts.append(f'<div class="row">{"".join(figures)}</div>')
-        return self
+    def turning(self, scene: bytes, picture: np.ndarray | bytes, caption: str = "", height: int = 400) -> str:
+        """The HTML of a figure of a packed scene, for `markup`; the page carries the scene."""
+        self._scenes.append(scene)
+        still = _figure(picture if isinstance(picture, bytes) else webp_bytes(picture), caption, "")
+        return still.replace("<figure>", f'<figure data-scene="scene{len(self._scenes)}" data-height="{height}">', 1)
 
     def table(self, rows: Iterable[Sequence[Any]], header: Sequence[str] = ()) -> Page:
         """A table; numbers are set flush right, floats with three significant figures."""
@@ -105,14 +98,6 @@ class Page:
         with rc_context({"svg.hashsalt": "scapekit"}):
             figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
         return self.picture(out.getvalue(), caption)
-
-    def download(self, name: str, data: bytes, text: str = "") -> Page:
-        """A link that saves a file carried by the page itself."""
-        kind = "model/gltf-binary" if name.endswith(".glb") else mimetypes.guess_type(name)[0]
-        size = f"{len(data) / 1e6:.1f} MB" if len(data) >= 1e5 else f"{len(data) / 1e3:.1f} kB"
-        self._parts.append(f'<a class="file" download="{escape(name)}" href="{_data_uri(data, kind)}">'
-                           f"{escape(text or name)}<small>{size}</small></a>")
-        return self
 
     def html(self) -> str:
         """The whole page."""
@@ -169,11 +154,7 @@ def _image_kind(data: bytes) -> str:
 
 def data_uri(data: bytes) -> str:
     """The bytes of a picture as the address of an `img`."""
-    return _data_uri(data, _image_kind(data))
-
-
-def _data_uri(data: bytes, kind: str | None) -> str:
-    return f"data:{kind or 'application/octet-stream'};base64,{base64.b64encode(data).decode()}"
+    return f"data:{_image_kind(data)};base64,{base64.b64encode(data).decode()}"
 
 
 def _cell(value: Any) -> str:

@@ -9,18 +9,25 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..geometry.mesh import Mesh
 from .camera import Camera
-from .colors import Heat
+from .colors import Heat, heat
 from .low_rank import low_rank
-from .shading import Bones, Dots, Moving, Shape, Solid, own_color
+from .shading import Bones, Dots, Moving, Shape, Solid, own_color, render
+from .sheets import side_by_side
+from .thinning import of_vertices, thinned
 
 FORMAT = 1
+SCENE = "picture.scene"              # beside a picture, for the page of many
+SMALL = 8000                         # triangles of a shape in it
+MOST_TURN, MOST_BYTES = 20, 4_000_000        # figures that turn on a page of many
+FINE = 2e-5                          # metres: step of what one column adds to a motion
 NO_INDEX = 255                       # place in a palette of vertices without a value; it has as many colours before
 
 
@@ -33,15 +40,54 @@ class Pane:
     label: str = ""
 
 
-def pack_scene(panes: Sequence[Pane]) -> bytes:
-    """Panes as bytes."""
+def framed_alike(panes: Sequence[Pane]) -> list[Pane]:
+    """The panes with cameras of one scale, so that bodies beside each other can be compared."""
+    sizes = {side: max(getattr(pane.camera, side) for pane in panes) for side in ("width", "height", "distance")}
+    return [replace(pane, camera=replace(pane.camera, **sizes)) for pane in panes]
+
+
+def picture_pane(pane: Pane, width: int, height: int) -> np.ndarray:
+    """What the camera sees at first (height, width, 3) uint8."""
+    shapes = [shape.shape if isinstance(shape, Moving) else shape for shape in pane.shapes
+              if not isinstance(shape, Moving) or np.isfinite(shape.frames[0]).any()]
+    return render([shape for shape in shapes if isinstance(shape, Mesh) or shape.visible], pane.camera, width, height)
+
+
+def picture_panes(panes: Sequence[Pane], height: int, columns: int | None = None) -> np.ndarray:
+    """What the cameras see at first, side by side (H, W, 3) uint8."""
+    images = [picture_pane(pane, max(110, int(height * pane.camera.width / pane.camera.height) + 10), height)
+              for pane in panes]
+    labels = [pane.label for pane in panes]
+    return side_by_side(images, labels if any(labels) else None, columns=columns)
+
+
+def pack_scene(panes: Sequence[Pane], whole: bool = False) -> bytes:
+    """Panes as bytes; `whole`: with all triangles, of bodies whose vertices will be moved."""
     columns = _Columns()
     header = {"format": FORMAT, "panes": [
         {"label": pane.label, "camera": _camera(pane.camera), "origin": pane.camera.target.tolist(),
-         "layers": [_layer(shape, pane.camera.target, columns) for shape in pane.shapes]} for pane in panes]}
+         "layers": [_layer(shape, pane.camera.target, columns, whole) for shape in pane.shapes]} for pane in panes]}
     text = json.dumps({**header, "columns": columns.described}, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     return zlib.compress(len(text).to_bytes(4, "little") + text + columns.data, 9)
+
+
+def small_scene(panes: Sequence[Pane]) -> bytes:
+    """A packed scene with fewer triangles, for a page of many."""
+    few = [replace(pane, shapes=[thinned(shape if isinstance(shape, Solid) else Solid(shape), SMALL)
+                                 if isinstance(shape, Solid | Mesh) else shape for shape in pane.shapes])
+           for pane in framed_alike(panes)]
+    return pack_scene(few)
+
+
+def worst_that_turn(paths: Sequence[Path]) -> list[bytes | None]:
+    """The packed scenes of files, worst first, of as many as a page can carry; None where there is none, or no room."""
+    room, out = MOST_BYTES, list[bytes | None]()
+    for path in paths:
+        scene = path.read_bytes() if path.exists() and room > 0 and len(out) < MOST_TURN else None
+        room -= len(scene or b"")
+        out.append(scene if room >= 0 else None)
+    return out
 
 
 @dataclass
@@ -82,13 +128,14 @@ def _camera(camera: Camera) -> dict[str, Any]:
             "up": camera.vertical.tolist(), "width": camera.width, "height": camera.height}
 
 
-def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
+def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, whole: bool) -> dict[str, Any]:
     """One shape of a pane."""
     if isinstance(shape, Moving):
-        return {**_layer(shape.shape, origin, columns), "motion": _motion(shape, origin, columns)}
+        return {**_layer(shape.shape, origin, columns, True), "motion": _motion(shape, origin, columns)}
     if isinstance(shape, Mesh):
         shape = Solid(shape)
     if isinstance(shape, Solid):
+        shape = shape if whole else thinned(shape)
         points = shape.mesh.vertices
         first = shape.color if isinstance(shape.color, Heat) else own_color(shape)
         shades = [_shade(name, shade, shape.mesh, columns) for name, shade in {"": first, **shape.shades}.items()]
@@ -122,17 +169,15 @@ def _shade(name: str, shade: Any, mesh: Mesh | None, columns: _Columns) -> dict[
     if isinstance(shade, Heat):
         share = (shade.values - shade.low) / max(shade.high - shade.low, 1e-30)
         index = np.where(np.isnan(share), NO_INDEX, np.round((NO_INDEX - 1) * np.clip(np.nan_to_num(share), 0, 1)))
-        ramp = Heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1).colors()
+        ramp = heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1, shade.colormap)
         return {"name": name or shade.title, "index": columns.add(index.astype(np.uint8)),
                 "palette": _hex(np.round(255 * ramp)),
-                "legend": {"title": shade.title, "low": shade.low, "high": shade.high}}
+                "legend": {"title": shade.title, "low": shade.low, "high": shade.high, "unit": shade.unit}}
     colors = np.round(255 * np.asarray(shade, dtype=float)).clip(0, 255).astype(np.uint8)
     if colors.ndim == 1:
         return {"name": name, "palette": _hex(colors)}
-    if mesh is not None and len(colors) == len(mesh.faces) != len(mesh.vertices):
-        of_vertex = np.zeros(mesh.vertices.shape, dtype=np.uint8)
-        of_vertex[mesh.faces.ravel()] = np.repeat(colors, 3, axis=0)
-        colors = of_vertex
+    if mesh is not None:
+        colors = of_vertices(colors, mesh)
     palette, index = np.unique(colors, axis=0, return_inverse=True)
     if len(palette) <= NO_INDEX:
         return {"name": name, "palette": _hex(palette), "index": columns.add(index.reshape(-1).astype(np.uint8))}
@@ -143,21 +188,31 @@ def _hex(colors: np.ndarray) -> str:
     return np.asarray(colors, dtype=np.uint8).tobytes().hex()
 
 
+def _steps(values: np.ndarray, axes: int | tuple[int, ...], factor: np.ndarray | float) -> np.ndarray:
+    """Steps that 16 bits can count, no smaller than is seen when the values are taken so many times."""
+    return np.maximum(np.abs(values).max(axis=axes, initial=1e-12) / 32767, FINE / np.maximum(factor, 1e-9))
+
+
 def _motion(moving: Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
-    """Frames (T, n, 3) as columns (n, r) times coefficients (T, r, 3), both in whole steps."""
+    """Frames (T, n, 3) as columns (n, r) times coefficients (T, r, 3), both in whole steps; of dots without columns."""
     hidden: Mapping[str, Any] = {}
+    made: np.ndarray | None = None
     if moving.columns is not None:                     # a shift of all points is one of the things that columns can do
-        basis, coefficients = moving.columns
-        coefficients = coefficients - np.linalg.lstsq(basis, np.ones(len(basis)))[0][:, None] * origin
+        made, coefficients = moving.columns
+        coefficients = coefficients - np.linalg.lstsq(made, np.ones(len(made)))[0][:, None] * origin
     else:
-        frames = np.asarray(moving.frames, dtype=float) - origin
+        frames = np.asarray(moving.frames) - origin.astype(moving.frames.dtype)
         known = np.isfinite(frames).all(axis=2)
         hidden = {} if known.all() else {"seen": columns.add(known.astype(np.uint8))}
-        basis, coefficients = low_rank(np.where(known[..., None], frames, 0.0))
-    steps = np.maximum(np.abs(basis).max(axis=0), 1e-12) / 32767
-    sizes = np.maximum(np.abs(coefficients).max(axis=(0, 2)), 1e-12) / 32767
-    return {"rate": moving.rate, "frames": len(coefficients), "rank": basis.shape[1], **hidden,
-            "basis": columns.add(np.round(basis / steps).astype(np.int16)),
+        coefficients = np.where(known[..., None], frames, np.float32(0))
+        if not isinstance(moving.shape, Dots):         # what each of those does tells nothing of the others
+            made, coefficients = low_rank(coefficients)
+    basis, steps, sizes = None, np.ones(coefficients.shape[1]), _steps(coefficients, (0, 2), 1.0)
+    if made is not None:
+        steps = _steps(made, 0, np.abs(coefficients).max(axis=(0, 2)))
+        sizes = _steps(coefficients, (0, 2), np.abs(made).max(axis=0))
+        basis = columns.add(np.round(made / steps).astype(np.int16))
+    return {"rate": moving.rate, "frames": len(coefficients), "rank": len(steps), **hidden, "basis": basis,
             "coefficients": columns.add(np.round(coefficients / sizes[:, None]).astype(np.int16).reshape(
                 len(coefficients), -1).view(np.uint16), True),
             "scale": (steps * sizes).tolist()}

@@ -66,6 +66,15 @@ def webp_bytes(image: np.ndarray) -> bytes:
     return out.getvalue()
 
 
+def small_picture(path: Path, width: int = 700) -> bytes:
+    """The picture of a file as a WebP file, no wider than so many pixels."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        image.thumbnail((width, width))
+        return webp_bytes(np.asarray(image.convert("RGB")))
+
+
 def save_png(path: str | Path, image: np.ndarray) -> None:
     """Write a picture (H, W, 3) uint8, whole or not at all."""
     write(path, png_bytes(image))

@@ -50,8 +50,9 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
     if clean and config.scan.clean is None:
         config = replace(config, scan=replace(config.scan, clean=CleanScanConfig()))
     marks = _template_marks(template, template_landmarks, body, tasks, config.scan.init)
-    with bar("registering scans") as registering, bar("finding the skeleton") as finding:
-        done = prepare(tasks, body, marks, space.folder, config, registering, finding)
+    with bar("finding the parts of a person") as naming, bar("registering scans") as registering, \
+            bar("finding the skeleton") as finding:
+        done = prepare(tasks, body, marks, space.folder, config, registering, finding, naming)
     return Outcome(output, [*_progress_made(done, tasks), *_quality(judge_set(output)),
                             Metric("unit assumed", config.scan.unit or "m")], {"prepare": config}, list(done.failures))
 

@@ -35,6 +35,7 @@ class ScanFigures:
     converged: bool
     removed: float = 0.0    # share of the scan's points that were cleaned off before
     seconds: float = np.nan         # in `times.csv`, as it is the one figure that differs from run to run
+    rolled: bool = False    # limbs are rolled otherwise than they were found first, as no person's lie so
 
 
 _TABLED = [f for f in fields(ScanFigures) if f.name != "seconds"]
@@ -47,7 +48,7 @@ def read_figures(folder: Path) -> list[ScanFigures]:
     seconds = {row["name"]: float(row["seconds"]) for row in _read(folder / TIMES)}
     rows = [{EARLIER.get(name, name): text for name, text in row.items()} for row in _read(folder / FIGURES)]
     try:
-        return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED},
+        return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED if f.name in row},
                             seconds=seconds.get(row["name"], np.nan)) for row in rows]
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{folder / FIGURES}: expected the columns {', '.join(f.name for f in _TABLED)} "

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
@@ -13,15 +14,17 @@ from ..geometry import rotations
 from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
 from ..judgement import size as size_of
-from ..pictures.camera import Camera, look_around, upright
+from ..pictures.camera import Camera, look_around
 from ..pictures.page import Page, data_uri
-from ..pictures.shading import CLAY, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
+from ..pictures.scene import Pane, small_scene, worst_that_turn
+from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
 from ..registration.nonrigid import Registration
 from .figures import Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
-WIDTH, HEIGHT = 150, 216
+WIDTH, HEIGHT, TALL = 150, 216, 300
+FEW = 6                     # scans that turn where fewer need a look
 FAR = 0.005                 # of the template's size: the dark end of the distances
 TURN = 20.0                 # degrees from the front
 BALL = 0.013                # of the template's size: radius of the balls that stand for points
@@ -42,11 +45,14 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page.markup(_index(verdicts, entries))
     page.section("Worst first", _explanation(limits, size))
     page.picture(_legend(size))
-    for verdict in verdicts:
-        page.markup(_card(folder, verdict, entries.get(verdict.name)))
+    scenes = worst_that_turn([folder / PICTURES / f"{verdict.name}.scene" for verdict in verdicts])
+    look = max(FEW, sum(verdict.suspect or verdict.failed for verdict in verdicts))
+    for number, (verdict, scene) in enumerate(zip(verdicts, scenes, strict=True)):
+        page.markup(_card(page, folder, verdict, entries.get(verdict.name), scene if number < look else None))
     if whole.skeleton is not None:
         page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
-        page.picture(_parts_picture(whole.template, whole.skeleton.part_of_face), "parts, front and back")
+        parts = Solid(whole.template, part_colors(whole.skeleton.part_of_face))
+        page.bodies([Pane([parts], look_around(whole.template, turns=(TURN,))[0])], "parts")
     page.write((to or folder) / PAGE)
     return (to or folder) / PAGE
 
@@ -112,14 +118,16 @@ def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
     return f'<div class="index">{"".join(parts)}</div>'
 
 
-def _card(folder: Path, verdict: Verdict, entry: SetEntry | None) -> str:
+def _card(page: Page, folder: Path, verdict: Verdict, entry: SetEntry | None, scene: bytes | None) -> str:
     path = folder / PICTURES / f"{verdict.name}.webp"
     about = " · ".join(filter(None, [entry.subject if entry and entry.subject != verdict.name else "",
                                      entry.pose if entry else "", verdict.figures.init if verdict.figures else ""]))
     badness = "failed" if verdict.failed else f"{verdict.badness:.1f}"
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     shown = ""
-    if path.exists():
+    if path.exists() and scene is not None:
+        shown = page.turning(scene, path.read_bytes(), height=TALL)
+    elif path.exists():
         labels = "".join(f"<span>{escape(label)}</span>" for label in PANELS)
         shown = (f'<div><img src="{data_uri(path.read_bytes())}" alt="{escape(verdict.name)}: {", ".join(PANELS)}" '
                  f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'
@@ -137,6 +145,7 @@ def _figure_table(f: ScanFigures) -> str:
             ("with data", f"{100 * f.seen:.0f}%"), ("confidence, mean", f"{f.confidence:.2f}"),
             ("scan off the template", f"{100 * f.missed:.1f}%"),
             ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("inverted triangles", f"{f.inverted}"),
+            *([("limbs rolled otherwise", "yes")] if f.rolled else []),
             ("landmarks off, RMS", "–" if np.isnan(f.landmarks) else f"{1000 * f.landmarks:.1f} mm"),
             ("converged", "yes" if f.converged else "no"))
     return "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'
@@ -155,29 +164,31 @@ def _legend(size: float) -> np.ndarray:
     return color_bar(0, FAR * size, "distance to the scan; grey: no data there")
 
 
-def _parts_picture(template: Mesh, part_of_face: np.ndarray) -> np.ndarray:
-    body = Solid(template, part_colors(part_of_face))
-    return side_by_side([render(body, camera, 240, 340) for camera in look_around(template, turns=(20, 200))])
-
-
-def strip(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> bytes:
-    """One row of pictures as a WebP file, in the order of `PANELS`.
+def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> tuple[bytes, bytes]:
+    """One row of pictures as a WebP file, in the order of `PANELS`, and the same as a packed scene.
 
     All are seen as the template would be from its front, whichever way the person stood in the scanner.
     """
     R, _ = rotations.procrustes(fit.mesh.vertices, template.vertices)
     middle = fit.mesh.vertices.mean(axis=0)
     body = fit.mesh.with_vertices((fit.mesh.vertices - middle) @ R.T)
-    up, front = upright(template)
-    near, back = (Camera.around(body.vertices, front + turn, up=up, margin=1.12) for turn in (TURN, TURN + 180))
+    near, back = (replace(c, width=1.06 * c.width, height=1.06 * c.height)
+                  for c in look_around(template, body.vertices, (TURN, TURN + 180)))
     size = size_of(template)
-    far = Solid(body, heat(evened(body, fit.distances), 0, FAR * size))
-    shown = [(_scan(scan, R, middle, size), near), (Solid(body, CLAY), near), (far, near), (far, back),
-             (Solid(body, heat(1 - fit.confidence, -0.35, 1, "Blues")), near)]      # unlike the distances
-    return webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
+    given = _scan(scan, R, middle, size)
+    far = Heat(evened(body, fit.distances), 0, FAR * size, "distance to the scan")
+    sure = Heat(1 - fit.confidence, -0.35, 1, colormap="Blues")                     # unlike the distances
+    shown: list[tuple[Shape, Camera]] = [
+        (given, near), (Solid(body, CLAY), near), (Solid(body, far), near), (Solid(body, far), back),
+        (Solid(body, sure), near)]
+    strip = webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
+    registered = Solid(body, far, name="registered template", shades={
+        "confidence": Heat(fit.confidence, 0, 1, "confidence", "%", "Blues_r"), "plain": np.array(CLAY)})
+    over = replace(given, name="scan over it", visible=False)
+    return strip, small_scene([Pane([given], near, "scan"), Pane([registered, over], near, "the template on it")])
 
 
-def _scan(scan: Mesh | np.ndarray, R: np.ndarray, middle: np.ndarray, size: float) -> Shape:
+def _scan(scan: Mesh | np.ndarray, R: np.ndarray, middle: np.ndarray, size: float) -> Solid | Dots:
     """The scan in the frame of the picture, with no more detail than a small picture can show."""
     if isinstance(scan, Mesh) and len(scan.faces):
         coarse = coarsened(scan, 0.007 * size)

@@ -21,7 +21,7 @@ from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
 from ..registration.limbs import limb_doubts
-from ..registration.person import person_parts
+from ..registration.person import PersonParts, person_parts
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
@@ -66,7 +66,7 @@ class Prepared:
 
 def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,
             config: PrepareConfig | None = None, progress: Progress | None = None,
-            skeleton_progress: Progress | None = None) -> Prepared:
+            skeleton_progress: Progress | None = None, person_progress: Progress | None = None) -> Prepared:
     """Register the template to every scan, find the skeleton, and write a page that shows how it went.
 
     What the folder already holds is done again only where something that it depends on has changed. A scan that cannot
@@ -79,7 +79,8 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
     with workspace(folder) as space, one_thread():
         # without what the template has worked out about itself: it is sent around
         bare = Mesh(template.vertices, template.faces, template.colors)
-        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan)
+        parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
+        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan, parts)
         tables = _Tables(space, work, tasks)
         if not space.names(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
@@ -90,7 +91,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress)
             failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
             registered = tables.write(failures)
-            _with_doubts(space, registered)
+            _with_doubts(space, registered, parts)
             _with_skeleton(space, registered, config, skeleton_progress)
         finally:
             tables.write(failures)
@@ -108,13 +109,15 @@ class RegisterScan:
     template: Mesh
     landmarks: Mapping[str, int]
     settings: ScanSettings
+    parts: PersonParts | None = None         # of the template, where it is a person
 
     def __call__(self, task: ScanTask, room: Room) -> ScanFigures:
-        found = register_scan(task, self.template, dict(self.landmarks), self.settings)
+        found = register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts)
         write_mesh(room.folder / mesh_file(task.name), self.template.with_vertices(found.vertices))
         if found.picture:
             (room.folder / PICTURES).mkdir()
             (room.folder / PICTURES / f"{task.name}.webp").write_bytes(found.picture)
+            (room.folder / PICTURES / f"{task.name}.scene").write_bytes(found.scene)
         return found.figures
 
 
@@ -164,14 +167,13 @@ class _Tables:
         return others
 
 
-def _with_doubts(space: Workspace, registered: RegisteredSet) -> None:
+def _with_doubts(space: Workspace, registered: RegisteredSet, parts: PersonParts | None) -> None:
     """The table of what in the registrations no person can do, where the template is a person."""
-    bare = Mesh(registered.template.vertices, registered.template.faces)
-    parts = space.step("person", bare, lambda folder: person_parts(bare))
     if parts is None:
         space.drop("limbs")
         return
-    doubts = {name: limb_doubts(bare, parts, registered.vertices([name])[0]) for name in registered.names}
+    doubts = {name: limb_doubts(registered.template, parts, registered.vertices([name])[0])
+              for name in registered.names}
     with space.staging("limbs") as staged:
         write_doubts(staged.folder, doubts)
 

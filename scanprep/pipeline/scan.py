@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
+from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
@@ -15,6 +16,8 @@ from ..geometry.mesh import Mesh
 from ..judgement import extent
 from ..ranges import FLAG, Settings
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
+from ..registration.person import PersonParts
+from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
 from ..registration.unmarked import register_unmarked
 from ..threads import one_thread
@@ -63,29 +66,34 @@ class RegisteredScan:
     vertices: np.ndarray            # (N, 3), metres
     figures: ScanFigures
     picture: bytes = b""            # a strip of small pictures as a WebP file; empty where none were asked for
+    scene: bytes = b""              # the same for the browser
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
-                  settings: ScanSettings) -> RegisteredScan:
-    """Read and register one scan; ValueError for files that cannot be read, or a registration that means nothing."""
+                  settings: ScanSettings, parts: PersonParts | None = None) -> RegisteredScan:
+    """Read and register one scan, and try other rolls of limbs where the template has the parts of a person.
+
+    ValueError for files that cannot be read, or a registration that means nothing.
+    """
     start = time.perf_counter()
     with one_thread():
         scan = read_scan(task.scan, settings.unit)
         _check_unit(task, scan, template)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
         scan, removed = _cleaned(scan, landmarks, settings.clean)
-        fit, init = _registered(template, scan, landmarks, settings)
+        fit, pairs, init = _registered(template, scan, landmarks, settings)
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        picture = b""
+        fit = repaired(template, scan, fit, parts, landmarks, settings.registration, correspondences=pairs)
+        picture = scene = b""
         if settings.pictures:
-            from .page import strip
+            from .page import pictures_of
 
-            picture = strip(template, scan, fit)
+            picture, scene = pictures_of(template, scan, fit)
     figures = figures_of(task.name, init, template, fit)
     return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
-                          picture)
+                          picture, scene)
 
 
 def _check_unit(task: ScanTask, scan: Mesh | np.ndarray, template: Mesh) -> None:
@@ -111,14 +119,14 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
 
 
 def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
-                ) -> tuple[Registration, str]:
-    """The template on the scan, and what led it there: landmarks, or correspondences, or its pose."""
+                ) -> tuple[Registration, Correspondences | None, str]:
+    """The template on the scan, and what led it there: landmarks, or correspondences, or its pose; that in words."""
     if landmarks is not None or settings.init == "pose":
-        return (register(template, scan, landmarks, settings.registration),
+        return (register(template, scan, landmarks, settings.registration), None,
                 "pose" if landmarks is None else f"{len(landmarks[0])} landmarks")
     try:
         fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences)
-        return fit, f"{len(pairs)} correspondences"
+        return fit, pairs, f"{len(pairs)} correspondences"
     except ValueError as error:
         raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
 
@@ -137,4 +145,4 @@ def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanF
     return ScanFigures(
         name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged)
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)

@@ -24,6 +24,7 @@ from ..judgement import Judgement
 from .limbs import limb_doubts
 from .nonrigid import register, registration_problem
 from .person import person_parts
+from .repair import repaired
 from .schedule import RegistrationConfig
 
 TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
@@ -109,8 +110,11 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     hints = read_correspondences(correspondences) if correspondences else None
     with bar("registering") as progress:
         fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
+    with bar("finding the parts of a person") as progress:
+        parts = person_parts(body, progress)
+    with bar("trying other rolls of limbs") as progress:
+        fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
     write_mesh(output, fit.mesh)
-    parts = person_parts(body)
     doubts = limb_doubts(body, parts, fit.mesh.vertices) if parts else ()
     return Outcome(output, [
         *_led_by(given, pairs),
@@ -119,7 +123,8 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("confidence, mean", float(fit.confidence.mean())),
         Metric("scan off the template", 100 * fit.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
-        Metric("inverted triangles", fit.inverted), Metric("converged", str(fit.converged))], {"register": config},
+        Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
+        Metric("converged", str(fit.converged))], {"register": config},
         judgement=Judgement.of(registration_problem(body, data, fit, pairs is not None),
                                [doubt.words for doubt in doubts]))
 

@@ -31,7 +31,12 @@ SHAPE = 20.0                # what bending of an end of a body in itself weighs 
 def graph_fit(given: Inputs, T: np.ndarray, stages: tuple[GraphStage, ...], ends: int,
               tell: Callable[[int], None]) -> GraphFit:
     """The template bent onto the scan by all stages, from where a rigid transform (4, 4) places it."""
-    fit = start_fit(given.template, T, stages[0].nodes if stages else 300)
+    return followed(given, start_fit(given.template, T, stages[0].nodes if stages else 300), stages, ends, tell)
+
+
+def followed(given: Inputs, fit: GraphFit, stages: tuple[GraphStage, ...], ends: int,
+             tell: Callable[[int], None]) -> GraphFit:
+    """The fit after some stages."""
     for stage in stages:
         before, fit = fit, bent(given, fit, stage)
         fit = replace(fit, moved=float(np.linalg.norm(fit.x - before.x, axis=1).mean()))

@@ -64,23 +64,31 @@ class LimbMeasures:
 
     def doubts(self, skeleton: Skeleton) -> tuple[Doubt, ...]:
         """What is unlikely, the gravest first."""
-        found: list[Doubt] = []
+        return tuple(doubt for doubt, _ in self._found(skeleton))
+
+    def doubted(self, skeleton: Skeleton) -> list[int]:
+        """The parts that are, the gravest first."""
+        return list(dict.fromkeys(part for _, part in self._found(skeleton)))
+
+    def _found(self, skeleton: Skeleton) -> list[tuple[Doubt, int]]:
+        """Every doubt with its part, the gravest first."""
+        found: list[tuple[Doubt, int]] = []
         for part in range(1, len(PARTS)):
             name, parent = (in_words(skeleton.names[k]) for k in (part, skeleton.parents[part]))
             kind = int(self.beyond[part].argmax())
             if self.beyond[part, kind] > 0:
-                found.append(Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
-                                   f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
-                                   f"against the {parent}"))
+                found.append((Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
+                                    f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
+                                    f"against the {parent}"), part))
             if part in LIMBS and self.bending[part] > self.most[part]:
-                found.append(Doubt(float(self.bending[part] / self.most[part]),
-                                   f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
-                                   "rolled, or slid"))
+                found.append((Doubt(float(self.bending[part] / self.most[part]),
+                                    f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
+                                    "rolled, or slid"), part))
             if part in LIMBS and abs(self.growth[part]) > SCALE:
-                found.append(Doubt(abs(float(self.growth[part])) / SCALE,
-                                   f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
-                                   f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template"))
-        return tuple(sorted(found, key=lambda doubt: -doubt.excess))
+                found.append((Doubt(abs(float(self.growth[part])) / SCALE,
+                                    f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
+                                    f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template"), part))
+        return sorted(found, key=lambda pair: -pair[0].excess)
 
 
 def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:
@@ -90,12 +98,23 @@ def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tup
 
 def limb_measures(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> LimbMeasures:
     """How the parts of a template came to lie on its new vertices (N, 3), metres, against what people do."""
-    low, high, bent = people_do()
     angles = joint_angles(parts.skeleton.fit_rotations(template, vertices) @ parts.R_template_rest)
-    beyond = np.maximum(low - angles, angles - high) - np.array([SLACK[_kind(part)] for part in PARTS])
     bending, growth = part_bending(template, parts.skeleton, vertices)
-    most = (bent + np.array([SHAPE[_kind(part)] for part in PARTS])) * size(template.with_vertices(vertices))
-    return LimbMeasures(angles, np.maximum(beyond, 0), bending, most, growth - np.median(growth))
+    most = (people_do()[2] + np.array([SHAPE[_kind(part)] for part in PARTS])) * size(template.with_vertices(vertices))
+    return LimbMeasures(angles, beyond_people(angles), bending, most, growth - np.median(growth))
+
+
+def beyond_people(angles: np.ndarray) -> np.ndarray:
+    """By how much joint angles (..., 16, 3), degrees, are beyond what any person does."""
+    low, high = allowed()
+    return np.maximum(np.maximum(low - angles, angles - high), 0)
+
+
+def allowed() -> tuple[np.ndarray, np.ndarray]:
+    """The lowest and the highest joint angles (16, 3), degrees, that are not doubted."""
+    low, high, _ = people_do()
+    slack = np.array([SLACK[_kind(part)] for part in PARTS])
+    return low - slack, high + slack
 
 
 def _kind(part: str) -> str:
@@ -111,12 +130,17 @@ def joint_angles(R: np.ndarray) -> np.ndarray:
     """
     angles = np.zeros((*R.shape[:-2], 3))
     for part in range(1, len(PARTS)):
-        roll, bend, side = frames()[part]
-        relative = np.swapaxes(R[..., PARENTS[part], :, :], -1, -2) @ R[..., part, :, :]
-        about = rolls(relative, roll)
-        swing = rotations.log(relative @ rotations.exp(-about[..., None] * roll))
-        angles[..., part, :] = np.stack([about, swing @ bend, swing @ side], axis=-1)
-    return np.degrees(angles)
+        angles[..., part, :] = angles_of_joint(part, R[..., PARENTS[part], :, :], R[..., part, :, :])
+    return angles
+
+
+def angles_of_joint(part: int, R_parent: np.ndarray, R_part: np.ndarray) -> np.ndarray:
+    """Those of one part (..., 3), degrees, from its own and its parent's world rotations (..., 3, 3)."""
+    roll, bend, side = frames()[part]
+    relative = np.swapaxes(R_parent, -1, -2) @ R_part
+    about = rolls(relative, roll)
+    swing = rotations.log(relative @ rotations.exp(-about[..., None] * roll))
+    return np.degrees(np.stack([about, swing @ bend, swing @ side], axis=-1))
 
 
 @lru_cache(maxsize=1)

@@ -46,6 +46,7 @@ class Registration:
     inverted: int                # triangles that face against their surroundings
     confidence: np.ndarray       # (N,) from 0, made up from the surroundings, to 1: data here, from both directions
     uncovered: float
+    rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repaired`
 
 
 @one_thread()
@@ -85,15 +86,18 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     stages = tuple(s for s in config.graph if s.positions == 1 or given.descriptors is not None)
     tell = _counted(progress, sum(stage.rounds for stage in stages) + 1)
     T = placed(given) if start is None else start
-    fit = graph_fit(given, T, stages, config.ends, tell)
+    fit = finished(given, graph_fit(given, T, stages, config.ends, tell), config)
+    tell(1)
+    return measured(given, fit, scan)
+
+
+def finished(given: Inputs, fit: GraphFit, config: RegistrationConfig) -> GraphFit:
+    """The surface at last: laid on the scan below its noise, without inverted triangles."""
     if config.final_fit is not None:
-        final = final_fit(template, fit.x, given.target, given.landmarks, config.final_fit)
+        final = final_fit(given.template, fit.x, given.target, given.landmarks, config.final_fit)
         fit = replace(fit, x=final.vertices, energies={**fit.energies, "strain": final.strain},
                       iterations=fit.iterations + final.iterations, moved=final.moved)
-    x = without_inverted(template, fit.x)
-    inverted = int(inverted_triangles(template, x).sum())
-    tell(1)
-    return _result(given, replace(fit, x=x), inverted, scan)
+    return replace(fit, x=without_inverted(given.template, fit.x))
 
 
 def _counted(progress: Callable[[int, int], None] | None, total: int) -> Callable[[int], None]:
@@ -129,9 +133,10 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
             f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")
 
 
-def _result(given: Inputs, fit: GraphFit, inverted: int, scan: Mesh | np.ndarray) -> Registration:
+def measured(given: Inputs, fit: GraphFit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
     body = given.template.with_vertices(fit.x)
+    inverted = int(inverted_triangles(given.template, fit.x).sum())
     found = evidence(body, given.target, 0.015 * given.size, NORMALS * given.size)
     seen = found.confidence >= 0.5
     distances = np.where(seen, found.distances, np.nan)

@@ -5,8 +5,10 @@ compared with those of people, before its first scan is registered.
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from ..synthetic.people import PARENTS, PARTS, Person
 from .nonrigid import register, stretched_share
 
 UNCOVERED, STRETCHED = 0.02, 0.05      # shares of a template and of the person on it beyond which it is no person
+MATCHING = 30                          # per cent of the time, before the person is registered
 ENDS = 5                               # of limbs: head, hands and feet
 NAMES = tuple(f"{part[2:]}_{'left' if part[0] == 'l' else 'right'}" if part[1] == "_" else part for part in PARTS)
 
@@ -33,9 +36,21 @@ class PersonParts:
     R_template_rest: np.ndarray
 
 
-@lru_cache(maxsize=4)                  # a folder of scans shares one template
-def person_parts(template: Mesh) -> PersonParts | None:
-    """The parts of a template; None where the average person does not come to lie on it: an animal, a hand, a half."""
+def person_parts(template: Mesh, progress: Callable[[int, int], None] | None = None) -> PersonParts | None:
+    """The parts of a template; None where the average person does not come to lie on it: an animal, a hand, a half.
+
+    `progress` is called as progress(done, total). What was found is remembered as long as the template lives.
+    """
+    if template not in _known:
+        _known[template] = _found(template, progress or (lambda done, total: None))
+    return _known[template]
+
+
+_known: WeakKeyDictionary[Mesh, PersonParts | None] = WeakKeyDictionary()
+
+
+def _found(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
+    """The parts of a template that was not seen before."""
     person = average_person()
     try:
         seeds = find_seeds(person.mesh, template)
@@ -43,8 +58,10 @@ def person_parts(template: Mesh) -> PersonParts | None:
         return None
     if len(seeds) < ENDS:
         return None
-    pairs = find_correspondences(person.mesh, template, (seeds.template_vertices, seeds.scan_points))
-    fit = register(person.mesh, template, correspondences=pairs)
+    pairs = find_correspondences(person.mesh, template, (seeds.template_vertices, seeds.scan_points),
+                                 progress=lambda done, total: tell(round(MATCHING * done / total), 100))
+    fit = register(person.mesh, template, correspondences=pairs,
+                   progress=lambda done, total: tell(round(MATCHING + (100 - MATCHING) * done / total), 100))
     if fit.uncovered > UNCOVERED or stretched_share(person.mesh, fit.mesh) > STRETCHED:
         return None
     nearest = Surface(fit.mesh).closest(template.corners.mean(axis=1)).faces

@@ -109,6 +109,8 @@ class RegistrationConfig(Settings):
     graph : stages of the coarse registration by a deformation graph
     ends : int
         How many ends of the body are tried in other rotations about themselves; 0 leaves that out.
+    rolls : int
+        How many other rolls of the limbs are tried where limbs lie as no person's do; 0 leaves that out.
     final_fit : FinalFitConfig or None
         The last pass: the surface follows the scan below its noise.
     """
@@ -126,6 +128,7 @@ class RegistrationConfig(Settings):
         GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )
     ends: int = 5
+    rolls: int = 3
     final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
 
     @classmethod
@@ -140,4 +143,4 @@ class RegistrationConfig(Settings):
         first = (stage(500, 0.7, landmarks, 0.0, 24) for landmarks in (0.001, 0.1, 10.0))
         coarse = (stage(500, length, 0.01, 2 * length, 6) for length in (0.2, 0.1, 0.06, 0.04))
         fine = (stage(2000, length, 0.005, 0.04, 6) for length in (0.04, 0.02))
-        return cls((*first, *coarse, *fine), 0, None)
+        return cls((*first, *coarse, *fine), 0, 0, None)

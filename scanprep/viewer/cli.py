@@ -14,12 +14,12 @@ from .landmark_names import read_names
 from .pick import Clicked, PickApp
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[SCAN ...]")]
-Port = Annotated[int, Range(1, 65535)]
+Port = Annotated[int, Range(0, 65535)]
 Ending = Literal["json", "pp", "mrk.json", "lnd", "txt"]
 
 
 def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Ending = "json",
-                   unit: Unit | None = None, port: Port | None = None, open: bool = True) -> Outcome:
+                   unit: Unit | None = None, serve: Port | None = None) -> Outcome:
     """Click named points on a template and on scans, in the browser. Every click is saved at once.
 
     Example: scape pick template.ply scans
@@ -32,17 +32,17 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
         format: Of new landmark files, which are written beside each scan with its name: json, pp (MeshLab),
             mrk.json (3D Slicer), lnd (CAESAR), txt. A file that is there keeps its format, and a copy of it as it was.
         unit: Unit of the scans and of their landmarks.
-        port: Port of this machine to use; else any that is free.
-        open: Open the browser. With --no-open the address is printed, and how to reach it from another machine.
+        serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
+            to reach it is printed.
     """
-    from .server import serve
+    from .server import serve as show
 
     ending = ".landmarks.json" if format == "json" else "." + format
     template, *others = [Clicked.found(path, ending, unit, file) for path, file in ((mesh, None), *_files(scans))]
     _ = template.body                                     # a file that is no mesh is refused before a browser opens
     app = PickApp(template, others, read_names(names))
     before = {one.path: len(one.places) for one in (template, *others)}
-    serve(app, port, open)
+    show(app, serve or None, serve is None)
     done = [one for one in (template, *others) if one.places]
     return Outcome(None, [Metric("bodies with landmarks", len(done)),
                           Metric("landmarks", sum(len(one.places) for one in done)),

@@ -21,13 +21,13 @@ from ..geometry.surface import Surface
 from ..pictures.camera import Camera, upright
 from ..pictures.scene import Pane, pack_scene
 from ..pictures.shading import CLAY, Dots, Shape, Solid
-from ..pictures.thinned import thinned
 from .landmark_names import next_name
 from .messages import Message
 from .surface_clicks import Clickable
 
 TEMPLATE, SCAN = 0, 1                # panes
 ENOUGH = 4                           # landmarks from which the others can be predicted
+SLIDES = -1                          # movements by key are one as long as they follow each other
 KEPT = ".before"                     # ending of the copy of a landmark file as it was found
 
 Send = Callable[[Message], None]
@@ -43,7 +43,7 @@ class Clicked:
     unit: str | None = None
     places: Places = field(default_factory=dict)
     predicted: Places = field(default_factory=dict)
-    _body: Clickable | None = None
+    surface: Clickable | None = None
 
     @classmethod
     def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
@@ -58,13 +58,13 @@ class Clicked:
     @property
     def body(self) -> Clickable:
         """What is clicked on; read when it is first shown."""
-        if self._body is None:
-            self._body = Clickable(read_scan(self.path, self.unit))
-        return self._body
+        if self.surface is None:
+            self.surface = Clickable(read_scan(self.path, self.unit))
+        return self.surface
 
-    def close(self) -> None:
-        """Forget the surface, not the landmarks."""
-        self._body = None
+    def forget(self) -> None:
+        """Let go of the surface, not of the landmarks; it is read again when it is shown."""
+        self.surface = None
 
     def save(self) -> None:
         """Write all landmarks; a file that was there before is kept beside it, once."""
@@ -78,7 +78,7 @@ class Clicked:
     def pane(self, label: str) -> Pane:
         """Its surface as the browser gets it."""
         shape = self.body.shape
-        shown: Shape = Solid(thinned(shape)) if self.body.has_surface and isinstance(shape, Mesh) else \
+        shown: Shape = Solid(shape) if self.body.has_surface and isinstance(shape, Mesh) else \
             Dots(self.body.points[::max(1, len(self.body.points) // 150_000)], CLAY, 0.004)
         return Pane([shown], camera_of(shape), label)
 
@@ -97,6 +97,7 @@ class Change:
     body: int
     before: Mapping[str, np.ndarray | None]
     after: Mapping[str, np.ndarray | None]
+    drag: int = 0                        # number of the movement that it is part of; 0 for a click
 
 
 class PickApp:
@@ -178,8 +179,11 @@ class PickApp:
         """Nothing is left to do: every click was saved."""
 
     def on_place(self, send: Send, pane: int, name: str, origin: list[float], direction: list[float],
-                 inside: bool = False, seen: list[float] | None = None, dragged: bool = False) -> None:
-        """A landmark where a ray meets the surface; a landmark inside is half way to where the ray leaves the body."""
+                 inside: bool = False, seen: list[float] | None = None, drag: int = 0) -> None:
+        """A landmark where a ray meets the surface; one inside is half way to where the ray leaves the body.
+
+        The places of one drag, which has a number, are undone as one.
+        """
         one = self._editable(pane)
         body, ray = one.body, (_point(origin), _point(direction))
         place = body.middle(*ray) if inside else body.hit(*ray)
@@ -188,8 +192,8 @@ class PickApp:
         if place is None:
             self.note = "the click met nothing: turn the body so that the place faces you"
             return
-        self._change(self._number(pane), {self._named(name): place}, merged=dragged)
-        if not dragged:
+        self._change(self._number(pane), {self._named(name): place}, drag)
+        if not drag:
             self.choose_next(name, pane)
         self._predict_if_time(send, pane)
 
@@ -197,7 +201,7 @@ class PickApp:
         """Move a landmark along a ray, metres: into the body, to where a joint is."""
         along = _point(direction)
         place = self._editable(pane).places[name] + by * along / np.linalg.norm(along)
-        self._change(self._number(pane), {name: place}, merged=True)
+        self._change(self._number(pane), {name: place}, SLIDES)
 
     def on_remove(self, send: Send, pane: int, name: str) -> None:
         """Take a landmark away."""
@@ -214,7 +218,7 @@ class PickApp:
         if not 0 <= scan < len(self.scans):
             raise ValueError(f"scan: expected 0 to {len(self.scans) - 1}, got {scan}")
         if scan != self.current:
-            self.scans[self.current].close()
+            self.scans[self.current].forget()
             self.current = scan
             self.choose_next(None)
             send(self.scene())
@@ -273,13 +277,14 @@ class PickApp:
             self.names = (*self.names, name)
         return name
 
-    def _change(self, number: int, after: Mapping[str, np.ndarray | None], merged: bool = False) -> None:
-        """Set landmarks, remember what they were, save; `merged` with the change before, where that was a drag too."""
+    def _change(self, number: int, after: Mapping[str, np.ndarray | None], drag: int = 0) -> None:
+        """Set landmarks, remember what they were, save; the changes of one drag are one."""
         one = self._of(number)
         before = {name: one.places.get(name) for name in after}
-        if merged and self.done and self.done[-1].body == number and list(self.done[-1].after) == list(after):
+        last = self.done[-1] if self.done else None
+        if drag and last and (last.drag, last.body, *last.after) == (drag, number, *after):
             before = dict(self.done.pop().before)
-        self.done.append(Change(number, before, after))
+        self.done.append(Change(number, before, after, drag))
         self.undone.clear()
         self._set(number, after)
 

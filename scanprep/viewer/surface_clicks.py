@@ -11,7 +11,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays, Surface
 
 BESIDE = 1e-6                        # of the size: so far behind a hit a ray goes on
-THROUGH = 1.5                        # spacings of a cloud that a ray may pass a point by
+BY, DEEP = 4.0, 8.0                  # spacings of a cloud: from the ray to points, and along it
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +66,11 @@ class Clickable:
     def _point_along(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         along = (self.points - origin) @ direction
         aside = np.linalg.norm(self.points - origin - along[:, None] * direction, axis=1)
-        near = np.flatnonzero((aside < THROUGH * self._spacing) & (along > 0))
-        return self.points[near[along[near].argmin()]].copy() if len(near) else None
+        near = np.flatnonzero((aside < BY * self._spacing) & (along > 0))
+        if not len(near):
+            return None
+        front = near[along[near] < along[near].min() + DEEP * self._spacing]
+        return self.points[front[aside[front].argmin()]].copy()
 
     def middle(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         """The middle between where a ray enters the body and where it leaves it: inside, as joints are."""

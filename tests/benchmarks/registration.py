@@ -26,19 +26,26 @@ from scanprep.pipeline.scan import figures_of
 from scanprep.registration.limbs import Doubt, limb_doubts
 from scanprep.registration.nonrigid import Registration, register, registration_problem
 from scanprep.registration.person import PersonParts, person_parts
+from scanprep.registration.repair import repaired
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.registration.unmarked import register_unmarked
 
 SETS = {"tuning": (TUNING_POSES, TUNING_MEN), "held": (HELD_POSES, HELD_MEN)}
-COLUMNS = ("all_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped", "cpu_s", "wall_s")
+COLUMNS = ("all_mm", "before_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped",
+           "cpu_s", "wall_s")
 
 
-def registered(data: RealData, item: TestScan, marks: str, config: RegistrationConfig) -> Registration:
-    """The template on one scan, by clicks or by what is found without any."""
-    landmarks = item.landmarks(data, marks)
+def registered(data: RealData, parts: PersonParts, item: TestScan, marks: str, config: RegistrationConfig
+               ) -> tuple[Registration, Registration]:
+    """The template on one scan, by clicks or by what is found without any, before and after limbs were repaired."""
+    landmarks, pairs = item.landmarks(data, marks), None
     if landmarks is not None:
-        return register(data.template, item.scan, landmarks, config)
-    return register_unmarked(data.template, item.scan, config)[0]
+        found = register(data.template, item.scan, landmarks, config)
+    else:
+        found, pairs = register_unmarked(data.template, item.scan, config)
+    if registration_problem(data.template, item.scan, found, marks != "0"):
+        return found, found                      # as in a folder: it means nothing, whatever its limbs do
+    return found, repaired(data.template, item.scan, found, parts, landmarks, config, correspondences=pairs)
 
 
 class Judged(NamedTuple):
@@ -55,12 +62,13 @@ def measure(data: RealData, parts: PersonParts, kind: str, index: int, marks: st
     """Register one virtual scan, compare with the truth and judge it; the vertices are `kept` in a folder."""
     item = test_scan(data, kind, index, front)
     start = time.perf_counter(), time.process_time()
-    found = registered(data, item, marks, config)
+    before, found = registered(data, parts, item, marks, config)
     wall, cpu = time.perf_counter() - start[0], time.process_time() - start[1]
     if kept:
         kept.mkdir(exist_ok=True)
         np.save(kept / f"{item.name}_{marks}.npy", found.mesh.vertices)
-    row = {"scan": item.name, "kind": kind, **errors(found.mesh.vertices, item), "flipped": found.inverted,
+    row = {"scan": item.name, "kind": kind, **errors(found.mesh.vertices, item), "repaired": found is not before,
+           "before_mm": errors(before.mesh.vertices, item)["all_mm"], "flipped": found.inverted,
            "converged": found.converged, "seen_agrees": float((found.seen == item.seen).mean()),
            **worst_limb(found.mesh.vertices, item, parts), "cpu_s": cpu, "wall_s": wall}
     problem = registration_problem(data.template, item.scan, found, marks != "0")

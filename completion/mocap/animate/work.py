@@ -15,17 +15,18 @@ from scanprep.console import Metric, judgement_row
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
+from scanprep.pictures.shading import Dots
 
 from ...cli import rows
 from ...motion import Motion, spread_frames
 from ...motion_pictures import (
-    animated_picture,
+    MARKER,
     chart_residuals,
     chart_states,
+    frame_panes,
     marker_rows,
-    moving_picture,
-    picture_bodies,
-    picture_frames,
+    moving_pane,
+    played,
     worst_frames,
 )
 from ..files.markers import MarkerSequence, read_markers
@@ -131,16 +132,16 @@ def _other_person(work: Work, person: Subject, output: Path, motion: Motion, bod
     write_glb(output / "onto.glb", other, person)
     page.section("On another person", "The same rotations of the joints; the way over the ground is as much longer as "
                  "the legs are, and the feet are on the ground when those of the first are.")
-    page.picture(picture_frames(other, person, None))
+    page.bodies([moving_pane(other, person)])
 
 
 def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page) -> None:
     shown = spread_frames(len(motion.poses), KEYS)
     bodies = morphed_vertices(work.model, motion, morph_keys(goal, motion), shown)
     write_glb(output / "morph.glb", motion, body, bodies)
-    some = spread_frames(len(bodies), 24)
     page.section("With a body that changes", "Betas change from key to key, straight over time.")
-    page.picture(picture_bodies(motion, body, bodies, shown)).picture(moving_picture(bodies[some], body, 8.0))
+    page.bodies([moving_pane(motion, body, bodies=lambda frames: morphed_vertices(
+        work.model, motion, morph_keys(goal, motion), frames))])
 
 
 def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
@@ -155,13 +156,14 @@ def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
 def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str,
                 rows: list[tuple[str, Any, str]]) -> Page:
     """The page of `scape animate`."""
-    page = Page(f"{name}, animated", "The body in some frames, with the markers that were measured as dots.")
-    page.picture(picture_frames(motion, subject, markers.positions), "from the front and the person's left")
-    page.picture(picture_frames(motion, subject, markers.positions, turn=215.0), "the same frames from behind")
-    page.picture(animated_picture(motion, subject, 10.0, 4.0), "first seconds")
+    page = Page(f"{name}, animated", "The body in motion, with the markers that were measured as dots.")
+    at = markers.positions[played(motion)[0]]
+    dots = Dots(at[0], MARKER, 0.013, name="measured markers", labels=markers.labels)
+    page.bodies([moving_pane(motion, subject, [(dots, at)])],
+                "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
-    page.picture(picture_frames(motion, subject, markers.positions, worst_frames(motion, 8)),
-                 "where the markers are farthest off")
+    page.bodies(frame_panes(motion, subject, markers.positions, worst_frames(motion, 5)),
+                "where the markers are farthest off", 300)
     used = np.isfinite(motion.residuals).any(axis=0)
     labels = [label for label, is_used in zip(motion.labels, used, strict=True) if is_used]
     missing = ~np.isfinite(motion.residuals[:, used])

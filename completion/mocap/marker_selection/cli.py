@@ -15,13 +15,13 @@ from scanprep.geometry.files import read_registered
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Dots, render, side_by_side
+from scanprep.pictures.scene import Pane
+from scanprep.pictures.shading import Dots
 
 from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model, rows
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..marker_sets.pictures import SIDES
 from ..marker_sets.symmetry import label_pairs, marker_pairs
 from .candidates import candidate_layout
 from .design import MarkerDesign, design_markers
@@ -115,20 +115,16 @@ def _figures(result: MarkerDesign, bodies: int, candidates: int) -> list[Metric]
 CHOSEN, KEPT, LEFT = (0.80, 0.16, 0.14), (0.16, 0.32, 0.62), (0.72, 0.72, 0.70)
 
 
-def picture_design(design: MarkerDesign, body: Mesh, candidates: MarkerLayout, keep: tuple[str, ...] = (),
-                   height: int = 620) -> np.ndarray:
-    """The body from four sides: chosen markers red, those kept blue, those left out small and grey."""
+def design_pane(design: MarkerDesign, body: Mesh, candidates: MarkerLayout, keep: tuple[str, ...] = ()) -> Pane:
+    """The body with its markers: chosen ones red, those kept blue, those left out small and grey."""
+    labels = np.array(candidates.labels)
     skin = MarkerLayout(candidates.labels, candidates.vertices, 0.0, candidates.weights).place(body)
-    rows = {name: [i for i, label in enumerate(candidates.labels) if pick(label)] for name, pick in {
-        "chosen": lambda label: label in design.layout.labels and label not in keep,
-        "kept": lambda label: label in keep,
-        "left": lambda label: label not in design.layout.labels}.items()}
+    kept, chosen = np.isin(labels, keep), np.isin(labels, design.layout.labels)
     size = 0.0075 * float(np.ptp(body.vertices, axis=0).max())
-    shapes = [body] + [Dots(skin[rows[name]], color, radius) for name, color, radius in
-                       (("chosen", CHOSEN, size), ("kept", KEPT, size), ("left", LEFT, 0.6 * size)) if rows[name]]
-    cameras = look_around(body)
-    wide = max(camera.width / camera.height for camera in cameras)
-    return side_by_side([render(shapes, camera, int(wide * height) + 10, height) for camera in cameras], SIDES)
+    dots = [Dots(skin[which], color, radius, name=name, labels=labels[which].tolist()) for name, color, radius, which in
+            (("chosen", CHOSEN, size, chosen & ~kept), ("kept", KEPT, size, kept),
+             ("left out", LEFT, 0.6 * size, ~chosen)) if which.any()]
+    return Pane([body, *dots], look_around(body, turns=(20,))[0])
 
 
 def chart_curve(design: MarkerDesign) -> Any:
@@ -169,7 +165,7 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     """The page of `scape layout design`."""
     page = Page(f"{len(design.layout.labels)} markers", "Chosen so that bodies estimated from them are near the true "
                 "ones over their whole surface. Red: chosen; blue: kept; grey: left out.")
-    page.picture(picture_design(design, at_rest(model), candidates, keep))
+    page.bodies([design_pane(design, at_rest(model), candidates, keep)], height=560)
     chosen = [label for label in design.layout.labels if label not in keep]
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "

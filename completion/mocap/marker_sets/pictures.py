@@ -10,8 +10,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.pictures.camera import Camera, look_around
 from scanprep.pictures.page import Page
+from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots, Solid, render, side_by_side
-from scanprep.pictures.sheets import font
+from scanprep.pictures.sheets import font, webp_bytes
 from scanprep.skeleton.tree import Skeleton
 
 from .layout import MarkerLayout
@@ -87,13 +88,20 @@ def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = No
     return rows
 
 
+def layout_pane(body: Mesh, layout: MarkerLayout) -> Pane:
+    """A body with its markers, fixed and loose ones apart."""
+    points, loose = layout.place(body), np.isin(layout.labels, layout.loose)
+    radius = 0.0055 * float(np.ptp(body.vertices, axis=0).max())
+    dots = [Dots(points[which], color, radius, name=name, labels=np.array(layout.labels)[which].tolist())
+            for name, color, which in (("fixed", FIXED, ~loose), ("loose", LOOSE, loose)) if which.any()]
+    return Pane([Solid(body), *dots], look_around(body, turns=(20,))[0])
 
 
 def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray, figures: Mapping[str, str],
                 skeleton: Skeleton | None = None) -> Page:
-    """The page of `scape layout show`."""
+    """The page of `scape layout show`; a picture stands for the body until it turns."""
     page = Page(f"Markers: {name}", "Red markers sit on a point of the anatomy, yellow ones anywhere on their limb.")
-    page.picture(picture, alt="the body from four sides with its markers")
+    page.bodies([layout_pane(body, layout)], "", 640, webp_bytes(picture))
     page.table(list(figures.items()), ("", ""))
     page.section("Markers").table(
         marker_rows(body, layout, skeleton), ("label", "also", "part", "partner", "from the skin", "place"))

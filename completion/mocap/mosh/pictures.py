@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,11 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import Camera, look_around, upright
-from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
+from scanprep.pictures.camera import look_around, stance
+from scanprep.pictures.scene import Pane, picture_pane, picture_panes
+from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid, side_by_side
 
-from ...motion_pictures import MARKER, chart_states, facing, frames_apart, mean_over, moving_picture
+from ...motion_pictures import MARKER, chart_states, facing, frames_apart, mean_over, moving_pane, played, upwards
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
@@ -29,95 +29,58 @@ def standing(model: BodyModel, betas: np.ndarray) -> Mesh:
     return model.template.with_vertices(model.vertices(model.pose_mean, betas))
 
 
-def picture_sides(body: Mesh, found: np.ndarray, usual: np.ndarray | None = None, labels: Sequence[str] = (),
-                  height: int = 560) -> np.ndarray:
-    """A body from four sides with its markers (L, 3), and where they usually sit (L, 3) with a rod from there.
-
-    Those that moved most on each side are named by their labels.
-    """
-    cameras, images = look_around(body), []
-    for camera in cameras:
-        shapes: list[Shape] = [Solid(body), Dots(found, MARKER, 0.011)]
-        if usual is not None:
-            shapes += [Dots(usual, USUAL, 0.009), Bones(usual, found, USUAL, 0.004)]
-        image = render(shapes, camera, _width(camera, height), height)
-        if usual is not None and labels:
-            image = _named(image, camera, body, found, np.linalg.norm(found - usual, axis=1), labels)
-        images.append(image)
-    return side_by_side(images, SIDES)
+def picture_sides(body: Mesh, found: np.ndarray, height: int = 360) -> np.ndarray:
+    """A body from four sides with its markers (L, 3)."""
+    shapes: list[Shape] = [Solid(body), Dots(found, MARKER, 0.011)]
+    return picture_panes([Pane(shapes, camera, side) for camera, side in zip(look_around(body), SIDES, strict=True)],
+                         height)
 
 
-def _named(image: np.ndarray, camera: Camera, body: Mesh, found: np.ndarray, moved: np.ndarray,
-           labels: Sequence[str]) -> np.ndarray:
-    """The picture with the labels of at most 6 markers in sight that have moved most, none over another."""
-    from PIL import Image, ImageDraw
-    from scipy.spatial import cKDTree
-
-    from scanprep.pictures.sheets import INK, font
-
-    below = cKDTree(body.vertices).query(found)[1]
-    in_sight = body.vertex_normals[below] @ camera.axes[2] > 0.3
-    picture = Image.fromarray(image)
-    draw, height, width = ImageDraw.Draw(picture), *image.shape[:2]
-    places, taken = camera.project(found, width, height), np.zeros((0, 4))
-    for i in np.argsort(-moved):
-        x, y = places[i]
-        for where, anchor in (((x + 9, y), "lm"), ((x - 9, y), "rm")):
-            box = np.array(draw.textbbox(where, labels[i], font=font(13), anchor=anchor))
-            free = not len(taken) or ((box[2:] < taken[:, :2]) | (box[:2] > taken[:, 2:])).any(axis=1).all()
-            if in_sight[i] and moved[i] > 0.01 and free and box[0] > 0 and box[2] < width and len(taken) < 6:
-                draw.text(where, labels[i], fill=INK, anchor=anchor, font=font(13), stroke_width=2, stroke_fill="white")
-                taken = np.vstack([taken, box])
-                break
-    return np.asarray(picture)
+def person_pane(body: Mesh, found: np.ndarray, usual: np.ndarray, labels: Sequence[str]) -> Pane:
+    """A body with its markers (L, 3), and where they usually sit (L, 3) with a rod from there."""
+    return Pane([Solid(body, name="body"), Dots(found, MARKER, 0.011, name="markers as found", labels=labels),
+                 Dots(usual, USUAL, 0.009, name="in the layout"),
+                 Bones(usual, found, USUAL, 0.004, name="from one to the other")], look_around(body, turns=(20,))[0])
 
 
-def every(count: int, most: int = 56) -> int:  # pictures on a contact sheet
-    """1, 2, 5, 10, 20, 50 ...: of so many frames, every so many make at most so many pictures."""
-    power = 1
-    while True:
-        for step in (1, 2, 5):
-            if -(-count // (step * power)) <= most:
-                return step * power
-        power *= 10
+def kinds_of_markers(take: Take) -> dict[str, tuple[Sequence[float], np.ndarray]]:
+    """Name -> colour and places (T, L, 3) of the measured markers that are so; NaN elsewhere."""
+    held = np.isin(take.markers.labels, () if take.held is None else take.held.labels)
+    used = np.isfinite(take.motion.residuals).any(axis=0) & ~held
+    kinds = {"believed markers": (MARKER, take.motion.trusted & used),
+             "not believed": (UNCERTAIN, ~take.motion.trusted & used), "held-out markers": (UNUSED, held)}
+    found = {name: (color, np.where(np.broadcast_to(which, take.motion.trusted.shape)[..., None],
+                                    take.markers.positions, np.nan)) for name, (color, which) in kinds.items()}
+    return {name: (color, at) for name, (color, at) in found.items() if np.isfinite(at).any()}
 
 
-def contact_sheet(take: Take, frames: np.ndarray, columns: int = 8, width: int = 122) -> np.ndarray:
-    """Frames of a sequence, 85% of them at one scale, the camera going along, the measured markers as dots."""
-    motion, bodies = take.shown, take.bodies(frames)
-    cameras = [facing(take.subject, motion.poses[t], body, 35.0) for t, body in zip(frames, bodies, strict=True)]
-    tall, wide = (float(np.percentile([getattr(c, side) for c in cameras], 85)) for side in ("height", "width"))
-    wide = min(max(wide, 0.5 * tall), 0.75 * tall)         # what is larger is shown smaller, not everything
-    images = []
-    for t, body, camera in zip(frames, bodies, cameras, strict=True):
-        even = replace(camera, height=max(tall, camera.height), width=max(wide, camera.width))
-        shapes: list[Shape] = [take.light.mesh(body), marker_dots(take, int(t), 0.019, coarse=True)]
-        images.append(render(shapes, even, width, round(width * tall / wide)))
-    return side_by_side(images, [f"{t} · {t / motion.rate:.2f} s" for t in frames], gap=4, columns=columns)
-
-
-def marker_dots(take: Take, t: int, radius: float = 0.014, coarse: bool = False) -> Dots:
+def marker_dots(take: Take, t: int, radius: float = 0.014) -> list[Dots]:
     """The measured markers of a frame: believed, not believed, and those that no stage has seen."""
-    colors = np.where(take.motion.trusted[t][:, None], MARKER, UNCERTAIN)
-    unused = ~np.isfinite(take.motion.residuals).any(axis=0)
-    held = () if take.held is None else take.held.labels
-    points = take.markers.positions[t].copy()
-    for i, label in enumerate(take.markers.labels):
-        if label in held:
-            colors[i] = UNUSED
-        elif unused[i]:
-            points[i] = np.nan
-    return Dots(points, colors, radius, coarse=coarse)
+    return [Dots(at[t], color, radius, name=name) for name, (color, at) in kinds_of_markers(take).items()]
+
+
+def take_pane(take: Take) -> Pane:
+    """The whole sequence with its markers."""
+    frames, _ = played(take.shown)
+    dots = [(Dots(at[0], color, 0.013, name=name, labels=take.markers.labels), at[frames])
+            for name, (color, at) in kinds_of_markers(take).items()]
+    return moving_pane(take.shown, take.subject, dots, take.make, take.light)
+
+
+def frame_panes(take: Take, frames: np.ndarray) -> list[Pane]:
+    """Some frames with their markers."""
+    vertical = upwards(take.shown, take.subject)
+    return [Pane([take.light.mesh(body), *marker_dots(take, int(t))],
+                 facing(take.subject, take.shown.poses[t], body, vertical=vertical),
+                 f"{t} · {t / take.shown.rate:.2f} s")
+            for t, body in zip(frames, take.bodies(frames), strict=True)]
 
 
 def picture_large(take: Take, frames: np.ndarray, height: int = 340) -> np.ndarray:
     """Some frames in a row, each as large as fits."""
-    images = []
-    for t, body in zip(frames, take.bodies(frames), strict=True):
-        camera = facing(take.subject, take.shown.poses[t], body, 35.0)
-        shapes: list[Shape] = [take.light.mesh(body), marker_dots(take, int(t))]
-        images.append(render(shapes, camera, round(0.62 * height), height))
-    return side_by_side(images, [f"{t} · {t / take.shown.rate:.2f} s" for t in frames])
+    panes = frame_panes(take, frames)
+    return side_by_side([picture_pane(pane, round(0.62 * height), height) for pane in panes],
+                        [pane.label for pane in panes])
 
 
 def soft_change(take: Take, frames: np.ndarray) -> np.ndarray:
@@ -128,33 +91,28 @@ def soft_change(take: Take, frames: np.ndarray) -> np.ndarray:
     return np.einsum("tnd,tnd->tn", soft - rigid, normals)
 
 
-def picture_soft_map(take: Take, frames: np.ndarray, height: int = 460) -> np.ndarray:
-    """Where the body is soft: the root mean square of the change over some frames, from four sides."""
+def soft_pane(take: Take, frames: np.ndarray) -> Pane:
+    """Where the body is soft: the root mean square of the change over some frames."""
     change = np.sqrt(((take.bodies(frames) - take.rigid(frames))**2).sum(axis=2).mean(axis=0))
     body = take.subject.template.with_vertices(
         take.subject.vertices(take.model.pose_mean).astype(float))
     end = max(float(np.percentile(change, 99.5)), LITTLE)
-    images = [render(Solid(body, heat(change, 0, end)), camera, _width(camera, height), height)
-              for camera in look_around(body)]
-    bar = color_bar(0, end, "change of the skin, root mean square over time")
-    return side_by_side([side_by_side(images, SIDES), bar], columns=1)
+    shown = Heat(change, 0, end, "change of the skin, root mean square over time")
+    return Pane([Solid(body, shown)], look_around(body, turns=(20,))[0])
 
 
-def picture_fixed_and_soft(take: Take, frames: np.ndarray, height: int = 400) -> np.ndarray:
-    """Frames with the fixed shape above, and below with soft tissue, red where the skin moved out, blue inwards."""
-    change, template = soft_change(take, frames), take.subject.template
-    end = max(float(np.percentile(np.abs(change), 99.5)), LITTLE)
-    rows: list[list[np.ndarray]] = [[], []]
+def changed_panes(take: Take, frames: np.ndarray) -> list[Pane]:
+    """Frames with soft tissue, coloured by how far it moves the skin; the fixed shape can be laid over each."""
+    change, light, vertical = soft_change(take, frames), take.light, upwards(take.shown, take.subject)
+    end, panes = max(float(np.percentile(np.abs(change), 99.5)), LITTLE), []
     for t, rigid, soft, out in zip(frames, take.rigid(frames), take.bodies(frames), change, strict=True):
-        camera = facing(take.subject, take.shown.poses[t], soft, 35.0)
-        width = round(0.62 * height)
-        rows[0].append(render([Solid(template.with_vertices(rigid)), marker_dots(take, int(t), 0.010)], camera, width,
-                              height))
-        rows[1].append(render([Solid(template.with_vertices(soft), heat(out, -end, end, "coolwarm")),
-                               marker_dots(take, int(t), 0.010)], camera, width, height))
-    seconds = [f"{t} · {t / take.shown.rate:.2f} s" for t in frames]
-    return side_by_side([side_by_side(rows[0]), side_by_side(rows[1], seconds),
-                         color_bar(-end, end, "skin moved inwards (-) and outwards", "coolwarm")], columns=1)
+        shown = Heat(out[light.vertex_ids], -end, end, "skin moved inwards (-) and outwards", colormap="coolwarm")
+        shapes: list[Shape] = [
+            Solid(light.mesh(soft), shown, name="with soft tissue"),
+            Solid(light.mesh(rigid), name="fixed shape", visible=False), *marker_dots(take, int(t), 0.010)]
+        panes.append(Pane(shapes, facing(take.subject, take.shown.poses[t], soft, vertical=vertical),
+                          f"{t} · {t / take.shown.rate:.2f} s"))
+    return panes
 
 
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
@@ -163,30 +121,12 @@ def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
     return frames_apart(frames[np.argsort(-size)], count, len(take.motion.poses) / (3 * count))
 
 
-def moving(take: Take, seconds: float = 4.0, rate: float = 6.0) -> bytes:
-    """The first seconds as an endless picture."""
-    motion = take.shown
-    span = max(1, min(len(motion.poses), round(seconds * motion.rate)))
-    frames = np.arange(0, span, max(1, round(motion.rate / rate)))
-    shown = take.bodies(frames)[:, take.light.vertex_ids]
-    return moving_picture(shown, take.subject, motion.rate * len(frames) / span, 240, 320, take.light.faces,
-                          motion.poses[frames[len(frames) // 2]])
-
-
 def change_of_place(body: Mesh, layout: MarkerLayout, found: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
     """Where markers sit on a body (L, 3) metres, and from where they usually sit: up, forward, to its left (L, 3)."""
-    up, front = upright(body)
-    across = [(up + 1) % 3, (up + 2) % 3]
-    axes = np.zeros((3, 3))
-    axes[0, up] = 1
-    axes[1, across] = np.cos(np.radians(front)), np.sin(np.radians(front))
-    axes[2] = np.cross(axes[0], axes[1])
+    vertical, ahead = stance(body)
+    axes = np.stack([vertical, ahead, np.cross(vertical, ahead)])
     places = found.place(body)
     return places, (places - layout.place(body)) @ axes.T
-
-
-def _width(camera: Camera, height: int) -> int:
-    return max(120, round(height * camera.width / camera.height) + 8)
 
 
 STATES = {"believed": "#e3eaf0", "not believed": "#f0c46c", "missing": "#9aa3ab", "swapped": "#2f6db3",

@@ -14,10 +14,13 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Dots, Shape, render, side_by_side
+from scanprep.pictures.scene import Pane
+from scanprep.pictures.shading import Dots
+from scanprep.pictures.sheets import webp_bytes
 
 from ...cli import rows
-from ...motion_pictures import MARKER, facing, marker_rows, mean_over, worst_frames
+from ...motion import spread_frames
+from ...motion_pictures import MARKER, facing, marker_rows, mean_over, upwards, worst_frames
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
 from .mosh import MoshResult
@@ -25,6 +28,7 @@ from .pictures import chart_artefacts, chart_frames, chart_map, chart_timeline
 from .takes import Take
 
 PICTURE = "picture.png"
+SOME = 56                            # frames that changes of the body are measured in
 COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
           "green for held-out markers, which no stage has seen.")
 _STYLE = """.entry { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
@@ -41,22 +45,22 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     found, moved = pictures.change_of_place(body, before, result.layout)
     page = Page(f"{name}: body shape and markers",
                 f"Found from the markers of {len(takes)} {'sequence' if len(takes) == 1 else 'sequences'} alone.")
-    page.picture(pictures.picture_sides(body, found),
-                 "the body from four sides, in the mean pose of the model's people; red: where the markers sat")
+    told = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, np.linalg.norm(moved, axis=1), strict=True)]
+    page.bodies([pictures.person_pane(body, found, before.place(body), told)],
+                "the body in the mean pose of the model's people; red: where the markers sat, blue: where the layout "
+                "has them, with a rod from the one to the other", 520)
     page.section("Sequences")
     for take in takes:
         add_entry(page, take.name, (f"{m.name}: {m.text()} {m.unit}" for m in _main(figures[take.name])))
     _worn_section(page, result)
-    page.section("Markers before and after", "Blue: where the layout has each marker on this body. Red: where it was "
-                 "found, with a rod from the one to the other. Those that moved most are named, from a centimetre on.")
-    page.picture(pictures.picture_sides(body, found, before.place(body), labels))
+    page.section("Markers before and after", "From where the layout has each marker to where it was found.")
     page.table(_moved_rows(result, before, moved, takes),
                ("marker", "moved (mm)", "up (mm)", "forward (mm)", "to the left (mm)", "off the skin, layout (mm)",
                 "found (mm)", "distance left, fixed shape (mm)"))
     if before.loose:
         page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
     page.section("Frames that shape and markers were found from")
-    page.picture(_chosen_frames(model, result, takes))
+    page.bodies(_chosen_frames(result, takes), height=200)
     return closing(page, metrics, settings)
 
 
@@ -76,18 +80,17 @@ def _worn_section(page: Page, result: MoshResult) -> None:
 
 def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
     """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
-    step = pictures.every(len(take.motion.poses))
-    frames = np.arange(0, len(take.motion.poses), step)
+    frames = spread_frames(len(take.motion.poses), SOME)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
     page.table(rows(_main(metrics)))
-    page.section("The whole sequence", f"Every {_th(step)} frame; below each its number and time.")
-    page.picture(pictures.contact_sheet(take, frames))
-    page.picture(pictures.moving(take), "the first seconds")
+    page.section("The whole sequence").bodies(
+        [pictures.take_pane(take)], "Press the triangle to play, drag the body to turn it; it is kept in the middle.",
+        520, webp_bytes(take_picture(take)))
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
     page.chart(chart_frames(take), "mean of the markers, over time")
     page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
                                 "as bad")
-    page.picture(pictures.picture_large(take, worst_frames(take.shown, 7)), "the frames in which they are farthest")
+    page.bodies(pictures.frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest", 300)
     page.table(_marker_rows(take), ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)",
                                     "seen (%)", "believed (%)"))
     _unused(page, take)
@@ -107,9 +110,9 @@ def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) 
 def _soft_section(page: Page, take: Take, frames: np.ndarray) -> None:
     page.section("Soft tissue", "The shape may change in every frame, as flesh does and as a pose model with one fixed "
                  "shape cannot. What it takes up may also be markers that slide with the skin.")
-    page.picture(pictures.picture_soft_map(take, frames), "where the body changes most")
-    page.picture(pictures.picture_fixed_and_soft(take, pictures.most_changed(take, frames, 5)),
-                 "frames that change most; above with the person's own shape, below with soft tissue")
+    page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
+    page.bodies(pictures.changed_panes(take, pictures.most_changed(take, frames, 4)),
+                "frames that change most", 300)
 
 
 def _artefact_section(page: Page, take: Take) -> None:
@@ -147,7 +150,7 @@ def add_entry(page: Page, name: str, lines: Iterable[str]) -> None:
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
     """A person from four sides with the markers, for the page of all people."""
     body = pictures.standing(model, result.betas)
-    return pictures.picture_sides(body, result.layout.place(body), height=360)
+    return pictures.picture_sides(body, result.layout.place(body))
 
 
 def take_picture(take: Take, count: int = 6) -> np.ndarray:
@@ -156,17 +159,15 @@ def take_picture(take: Take, count: int = 6) -> np.ndarray:
     return pictures.picture_large(take, frames, 260)
 
 
-def _chosen_frames(model: BodyModel, result: MoshResult, takes: Sequence[Take], height: int = 220) -> np.ndarray:
-    person, subject = result.person, takes[0].subject
-    images, labels = [], []
+def _chosen_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
+    person, subject, light = result.person, takes[0].subject, takes[0].light
+    panes, vertical = [], upwards(takes[0].shown, subject)
     for (number, t), pose, trans in zip(person.frames.tolist(), person.poses, person.trans, strict=True):
-        vertices = subject.vertices(pose, trans).astype(float)
-        shapes: list[Shape] = [model.template.with_vertices(vertices),
-                               Dots(takes[number].markers.select(_there(takes[number], result)).positions[t], MARKER,
-                                    0.015)]
-        images.append(render(shapes, facing(subject, pose, vertices, 35.0), 160, height))
-        labels.append(str(t) if len(takes) == 1 else f"{number + 1}: {t}")
-    return side_by_side(images, labels, columns=6)
+        vertices, take = subject.vertices(pose, trans).astype(float), takes[number]
+        dots = Dots(take.markers.select(_there(take, result)).positions[t], MARKER, 0.015)
+        panes.append(Pane([light.mesh(vertices), dots], facing(subject, pose, vertices, vertical=vertical),
+                          str(t) if len(takes) == 1 else f"{number + 1}: {t}"))
+    return panes
 
 
 def _there(take: Take, result: MoshResult) -> list[str]:
@@ -211,7 +212,3 @@ def _unused(page: Page, take: Take) -> None:
               if not is_used and label not in held]
     if unused:
         page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
-
-
-def _th(number: int) -> str:
-    return "" if number == 1 else f"{number}th"

@@ -8,11 +8,10 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject, posed_product
-from scanprep.decimation.registered_set import decimate_set
-from scanprep.geometry.mesh import Mesh
 
 from ...energy import lifted
 from ...motion import Motion
+from ...motion_pictures import LightMesh
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
@@ -20,28 +19,7 @@ from ..pose.marked_body import supports
 from ..soft_tissue.soft_tissue import SoftTissue
 from .recordings import Recording
 
-LIGHT = 7000                         # triangles of a body in small pictures
 AT_ONCE = 128                        # frames whose changes are held at a time
-
-
-@dataclass(frozen=True, eq=False)
-class LightMesh:
-    """Some of the vertices (n,) of a body and triangles (f, 3) between them, for small pictures."""
-
-    vertex_ids: np.ndarray
-    faces: np.ndarray
-
-    @staticmethod
-    def of(template: Mesh) -> LightMesh:
-        """At most `LIGHT` triangles; of a body that has no more its own."""
-        if len(template.faces) <= LIGHT:
-            return LightMesh(np.arange(len(template.vertices)), template.faces)
-        small = decimate_set(template, None, LIGHT)
-        return LightMesh(small.vertex_map, small.template.faces)
-
-    def mesh(self, vertices: np.ndarray) -> Mesh:
-        """The small mesh of a large one's vertices (N, 3)."""
-        return Mesh(vertices[self.vertex_ids], self.faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +65,13 @@ class Take:
         """The meshes (n, N, 3) of some frames, metres, with soft tissue where there is one; made once each."""
         new = np.array([t for t in map(int, frames) if t not in self._kept], dtype=int)
         if len(new):
-            made = self.motion.vertices(self.subject, new) if self.soft is None else \
-                self.soft.vertices(self.model, new)
-            self._kept.update(zip(new.tolist(), made.astype(np.float32), strict=True))
+            self._kept.update(zip(new.tolist(), self.make(new).astype(np.float32), strict=True))
         return np.stack([self._kept[int(t)] for t in frames]).astype(float)
+
+    def make(self, frames: np.ndarray) -> np.ndarray:
+        """As `bodies`, which are not kept."""
+        return self.motion.vertices(self.subject, frames) if self.soft is None else \
+            self.soft.vertices(self.model, frames)
 
     def rigid(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
         """The meshes (n, N, 3) of the same poses with the person's own shape."""

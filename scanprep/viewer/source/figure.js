@@ -1,8 +1,10 @@
 // A figure: panes side by side, with their buttons, legend and timeline. Reports are made of these, and programs too.
-import { Layer, millimetres, SURFACES } from "./layer.js";
+import { Layer, SURFACES, told } from "./layer.js";
 import { Pane } from "./pane.js";
 
 const SIDES = { "first view": [0, null], front: [0, 0], left: [90, 0], back: [180, 0], right: [-90, 0], above: [0, 85] };
+
+const FEW_NAMES = [80, 15];                             // that are shown at first, where nothing moves, and in motions
 
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
@@ -43,6 +45,8 @@ export class Figure {
     for (const layer of described.layers) pane.add(new Layer(layer, this.scene.columns));
     if (described.label) box.append(make("div", { class: "sk-label" }, described.label));
     box.append(pane.tip = make("div", { class: "sk-tip", hidden: true }));
+    const moves = pane.layers.some((layer) => layer.motion);
+    pane.names = pane.layers.reduce((sum, layer) => sum + layer.labels.length, 0) <= FEW_NAMES[moves ? 1 : 0];
     pane.onTurn = () => this.turned(pane);
     pane.canvas.addEventListener("pointermove", (event) => this.tell(pane, event));
     pane.canvas.addEventListener("pointerleave", () => { pane.tip.hidden = true; });
@@ -56,15 +60,21 @@ export class Figure {
     const { tools } = this;
     tools.replaceChildren(choice("side", Object.keys(SIDES), (i) => this.look(...Object.values(SIDES)[i])),
       choice("surface", SURFACES, (i) => this.each((layer) => layer.setSurface(SURFACES[i]))));
-    const shades = [...new Set(this.layers.flatMap((layer) => layer.shades.map((shade) => shade.name)))];
-    if (shades.length > 1 && this.layers.some((layer) => layer.shades.length > 1)) {
-      tools.append(choice("colour", shades.map((name) => name || "as given"), (i) => this.color(shades[i])));
+    const many = this.layers.filter((layer) => layer.shades.length > 1);
+    if (many.length) {
+      const shades = [...new Set(many.flatMap((layer) => layer.shades.map((shade) => shade.name)))];
+      tools.append(choice("colour", shades.map((name) => name || "as given"), (i) => this.color(shades[i]),
+        shades.indexOf(many[0].shade.name)));
     }
     const named = [...new Set(this.layers.map((layer) => layer.name).filter(Boolean))];
     for (const name of named) {
       const shown = this.layers.some((layer) => layer.name === name && layer.object.visible);
       const box = make("input", { type: "checkbox", checked: shown, onchange: () => this.show(name, box.checked) });
       tools.append(make("label", {}, box, name));
+    }
+    if (this.layers.some((layer) => layer.labels.length)) {
+      const box = make("input", { type: "checkbox", checked: this.labelled(), onchange: () => this.label(box.checked) });
+      tools.append(make("label", {}, box, "names"));
     }
     if (this.panes.length > 1) {
       const box = make("input", { type: "checkbox", checked: this.linked, onchange: () => { this.linked = box.checked; } });
@@ -98,6 +108,16 @@ export class Figure {
     this.each((layer) => { if (layer.name === name) layer.object.visible = visible; });
   }
 
+  // Names of points are shown; many of them would hide the body, and are so at first.
+  labelled() { return this.panes.some((pane) => pane.names); }
+
+  label(on) {
+    for (const pane of this.panes) {
+      pane.names = on;
+      pane.redraw();
+    }
+  }
+
   turned(pane) {
     if (!this.linked) return;
     for (const other of this.panes) if (other !== pane) other.follow(pane);
@@ -116,16 +136,16 @@ export class Figure {
 
   legend() {
     this.below.querySelectorAll(".sk-legend").forEach((old) => old.remove());
-    const told = new Set();
+    const known = new Set();
     for (const { shade } of this.layers) {
-      if (!shade?.legend || told.has(JSON.stringify(shade.legend))) continue;
-      told.add(JSON.stringify(shade.legend));
+      if (!shade?.legend || known.has(JSON.stringify(shade.legend))) continue;
+      known.add(JSON.stringify(shade.legend));
       const { title, low, high } = shade.legend;
       const stops = Array.from({ length: 12 }, (_, i) => `#${shade.palette.slice(6 * Math.round(i * 254 / 11)).slice(0, 6)}`);
       this.below.prepend(make("div", { class: "sk-legend" }, make("span", {}, title),
-        make("span", { class: "sk-low" }, millimetres(low)),
+        make("span", { class: "sk-low" }, told(low, shade.legend)),
         make("span", { class: "sk-ramp", style: `background: linear-gradient(to right, ${stops.join(", ")})` }),
-        make("span", {}, millimetres(high))));
+        make("span", {}, told(high, shade.legend))));
     }
   }
 

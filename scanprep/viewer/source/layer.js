@@ -71,7 +71,7 @@ export class Layer {
     const { legend, index } = this.shade;
     if (!legend) return "";
     const place = this.columns[index][vertex];
-    return place === 255 ? "no data" : millimetres(legend.low + (legend.high - legend.low) * place / 254);
+    return place === 255 ? "no data" : told(legend.low + (legend.high - legend.low) * place / 254, legend);
   }
 
   setSurface(kind) {
@@ -125,6 +125,11 @@ export class Layer {
   }
 }
 
+// A value in the unit of its legend.
+export function told(value, { unit }) {
+  return unit === "%" ? `${(100 * value).toFixed(0)}%` : millimetres(value);
+}
+
 export function millimetres(metres) {
   const value = 1000 * metres;
   return `${Math.abs(value) >= 100 ? value.toFixed(0) : Number(value.toPrecision(3))} mm`;
@@ -136,14 +141,15 @@ class Motion {
     Object.assign(this, { rate, frames, rank, coefficients: new Int16Array(columns[coefficients].buffer) });
     this.seen = seen === undefined ? null : columns[seen];
     this.scale = scale;
-    this.basis = Float32Array.from(columns[basis]);
-    this.count = this.basis.length / rank;
+    this.basis = basis === null ? null : Float32Array.from(columns[basis]);      // without: each point on its own
+    this.count = basis === null ? rank : this.basis.length / rank;
   }
 
   write(frame, positions) {
     const { rank, basis } = this;
     const row = this.coefficients.subarray(3 * rank * frame, 3 * rank * (frame + 1));
     const c = Float32Array.from(row, (value, i) => value * this.scale[Math.floor(i / 3)]);
+    if (!basis) { positions.set(c); return; }
     for (let n = 0, at = 0; n < this.count; n++) {
       let x = 0, y = 0, z = 0;
       for (let r = 0, k = 0; r < rank; r++, k += 3, at++) {
@@ -211,7 +217,9 @@ function dotMaterial(radius, onTop) {
       void main() {
         shade = color;
         vec4 eye = modelViewMatrix * vec4(position, 1.0);
+        vec4 front = projectionMatrix * (eye + vec4(0.0, 0.0, radius, 0.0));    // half of a ball on a skin is in sight
         gl_Position = projectionMatrix * eye;
+        gl_Position.z = front.z / front.w * gl_Position.w;
         gl_PointSize = max(2.0, radius * pixels * projectionMatrix[1][1] / gl_Position.w);
       }`,
     fragmentShader: `varying vec3 shade;

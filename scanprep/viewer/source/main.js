@@ -1,4 +1,5 @@
 // What a page calls: `scapekit.start()` in reports, `scapekit.start("view")` and the like in programs.
+import { Complete } from "./complete.js";
 import { Figure } from "./figure.js";
 import { hasWebGL } from "./pane.js";
 import { Pick } from "./pick.js";
@@ -33,7 +34,7 @@ async function turn(figure) {
   figure.dataset.turns = "";
 }
 
-const PROGRAMS = { pick: Pick, view: View };
+const PROGRAMS = { complete: Complete, pick: Pick, view: View };
 
 export function start(name) {
   if (!name) startReport();

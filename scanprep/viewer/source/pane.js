@@ -157,8 +157,8 @@ export class Pane {
     this.context.fillStyle = getComputedStyle(this.canvas).backgroundColor;
     this.context.fillRect(0, 0, width, height);
     this.context.drawImage(renderer.domElement, 0, tall - height, width, height, 0, 0, width, height);
-    const taken = [];                                   // by labels: those drawn last in the list come first
-    for (const layer of [...this.layers].reverse()) drawLabels(this, layer, taken);
+    const taken = this.told = [];                       // by labels: those drawn last in the list come first
+    if (this.names !== false) for (const layer of [...this.layers].reverse()) drawLabels(this, layer, taken);
     for (const overlay of this.overlays) overlay(this.context, this);
     this.drawn = (this.drawn ?? 0) + 1;
   }
@@ -171,6 +171,13 @@ export class Pane {
     this.camera.updateMatrixWorld();
     raycaster.setFromCamera(new Vector2(2 * x / box.width - 1, 1 - 2 * y / box.height), this.camera);
     return { raycaster, x, y };
+  }
+
+  // Whether a surface stands between the camera and a point.
+  covers(point) {
+    const way = point.clone().sub(this.camera.position), far = way.length();
+    const raycaster = new Raycaster(this.camera.position, way.normalize(), 0, far - 0.01);
+    return this.layers.some((layer) => layer.described.opacity === 1 && layer.hit(raycaster));
   }
 
   hit(event) {
@@ -207,11 +214,11 @@ function drawLabels(pane, layer, taken) {
   context.fillStyle = style.color;
   layer.labels.forEach((text, i) => {
     if (!text || layer.hidden.has(i)) return;
-    const at = pane.project(new Vector3().fromArray(layer.positions, 3 * i));
-    if (!at) return;
+    const point = new Vector3().fromArray(layer.positions, 3 * i), at = pane.project(point);
+    if (!at || (!layer.described.on_top && pane.covers(point))) return;
     const x = (at.x + 8) * scale, y = at.y * scale, wide = context.measureText(text).width, high = 7 * scale;
     if (taken.some((box) => x < box.right && x + wide > box.left && y - high < box.bottom && y + high > box.top)) return;
-    taken.push({ left: x, right: x + wide, top: y - high, bottom: y + high });
+    taken.push({ text, left: x, right: x + wide, top: y - high, bottom: y + high });
     context.strokeText(text, x, y);
     context.fillText(text, x, y);
   });

@@ -14,6 +14,7 @@ export class Pick extends Program {
   constructor() {
     super();
     this.linked = false;                                // template and scan stand differently
+    this.drags = Date.now() % 1e9;                      // of other tabs' numbers too
     this.inside = false;
     this.state = null;
     this.measured = [];
@@ -106,7 +107,7 @@ export class Pick extends Program {
   // Landmarks as dots with names, in every pane.
   paint() {
     if (!this.figure || !this.state) return;
-    this.figure.panes.forEach((pane, i) => {
+    this.figure.panes.slice(0, 2).forEach((pane, i) => {
       const marks = this.state.panes[i];
       if (!marks) return;
       const groups = { predicted: i === 1 ? this.waiting() : {}, set: {}, chosen: {} };
@@ -118,7 +119,7 @@ export class Pick extends Program {
   }
 
   shown(figure) {
-    figure.panes.forEach((pane, i) => this.listen(pane, i));
+    figure.panes.slice(0, 2).forEach((pane, i) => this.listen(pane, i));
     this.paint();
   }
 
@@ -128,23 +129,23 @@ export class Pick extends Program {
     canvas.addEventListener("pointerdown", (event) => {
       if (event.button !== 0) return;
       const name = this.near(pane, number, event);
-      down = { x: event.clientX, y: event.clientY, name, moved: false };
+      down = { x: event.clientX, y: event.clientY, name, moved: false, drag: ++this.drags };
       if (name && !(number === 0 && this.state.fixed)) { pane.controls.enabled = false; canvas.setPointerCapture(event.pointerId); }
     }, true);
     canvas.addEventListener("pointermove", (event) => {
       if (!down) return;
       down.moved ||= Math.hypot(event.clientX - down.x, event.clientY - down.y) > STILL;
-      if (down.moved && !pane.controls.enabled) this.place(pane, number, down.name, event, true);
+      if (down.moved && !pane.controls.enabled) this.place(pane, number, down.name, event, down.drag);
     });
     canvas.addEventListener("pointerup", (event) => {
       if (!down) return;
-      const { name, moved } = down;
+      const { name, moved, drag } = down;
       const dragging = !pane.controls.enabled;
       down = null;
       pane.controls.enabled = true;
-      if (dragging && moved) this.place(pane, number, name, event, true);
+      if (dragging && moved) this.place(pane, number, name, event, drag);
       else if (!moved && name && name !== this.state.chosen && !(name in this.waiting())) this.send("choose", { name });
-      else if (!moved) this.place(pane, number, name ?? this.state.chosen, event, false);
+      else if (!moved) this.place(pane, number, name ?? this.state.chosen, event, 0);
     });
   }
 
@@ -161,12 +162,12 @@ export class Pick extends Program {
     return best;
   }
 
-  place(pane, number, name, event, dragged) {
+  place(pane, number, name, event, drag) {
     if (!name) { this.say("Name the landmark first: choose one from the list, or type another name.", "bad"); return; }
     const { raycaster } = pane.ray(event), hit = pane.hit(event);
-    const fields = { pane: number, name, inside: this.inside, dragged, origin: raycaster.ray.origin.clone().add(pane.origin).toArray(),
+    const fields = { pane: number, name, inside: this.inside, drag, origin: raycaster.ray.origin.clone().add(pane.origin).toArray(),
       direction: raycaster.ray.direction.toArray(), seen: hit ? hit.point.clone().add(pane.origin).toArray() : null };
-    this.send("place", fields, dragged ? `drag ${number} ${name}` : "");
+    this.send("place", fields, drag ? `drag ${drag}` : "");
   }
 
   key(event) {

@@ -1,0 +1,232 @@
+"""`scape complete --interactive`: click a few landmarks on a scan, complete, look, correct, complete again, save.
+
+Built on `scape pick`: the template is the model's, with its landmarks, and a third pane shows the whole body.
+"""
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import Subject
+from scanprep.batch.opening import workspace
+from scanprep.console import Metric, Outcome, write_report
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.scene import Pane, pack_scene
+from scanprep.viewer.messages import Message
+from scanprep.viewer.pick import Clicked, PickApp, Send
+from scanprep.viewer.surface_clicks import Clickable
+
+from .completion import Completion, complete
+from .report import completion_panes
+from .work import Inputs, ScanFiles, Work, figures, read_views, write_results
+
+FEWEST = 3                           # landmarks that say where a body is
+HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A completion and what it was made from."""
+
+    completion: Completion
+    seconds: float                       # that it took
+    places: Mapping[str, np.ndarray]     # of the landmarks
+    known: bool                          # whether the person's shape was
+
+
+class CompleteApp(PickApp):
+    """The state of `scape complete --interactive`.
+
+    Parameters
+    ----------
+    model : BodyModel
+    work : Work
+        Settings, and the landmarks of the model's template; its body is what a person of known shape is.
+    scans : paths
+    output : folder that results are saved in, one for each scan where there are several
+    """
+
+    name, title = "complete", "Complete a scan"
+
+    def __init__(self, model: BodyModel, work: Work, scans: Sequence[Path], output: Path) -> None:
+        self.model, self.work, self.output = model, work, output
+        self._dropped = Path(tempfile.mkdtemp(prefix="scapekit-"))
+        self._views: dict[Path, ScanFiles] = {}
+        self.made: dict[Path, Made] = {}
+        self.saved: dict[Path, Path] = {}
+        self.known = isinstance(work.body, Subject)
+        self.can_choose = model.n_betas > 0
+        template = Clicked(Path(work.model), output / "template.landmarks.json", surface=Clickable(model.template))
+        marks = {name: model.template.vertices[vertex] for name, vertex in work.marks.items()}
+        super().__init__(template, [self._clicked(path) for path in scans], (), fixed=marks)
+
+    def _clicked(self, path: Path) -> Clicked:
+        one = Clicked.found(path, ".landmarks.json", self.work.unit)
+        self._views[path] = read_views([path], self.work.unit)
+        view = self._views[path].views[0]
+        one.surface = Clickable(view if isinstance(view, Mesh) else view.points)
+        return one
+
+    # what the page is sent
+
+    def scene(self) -> Message:
+        """The template, the scan, and the whole body once there is one."""
+        panes = [self.template.pane("the model: where the next landmark is")]
+        if self.scan is not None:
+            panes.append(self.scan.pane(self.scan.path.name))
+            if (result := self._result_pane()) is not None:
+                panes.append(result)
+        return Message("scene", {}, pack_scene(panes))
+
+    def _result_pane(self) -> Pane | None:
+        made = self.made.get(self.scan.path) if self.scan else None
+        if made is None or self.scan is None:
+            return None
+        views = list(self._views[self.scan.path].views)
+        return completion_panes(views, made.completion, self.model.template)[-1]
+
+    def more(self) -> dict[str, Any]:
+        """What the completion says of itself, and what would help it."""
+        made = self.made.get(self.scan.path) if self.scan else None
+        out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None}
+        if made is None or self.scan is None:
+            return out
+        judgement = made.completion.judgement
+        out["completed"] = {
+            "verdict": judgement.verdict, "reasons": list(judgement.reasons), "landmarks": len(made.places),
+            "rows": [[m.name, m.text(), m.unit] for m in self._figures(made)],
+            "outdated": self._outdated(made), "helpful": helpful(self.model, self.work.marks, made),
+            "saved": str(self.saved.get(self.scan.path, ""))}
+        return out
+
+    def _figures(self, made: Made) -> list[Metric]:
+        assert self.scan is not None
+        pairs = pairs_of(made.places, self.work.marks)
+        return figures(self.work, Inputs((self.scan.path,)), made.completion, pairs, None)
+
+    def _outdated(self, made: Made) -> bool:
+        """Whether landmarks were changed since."""
+        assert self.scan is not None
+        now = {name: self.scan.places[name] for name in self._usable(self.scan)}
+        return made.known != self.known or set(now) != set(made.places) or any(
+            not np.array_equal(now[name], made.places[name]) for name in now)
+
+    def _usable(self, scan: Clicked) -> list[str]:
+        return [name for name in self.work.marks if name in scan.places]
+
+    # what the page sends
+
+    def receive(self, name: str, path: Path, send: Send) -> None:
+        """A scan that was dropped on the page; it is completed beside the others, its landmarks saved with it."""
+        kept = self._dropped / name
+        shutil.copyfile(path, kept)
+        one = self._clicked(kept)
+        one.file = self.output / f"{name.split('.')[0]}.landmarks.json"
+        with self._lock:
+            self.scans.append(one)
+            self.current = len(self.scans) - 1
+            self.choose_next(None)
+        send(self.scene())
+        send(self.state())
+
+    def _predict_if_time(self, send: Send, pane: int) -> None:
+        """Here the completion tells where landmarks are."""
+
+    def on_known(self, send: Send, known: bool) -> None:
+        """Whether the body is the one that the model's poses were learned from."""
+        self.known = bool(known) or not self.can_choose
+
+    def on_complete(self, send: Send, anew: bool = False) -> None:
+        """Complete the scan, going on from the body that there is; `anew` searches again."""
+        if self.scan is None:
+            raise ValueError("drop a scan on the page first")
+        if self.working is not None:
+            return
+        names = self._usable(self.scan)
+        if 0 < len(names) < FEWEST:
+            raise ValueError(f"click at least {FEWEST} landmarks, or none")
+        made = self.made.get(self.scan.path)
+        start = made.completion if made is not None and made.known == self.known and names and not anew else None
+        self.working = ("completing", 0, 1)
+        places = {name: self.scan.places[name] for name in names}
+        threading.Thread(target=self._complete, args=(self.scan, places, self.known, start, send), daemon=True).start()
+
+    def _complete(self, scan: Clicked, places: Mapping[str, np.ndarray], known: bool, start: Completion | None,
+                  send: Send) -> None:
+        """Complete beside the clicks that go on, and show what came out."""
+        def tell(done: int, total: int) -> None:
+            self.working = ("completing", done, total)
+            send(self.state())
+
+        try:
+            begin = time.perf_counter()
+            pairs = pairs_of(places, self.work.marks)
+            done = complete(self._body(known), list(self._views[scan.path].views), pairs, self.work.config, tell,
+                            start=start)
+            with self._lock:
+                self.made[scan.path] = Made(done, time.perf_counter() - begin, places, known)
+                self.saved.pop(scan.path, None)
+                scan.predicted = on_scan(done, self.work.marks, scan.body)
+                self.note = "completed; move or add landmarks and complete again, or save"
+            if scan is self.scan:
+                send(self.scene())
+        except ValueError as error:
+            self.note = f"this scan could not be completed: {error}"
+        finally:
+            self.working = None
+        send(self.state())
+
+    def _body(self, known: bool) -> BodyModel | Subject:
+        if not known:
+            return self.model
+        if not isinstance(self.work.body, Subject):
+            self.work = replace(self.work, body=self.model.subject(None))
+        return self.work.body
+
+    def on_save(self, send: Send) -> None:
+        """Write what `scape complete` writes."""
+        made = self.made.get(self.scan.path) if self.scan else None
+        if made is None or self.scan is None:
+            raise ValueError("complete the scan first")
+        scan = self.scan
+        folder = self.output if len(self.scans) == 1 else self.output / scan.path.name.split(".")[0]
+        with workspace(folder) as space, space.staging("completion") as staged:
+            rows = write_results(replace(self.work, body=self._body(made.known)), Inputs((scan.path,), scan.file),
+                                 self._views[scan.path], made.completion, pairs_of(made.places, self.work.marks), None,
+                                 staged.folder)
+            write_report(Outcome(staged.folder, rows, {"complete": self.work.config}),
+                         "scape complete --interactive", made.seconds)
+        self.saved[scan.path] = folder
+        self.note = f"saved in {folder}"
+
+    def close(self) -> None:
+        """Forget files that were dropped."""
+        shutil.rmtree(self._dropped, ignore_errors=True)
+
+
+def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Landmarks as `complete` takes them; None without any."""
+    return (np.array([marks[name] for name in places]), np.array(list(places.values()))) if places else None
+
+
+def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict[str, np.ndarray]:
+    """Where the completed body has its landmarks, of those that the scan shows."""
+    return {name: scan.nearest(done.completed.vertices[vertex]) for name, vertex in marks.items() if done.seen[vertex]}
+
+
+def helpful(model: BodyModel, marks: Mapping[str, int], made: Made) -> list[str]:
+    """Landmarks that were not clicked where the body may be far off, the most doubtful first."""
+    error = made.completion.expected_error
+    if error is None:
+        return []
+    far = {name: float(error[vertex]) for name, vertex in marks.items() if name not in made.places}
+    return [name for name in sorted(far, key=lambda name: -far[name]) if far[name] > HELPFUL][:5]

@@ -1,0 +1,150 @@
+"""`scape complete --interactive`: by mouse alone from a half view to a saved body, and what the page says of it."""
+import json
+import time
+
+import numpy as np
+import pytest
+from browser import wait_until
+from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
+from test_completion_partial import errors
+
+from completion.partial.completion import complete, load_completion
+from completion.partial.interactive import CompleteApp
+from completion.partial.work import Work
+from scanprep.batch.opening import workspace
+from scanprep.geometry.files import PointCloud, write_points
+from scanprep.geometry.landmarks import read_landmarks
+from scanprep.viewer.messages import Message
+from scanprep.viewer.server import Server
+
+NAMES = [f"mark {i}" for i in range(len(MARKS))]
+PLACED = """([pane, place]) => {
+    const on = program.figure.panes[pane], box = on.canvas.getBoundingClientRect();
+    const at = on.project(on.origin.clone().fromArray(place).sub(on.origin));
+    return [box.left + at.x, box.top + at.y];
+}"""
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_with_prior()
+
+
+@pytest.fixture
+def case(model, tmp_path):
+    """The body, what was seen of it, and the app with its scan of points."""
+    body = model.template.with_vertices(model.vertices(POSE, None, TRANS))
+    points, seen = half_view(body, np.array([0.3, -1, 0.5]), noise=0.001)
+    write_points(tmp_path / "half.ply", PointCloud(points))
+    work = Work(model, "worm", dict(zip(NAMES, map(int, MARKS), strict=True)), QUICK)
+    app = CompleteApp(model, work, [tmp_path / "half.ply"], tmp_path / "out")
+    yield body, points, seen, app
+    app.close()
+
+
+def sent(app, kind, **fields):
+    told = []
+    app.handle(Message(kind, fields), told.append)
+    return told
+
+
+def finished(app, page=None):
+    """Wait for the work beside the clicks."""
+    end = time.monotonic() + 60
+    while app.working is not None:
+        assert time.monotonic() < end
+        page.wait_for_timeout(50) if page else time.sleep(0.05)
+
+
+def marked(app, body, seen, count=4):
+    """Give the scan some landmarks, as clicks do."""
+    for name, vertex in list(zip(NAMES, MARKS, strict=True)):
+        if seen[vertex] and len(app.scan.places) < count:
+            app.scan.places[name] = app.scan.body.nearest(body.vertices[vertex])
+
+
+def test_a_completion_goes_on_from_the_one_before(case):
+    body, _, seen, app = case
+    marked(app, body, seen)
+    sent(app, "known", known=True)
+    sent(app, "complete")
+    finished(app)
+    first = app.made[app.scan.path]
+    assert first.known and max(errors(body, first.completion, seen)) < 0.01
+    assert set(app.scan.predicted) <= set(NAMES) and len(app.greet()[0].data) > 1000
+    state = app.greet()[1].fields["completed"]
+    assert state["verdict"] == str(first.completion.judgement).split(":")[0] and not state["outdated"]
+    sent(app, "slide", pane=1, name=next(iter(app.scan.places)), direction=[0, 0, 1], by=0.002)
+    assert app.greet()[1].fields["completed"]["outdated"]
+    sent(app, "complete")
+    finished(app)
+    again = app.made[app.scan.path]
+    assert again.completion is not first.completion and not app.greet()[1].fields["completed"]["outdated"]
+    assert max(errors(body, again.completion, seen)) < 0.01
+
+
+def test_what_python_completes_the_page_completes(case):
+    body, points, seen, app = case
+    marked(app, body, seen, 7)
+    pairs = np.array([MARKS[NAMES.index(name)] for name in app.scan.places]), np.array(list(app.scan.places.values()))
+    want = complete(app.model, PointCloud(points), pairs, QUICK)
+    sent(app, "complete")
+    finished(app)
+    got = app.made[app.scan.path].completion
+    np.testing.assert_allclose(got.completed.vertices, want.completed.vertices, atol=1e-6)
+
+
+def test_too_few_landmarks_and_nothing_to_save_are_refused(case):
+    body, _, seen, app = case
+    with pytest.raises(ValueError, match="complete the scan first"):
+        sent(app, "save")
+    marked(app, body, seen, 2)
+    with pytest.raises(ValueError, match="at least 3 landmarks"):
+        sent(app, "complete")
+
+
+def test_a_dropped_scan_is_completed_beside_the_others(case, tmp_path):
+    _, points, _, app = case
+    write_points(tmp_path / "drop.ply", PointCloud(points + 1.0))
+    app.receive("drop.ply", tmp_path / "drop.ply", lambda message: None)
+    assert app.scan.path.name == "drop.ply" and len(app.scans) == 2
+    assert app.scan.file.parent == app.output and app.scan.path.parent != tmp_path
+    (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
+    with pytest.raises(ValueError, match=r"broken\.ply"):
+        app.receive("broken.ply", tmp_path / "broken.ply", lambda message: None)
+    assert len(app.scans) == 2
+
+
+def test_from_a_half_view_to_a_saved_body_by_mouse_alone(case, new_page, tmp_path):
+    body, _, seen, app = case
+    app.known = True
+    with workspace(tmp_path / "out"), Server(app) as server:
+        page = new_page(viewport={"width": 1300, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, "Boolean(window.program?.figure && program.state)")
+        wait_until(page, "program.figure.panes.every((pane) => pane.drawn > 1)")
+        toward = np.array([0.3, -1, 0.5]) / np.linalg.norm([0.3, -1, 0.5])
+        page.evaluate("""(back) => { const pane = program.figure.panes[1]; Object.assign(pane.home,
+            { back, width: 2 * pane.home.width, height: 2 * pane.home.height }); pane.reset(); }""",
+                      toward.tolist())                                  # as if turned, to where the camera stood
+        for name, vertex in zip(NAMES, MARKS, strict=True):
+            if not seen[vertex] or len(app.scan.places) == 4:
+                continue
+            page.locator(".sk-names li").filter(has_text=name).first.click()
+            wait_until(page, f"program.state.chosen === {json.dumps(name)}")
+            page.mouse.click(*page.evaluate(PLACED, [1, body.vertices[vertex].tolist()]))
+            wait_until(page, f"{json.dumps(name)} in program.state.panes[1].places")
+        page.get_by_role("button", name="complete with 4 landmarks").click()
+        wait_until(page, "Boolean(program.state.completed) && !program.state.working", 60)
+        wait_until(page, "program.figure.panes.length === 3 && program.figure.panes[2].drawn > 0")
+        assert page.locator(".sk-verdict strong").inner_text() in ("good", "look at it")
+        page.get_by_role("button", name="save").click()
+        wait_until(page, "Boolean(program.state.completed.saved)", 60)
+        assert page.errors == []
+    saved = load_completion(tmp_path / "out")
+    assert max(errors(body, saved, seen)) < 0.015
+    assert {p.name for p in (tmp_path / "out").iterdir()} >= {"completed.ply", "report.html", "report.json"}
+    clicked = read_landmarks(tmp_path / "half.landmarks.json")
+    assert len(clicked) == 4
+    for name, place in clicked.items():
+        assert np.linalg.norm(place - body.vertices[MARKS[NAMES.index(name)]]) < 0.03

@@ -1,0 +1,189 @@
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from scanprep.geometry import rotations
+from scanprep.geometry.surface import Surface
+from scanprep.registration import person as person_module
+from scanprep.registration.deformation_graph import build_graph
+from scanprep.registration.graph_fit import deform, start_fit, start_motion
+from scanprep.registration.limbs import beyond_people, frames, joint_angles, limb_doubts
+from scanprep.registration.matches import prepare
+from scanprep.registration.nonrigid import Registration, measured
+from scanprep.registration.person import NAMES, PersonParts, average_person, person_parts
+from scanprep.registration.repair import better, motion_of, repaired, rolled
+from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
+from scanprep.registration.schedule import GraphStage, RegistrationConfig
+from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.people import PARENTS, PARTS, named_pose
+
+FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("l_forearm", "r_shin", "head"))
+QUICK = RegistrationConfig((GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=3),
+                            GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=4)), ends=0, final_fit=None)
+
+
+@pytest.fixture(scope="module")
+def person():
+    return average_person()
+
+
+@pytest.fixture(scope="module")
+def parts(person):
+    skeleton = Skeleton(person.part_of_face, person.parents, person.joints, NAMES)
+    return PersonParts(skeleton, np.broadcast_to(np.eye(3), (len(PARTS), 3, 3)))
+
+
+def registration(person, scan, x):
+    """What a registration with vertices (N, 3) says of itself."""
+    fit = replace(start_fit(person.mesh, np.eye(4), 300), x=x, moved=0.0)
+    return measured(prepare(person.mesh, scan), fit, scan)
+
+
+def with_rolled_skin(person, body, part, angle):
+    """Vertices of a body with the skin of a limb, and what hangs on it, taken round its bone while the bone stays."""
+    R = person.skeleton.fit_rotations(person.mesh, body)[part]
+    joint, bone = (person.skeleton.joint_regressor(person.mesh) @ body)[part], R @ frames()[part, 0]
+    mine = person.skeleton.descends[person.part_of_vertex, part]
+    out = body.copy()
+    turned = (body[mine] - joint) @ rotations.exp(angle * bone).T + joint
+    out[mine] = Surface(person.mesh.with_vertices(body)).closest(turned).points
+    return out
+
+
+def test_rolls_are_the_best_of_all():
+    """The tree of one leg against all that could be; the joints of the rest are content."""
+    rng = np.random.default_rng(0)
+    thigh, shin, foot = (PARTS.index(f"r_{name}") for name in ("thigh", "shin", "foot"))
+    costs = np.zeros((len(PARTS), STEPS, STEPS))
+    costs[[thigh, shin, foot]] = rng.uniform(0, 2, (3, STEPS, STEPS))
+    turned = CHANGE * np.minimum(np.arange(STEPS), STEPS - np.arange(STEPS)) / (STEPS / 2)
+    every = (costs[thigh, 0][:, None, None] + costs[shin][:, :, None] + costs[foot][None]
+             + turned[:, None, None] + turned[:, None] + turned)
+    free = {thigh, shin, foot}
+    cost, rolls = best_rolls(costs, free)
+    assert np.isclose(cost, every.min())
+    assert tuple(rolls[[thigh, shin, foot]]) == np.unravel_index(every.argmin(), every.shape)
+    assert not np.delete(rolls, [thigh, shin, foot]).any()
+    cost, rolls = best_rolls(costs, free, shin, 7)
+    assert np.isclose(cost, every[:, 7].min()) and rolls[shin] == 7
+    cost, rolls = best_rolls(costs, {shin, foot})
+    assert np.isclose(cost, every[0].min()) and not rolls[thigh]
+
+
+@pytest.mark.parametrize("part, angle", [*product((FOREARM, SHIN, HEAD), (150, -120))])
+def test_a_rolled_limb_is_asked_to_roll_back(person, parts, part, angle):
+    """What hangs on it came along, and needs to roll back as well."""
+    R = person.part_rotations(named_pose("run"))
+    below = person.skeleton.descends[:, part]
+    bone = R[part] @ frames()[part, 0]
+    R[below] = rotations.exp(np.radians(angle) * bone) @ R[below]
+    first = other_rolls(parts, R, [part], 4)[0]
+    touched = np.flatnonzero(below | (np.arange(len(PARTS)) == PARENTS[part]))
+    assert set(np.flatnonzero(first)) <= set(touched) & set(LIMBS)
+    assert np.cos(first[part] + np.radians(angle)) > 0.2             # joints leave some play
+    back = np.stack([R[p] @ rotations.exp(first[p] * frames()[p, 0]) for p in range(len(PARTS))])
+    assert beyond_people(joint_angles(R)).max() > 40 and beyond_people(joint_angles(back)).max() < 5       # degrees
+
+
+def test_where_no_joint_tells_a_doubted_limb_is_turned_by_quarters(person, parts):
+    tries = other_rolls(parts, person.part_rotations(named_pose("run")), [HEAD], 9)
+    assert sorted(step(rolls[HEAD]) for rolls in tries) == [STEPS // 4, STEPS // 2, 3 * STEPS // 4]
+    assert len(other_rolls(parts, person.part_rotations(named_pose("run")), [HEAD], 2)) == 2
+    assert other_rolls(parts, person.part_rotations(named_pose("run")), [], 9) == []
+
+
+def test_a_motion_is_found_from_where_it_took_the_template(person):
+    graph = build_graph(person.mesh, 120)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotations.exp(np.array([0.4, -2.0, 1.0])), [3, -1, 2]
+    wanted = replace(start_motion(graph, T), log_scale=np.full(120, 0.2))
+    x = np.exp(0.2) * person.mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    found = motion_of(graph, x)
+    np.testing.assert_allclose(found.R, wanted.R, atol=1e-9)
+    np.testing.assert_allclose(found.log_scale, 0.2, atol=1e-9)
+    np.testing.assert_allclose(deform(graph, found), x, atol=1e-9)
+
+
+def test_a_limb_rolls_about_its_bone_and_nothing_else_moves(person, parts):
+    graph = build_graph(person.mesh, 300)
+    body = person.posed(named_pose("run"))
+    start, angles = motion_of(graph, body), np.zeros(len(PARTS))
+    np.testing.assert_allclose(rolled(graph, start, person.mesh, parts, body, angles).positions, start.positions,
+                               atol=1e-12)
+    angles[FOREARM] = 1.2
+    after = rolled(graph, start, person.mesh, parts, body, angles)
+    part = person.part_of_vertex[graph.node_vertices]
+    near = np.isin(part, [FOREARM, PARENTS[FOREARM], *np.flatnonzero(np.array(PARENTS) == FOREARM)])
+    np.testing.assert_allclose(after.positions[~near], start.positions[~near], atol=1e-12)
+    turn = after.R @ start.R.transpose(0, 2, 1)
+    bone = (person.skeleton.fit_rotations(person.mesh, body) @ frames()[:, 0, :, None])[FOREARM, :, 0]
+    rolls = rotations.log(turn)
+    np.testing.assert_allclose(rolls - (rolls @ bone)[:, None] * bone, 0, atol=1e-9)
+    assert 0.7 < (rolls @ bone)[part == FOREARM].mean() < 1.2        # it sets in at the joints
+    along = (after.positions - start.positions) @ bone
+    assert np.abs(along).max() < 1e-9 < np.linalg.norm(after.positions - start.positions, axis=1)[part == FOREARM].min()
+
+
+@pytest.mark.parametrize("part, angle", [(FOREARM, np.pi), (SHIN, 2.5)])
+def test_a_limb_rolled_in_a_registration_is_put_right(person, parts, part, angle):
+    body = person.posed(named_pose("run"))
+    scan = person.mesh.with_vertices(body)
+    before = registration(person, scan, with_rolled_skin(person, body, part, angle))
+    told = []
+    after = repaired(person.mesh, scan, before, parts, config=QUICK, progress=lambda *given: told.append(given))
+    mine = person.part_of_vertex == part
+    off = [np.linalg.norm(fit.mesh.vertices - body, axis=1)[mine].mean() for fit in (before, after)]
+    assert off[0] > 0.05 and off[1] < 0.3 * off[0], off
+    assert after.rolled and not limb_doubts(person.mesh, parts, after.mesh.vertices)
+    assert after.uncovered <= before.uncovered + 0.001 and told[-1][0] <= told[-1][1]
+
+
+def test_what_needs_no_repair_stays(person, parts):
+    body = person.posed(named_pose("run"))
+    scan = person.mesh.with_vertices(body)
+    right, wrong = (registration(person, scan, x) for x in (body, with_rolled_skin(person, body, FOREARM, np.pi)))
+    assert repaired(person.mesh, scan, right, parts, config=QUICK) is right
+    assert repaired(person.mesh, scan, wrong, None, config=QUICK) is wrong                  # an animal, say
+    assert repaired(person.mesh, scan, wrong, parts, config=replace(QUICK, rolls=0)) is wrong
+    assert not RegistrationConfig.published().rolls and RegistrationConfig().rolls
+
+
+def test_fewer_doubts_are_not_bought(person, parts):
+    """Not with the scan, the landmarks or the shape of the body."""
+    body = person.posed(named_pose("run"))
+    scan = person.mesh.with_vertices(body)
+    right, wrong = (registration(person, scan, x) for x in (body, with_rolled_skin(person, body, FOREARM, np.pi)))
+    marked = [replace(fit, landmark_rms=0.002) for fit in (right, wrong)]
+    assert better(person.mesh, parts, right, wrong) and better(person.mesh, parts, *marked)
+    assert not better(person.mesh, parts, wrong, right) and not better(person.mesh, parts, right, right)
+    assert not better(person.mesh, parts, replace(right, uncovered=wrong.uncovered + 0.01), wrong)
+    assert not better(person.mesh, parts, replace(marked[0], landmark_rms=0.02), marked[1])
+    stretched = scan.with_vertices(1.6 * body)
+    assert not limb_doubts(person.mesh, parts, stretched.vertices)
+    assert not better(person.mesh, parts, replace(right, mesh=stretched), wrong)
+
+
+def test_the_search_for_parts_tells_how_far_it_is(person, monkeypatch):
+    """Once: what was found is remembered."""
+    template = person.mesh.with_vertices(person.mesh.vertices + 1)
+
+    def correspondences(*args, progress):
+        for done in range(5):
+            progress(done, 4)
+
+    def register(*args, correspondences, progress):
+        for done in range(8):
+            progress(done, 7)
+        nothing = np.zeros(0)
+        return Registration(template, nothing, nothing, 0.0, 0.0, True, 1, {}, 0, nothing, 0.0)
+
+    monkeypatch.setattr(person_module, "find_correspondences", correspondences)
+    monkeypatch.setattr(person_module, "register", register)
+    told = []
+    found = person_parts(template, lambda done, total: told.append((done, total)))
+    done = [k for k, _ in told]
+    assert done == sorted(done) and told[0] == (0, 100) and told[-1] == (100, 100)
+    assert person_parts(template, lambda *given: pytest.fail("sought again")) is found
+    np.testing.assert_allclose(found.R_template_rest, np.broadcast_to(np.eye(3), (len(PARTS), 3, 3)), atol=1e-6)

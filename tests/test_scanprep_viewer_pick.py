@@ -1,0 +1,240 @@
+"""Landmarks clicked in the browser: exact places, names, undo, files of every format, and the page in Chromium."""
+import json
+import time
+
+import numpy as np
+import pytest
+from browser import wait_until
+
+from scanprep.geometry import rotations
+from scanprep.geometry.files import write_mesh
+from scanprep.geometry.landmarks import read_landmarks, write_landmarks
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.shading import sphere
+from scanprep.synthetic.landmarks import landmarks
+from scanprep.synthetic.people import Person
+from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
+from scanprep.viewer.messages import Message
+from scanprep.viewer.pick import KEPT, Clicked, PickApp, predict_landmarks
+from scanprep.viewer.server import Server
+from scanprep.viewer.surface_clicks import Clickable
+
+FOUR = ("left middle finger", "right middle finger", "left toe", "right toe")
+
+DRAWN = "Boolean(window.program?.figure && program.state) && program.figure.panes.every((pane) => pane.drawn > 1)"
+ON_PAGE = """(place) => {
+    const pane = program.figure.panes[1], box = pane.canvas.getBoundingClientRect();
+    const at = pane.project(pane.origin.clone().fromArray(place).sub(pane.origin));
+    return [box.left + at.x, box.top + at.y];
+}"""
+
+
+def on_page(page, place):
+    """Where a place on the scan is on the page, pixels."""
+    return page.evaluate(ON_PAGE, np.asarray(place).tolist())
+
+
+@pytest.fixture(scope="module")
+def person():
+    return Person()
+
+
+@pytest.fixture
+def folder(person, tmp_path):
+    """A template with landmarks, and a scan of it that is turned and moved."""
+    write_mesh(tmp_path / "template.ply", person.mesh)
+    some = {name: landmarks()[name] for name in (*FOUR, "navel", "chin")}
+    write_landmarks(tmp_path / "template.landmarks.json", some)
+    write_mesh(tmp_path / "anna.ply", person.mesh.with_vertices(moved(person.mesh.vertices)))
+    return tmp_path
+
+
+def moved(points):
+    return points @ rotations.exp(np.array([0, 0, 0.4])).T + [5.0, -2.0, 0.3]
+
+
+def app_of(folder, names=TEN, ending=".landmarks.json", scans=("anna.ply",)):
+    return PickApp(Clicked.found(folder / "template.ply", ending),
+                   [Clicked.found(folder / name, ending) for name in scans], names)
+
+
+def sent(app, kind, **fields):
+    """What a message makes the app tell the page."""
+    told = []
+    app.handle(Message(kind, fields), told.append)
+    return told
+
+
+def click(app, place, name, pane=1, normal=(0.0, 0.0, 1.0), **more):
+    origin = np.asarray(place) + 2 * np.asarray(normal)
+    return sent(app, "place", pane=pane, name=name, origin=origin.tolist(), direction=(-np.asarray(normal)).tolist(),
+                **more)
+
+
+def test_a_ray_meets_400_000_triangles_exactly():
+    vertices, faces = sphere(7)
+    assert len(faces) > 300_000
+    body, rng = Clickable(Mesh(1000 + 0.9 * vertices, faces)), np.random.default_rng(0)
+    for _ in range(20):
+        toward = rng.normal(size=3)
+        aim = 1000 + 0.5 * rng.uniform(-1, 1, 3)
+        found = body.hit(aim + 5 * toward, -toward)
+        direction = toward / np.linalg.norm(toward)
+        along = (found - aim) @ direction
+        np.testing.assert_allclose(found, aim + along * direction, atol=1e-9)         # on the ray
+        corners = body.shape.corners
+        near = np.flatnonzero(np.linalg.norm(corners.mean(axis=1) - found, axis=1) < 0.02)
+        normals = np.cross(corners[near, 1] - corners[near, 0], corners[near, 2] - corners[near, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        off = np.abs(np.einsum("nd,nd->n", found - corners[near, 0], normals)).min()
+        assert off < 1e-6                                                              # and on a triangle
+
+
+def test_clouds_are_clicked_point_by_point_and_the_nearest_one_wins():
+    points = np.random.default_rng(0).normal(size=(5000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    found = Clickable(points).hit(np.array([0.0, 0, 5]), np.array([0.0, 0, -1]))
+    assert found[2] > 0.9 and (found == points).all(axis=1).any()
+    assert Clickable(points).hit(np.array([3.0, 0, 5]), np.array([0.0, 0, -1])) is None
+
+
+def test_a_click_inside_is_half_way_through():
+    vertices, faces = sphere(4)
+    np.testing.assert_allclose(Clickable(Mesh(vertices, faces)).middle(np.array([0.2, 0, 5]), np.array([0.0, 0, -1])),
+                               [0.2, 0, 0], atol=1e-3)
+
+
+def test_names_are_offered_the_other_side_first():
+    assert len(CAESAR) == 73 == len(set(CAESAR)) and len(TEN) == 10
+    assert next_name(TEN, {"left toe"}, "left toe") == "right toe"
+    assert next_name(TEN, {"left toe", "right toe"}, "right toe") == "left elbow outside"
+    assert next_name(TEN, set(TEN), "navel") is None
+    assert next_name(CAESAR, {"Rt. ASIS"}, "Rt. ASIS") == "Lt. ASIS"
+
+
+def test_lists_of_names_come_from_a_file(tmp_path):
+    (tmp_path / "names.txt").write_text("# mine\nnose\n\n  left   ear \nnose\n")
+    assert read_names(str(tmp_path / "names.txt")) == ("nose", "left ear")
+    (tmp_path / "none.txt").write_text("# nothing\n")
+    for wrong, told in ((tmp_path / "none.txt", "none.txt"), (tmp_path / "missing", "--names")):
+        with pytest.raises(ValueError, match=told):
+            read_names(str(wrong))
+
+
+@pytest.mark.parametrize("ending", [".landmarks.json", ".pp", ".mrk.json", ".lnd", ".txt"])
+def test_every_click_is_saved_in_the_format_wanted(folder, person, ending):
+    app, file = app_of(folder, ending=".landmarks.txt" if ending == ".txt" else ending), None
+    for name in FOUR[:2]:
+        place = moved(person.mesh.vertices[landmarks()[name]])
+        click(app, place, name, seen=place.tolist())
+        file = app.scans[0].file
+        found = read_landmarks(file)
+        np.testing.assert_allclose(found[name], app.scans[0].places[name], atol=1e-6)
+    assert set(found) == set(FOUR[:2]) and file.name.endswith(ending)
+    again = app_of(folder)                                             # opened again, it goes on where it was
+    assert again.scans[0].file == file and set(again.scans[0].places) == set(FOUR[:2])
+
+
+def test_a_file_of_the_user_is_kept_as_it_was(folder, person):
+    mine = folder / "anna.pp"
+    write_landmarks(mine, {"my own": np.array([5.0, -2.0, 1.0])})
+    before = mine.read_bytes()
+    app = app_of(folder)
+    for name in FOUR[:2]:
+        click(app, moved(person.mesh.vertices[landmarks()[name]]), name)
+    assert (folder / ("anna.pp" + KEPT)).read_bytes() == before
+    assert set(read_landmarks(mine)) >= {"my own"}
+
+
+def test_undo_and_redo_walk_through_all_changes_and_survive_a_reload(folder, person):
+    app = app_of(folder)
+    top = moved(person.mesh.vertices[landmarks()["top of head"]])
+    click(app, top, "a")
+    click(app, top + [0.01, 0, 0], "b")
+    first = dict(app.scans[0].places)
+    for x in (0.02, 0.03):
+        click(app, top + [x, 0, 0], "b", drag=7)                 # a drag is one change, however long
+    dragged = dict(app.scans[0].places)
+    assert not np.allclose(first["b"], dragged["b"])
+    sent(app, "undo")
+    np.testing.assert_array_equal(app.scans[0].places["b"], first["b"])
+    sent(app, "undo")
+    assert sorted(read_landmarks(app.scans[0].file)) == ["a"] == sorted(app.scans[0].places)
+    state = app.greet()[-1].fields
+    assert state["redo"] and list(state["panes"][1]["places"]) == ["a"]
+    sent(app, "redo")
+    sent(app, "redo")
+    np.testing.assert_array_equal(app.scans[0].places["b"], dragged["b"])
+    sent(app, "remove", pane=1, name="a")
+    sent(app, "undo")
+    assert set(app.scans[0].places) == {"a", "b"}
+
+
+def test_a_click_that_meets_nothing_is_told_and_wrong_messages_are_refused(folder):
+    app = app_of(folder)
+    assert "met nothing" in click(app, [50.0, 0, 0], "a")[-1].fields["note"] and not app.scans[0].places
+    ray = {"origin": [0, 0, 0], "direction": [0, 0, 1]}
+    for kind, fields in (("nonsense", {}), ("open", {"scan": 7}), ("place", {"pane": 3, "name": "a", **ray}),
+                         ("place", {"pane": 1, "name": "a", **ray, "origin": [0, None, 0]}), ("choose", {"name": " "})):
+        with pytest.raises((ValueError, TypeError)):
+            sent(app, kind, **fields)
+
+
+def test_the_others_are_predicted_from_four(person):
+    """Registration of a body to itself, moved and turned: within a centimetre, mostly."""
+    template = {name: person.mesh.vertices[vertex] for name, vertex in landmarks().items()}
+    scan = Clickable(person.mesh.with_vertices(moved(person.mesh.vertices)))
+    found = predict_landmarks(person.mesh, template, scan, {name: moved(template[name]) for name in FOUR})
+    off = [np.linalg.norm(found[name] - moved(template[name])) for name in template]
+    assert np.median(off) < 0.003 and max(off) < 0.02
+
+
+def test_landmarks_are_picked_by_mouse_and_saved(new_page, folder, person):
+    """Four clicks at the true places, on a body 5 m off the origin; then undo by key, and a reload."""
+    app = app_of(folder)
+    app._predict_if_time = lambda send, pane: None                     # tested above
+    with Server(app) as server:
+        page = new_page(viewport={"width": 1200, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, DRAWN)
+        for name in FOUR:
+            page.locator(".sk-names li").filter(has_text=name).first.click()
+            wait_until(page, f"program.state.chosen === {json.dumps(name)}")
+            place = moved(person.mesh.vertices[landmarks()[name]])
+            page.mouse.click(*on_page(page, place))
+            wait_until(page, f"{json.dumps(name)} in program.state.panes[1].places || program.state.note")
+        found = read_landmarks(folder / "anna.landmarks.json")
+        off = {name: np.linalg.norm(found[name] - moved(person.mesh.vertices[landmarks()[name]])) for name in found}
+        assert len(off) == 4 and max(off.values()) < 0.02, off                        # a pixel is 2.5 mm
+        page.keyboard.press("z")
+        wait_until(page, "Object.keys(program.state.panes[1].places).length === 3")
+        page.reload()
+        wait_until(page, "Boolean(window.program?.state) && Object.keys(program.state.panes[1].places).length === 3")
+        page.locator("button", has_text="redo").click()
+        wait_until(page, "Object.keys(program.state.panes[1].places).length === 4")
+        assert page.errors == []
+    assert set(read_landmarks(folder / "anna.landmarks.json")) == set(FOUR)
+
+
+def test_a_landmark_is_dragged(new_page, folder, person):
+    app, end = app_of(folder), time.monotonic() + 20
+    app._predict_if_time = lambda send, pane: None
+    place = moved(person.mesh.vertices[landmarks()["navel"]])
+    ahead = moved(person.mesh.vertices[landmarks()["navel"]] + person.mesh.vertex_normals[landmarks()["navel"]]) - place
+    click(app, place, "navel", normal=ahead)
+    before = app.scans[0].places["navel"].copy()
+    with Server(app) as server:
+        page = new_page(viewport={"width": 1200, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, DRAWN)
+        x, y = on_page(page, before)
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x, y - 15, steps=4)
+        page.mouse.move(x, y - 30, steps=4)
+        page.mouse.up()
+        while np.allclose(app.scans[0].places["navel"], before, atol=0.03) and time.monotonic() < end:
+            page.wait_for_timeout(50)
+        assert page.errors == []
+    shift = app.scans[0].places["navel"] - before
+    assert 0.03 < shift[2] < 0.2 and len(app.done) == 2                # up, and the drag is one change
