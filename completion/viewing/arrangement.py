@@ -8,7 +8,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera
-from scanprep.pictures.scene import Pane
+from scanprep.pictures.scene import Pane, framed_alike
 from scanprep.pictures.shading import CLAY, Moving, Shape, Solid
 
 from .contents import Content
@@ -19,12 +19,11 @@ LAID_OVER = (CLAY, (0.55, 0.66, 0.80), (0.83, 0.62, 0.55), (0.62, 0.75, 0.60), (
 
 def side_by_side(contents: Sequence[Content], up: np.ndarray | None) -> tuple[list[Camera], list[Pane]]:
     """A pane for each, in one scale, so that they can be compared."""
-    cameras = [content.stance.camera(up) for content in contents]
-    sizes = {side: [getattr(camera, side) for camera in cameras] for side in ("width", "height", "distance")}
-    if max(sizes["distance"]) < ALIKE * min(sizes["distance"]):        # else one of them is in another unit
-        cameras = [replace(camera, **{side: max(all_of) for side, all_of in sizes.items()}) for camera in cameras]
-    return cameras, [Pane(content.shapes, camera, content.name)
-                     for content, camera in zip(contents, cameras, strict=True)]
+    panes = [Pane(content.shapes, content.stance.camera(up), content.name) for content in contents]
+    sizes = [pane.camera.distance for pane in panes]
+    if max(sizes) < ALIKE * min(sizes):                # else one of them is in another unit
+        panes = framed_alike(panes)
+    return [pane.camera for pane in panes], panes
 
 
 def over_each_other(contents: Sequence[Content], up: np.ndarray | None) -> tuple[list[Camera], list[Pane]]:

@@ -12,7 +12,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import Camera, upright
+from scanprep.pictures.camera import Camera, stance
 from scanprep.pictures.colors import part_colors
 from scanprep.pictures.scene import NO_INDEX
 from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
@@ -24,7 +24,7 @@ from ..partial.completion import Completion
 POINTS, TRIANGLES = 150_000, 120_000             # of a cloud or mesh that are shown
 SHOWN_OFF = 0.03                     # metres: residual of a marker that is darkest
 MARKER = (0.85, 0.25, 0.2)
-ELEVATION, TURN = 8.0, 20.0          # degrees from which a body is seen at first
+ELEVATION, TURN = 8.0, np.radians(20)            # degrees above, and angle from the front, of the first view
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) for i, axis in enumerate("xyz")}
 
 
@@ -37,34 +37,21 @@ class Stance:
     front: np.ndarray
 
     @staticmethod
-    def of(mesh: Mesh) -> Stance:
-        """As far as it can be told from the outline of a body."""
-        up, azimuth = upright(mesh)
-        first, second = np.eye(3)[[(up + 1) % 3, (up + 2) % 3]]
-        front = np.cos(np.radians(azimuth)) * first + np.sin(np.radians(azimuth)) * second
-        return Stance(_box(mesh.vertices), np.eye(3)[up], front)
-
-    def turned(self, poses: np.ndarray, points: np.ndarray) -> Stance:
-        """Of a motion of the body: poses (T, J, 3), and the points (..., 3) that it comes by."""
-        R = rotations.exp(poses[:, 0])
-        mean = (R @ self.up).mean(axis=0)
-        axis = int(np.abs(mean).argmax())
-        return Stance(_box(points.reshape(-1, 3)), np.sign(mean[axis]) * np.eye(3)[axis], R[0] @ self.front)
+    def of(mesh: Mesh, poses: np.ndarray | None = None) -> Stance:
+        """As far as it can be told from the outline of a body; `poses` (T, J, 3) are what it does."""
+        return Stance(_box(mesh.vertices), *stance(mesh, None if poses is None else rotations.exp(poses[:, 0])))
 
     def around(self, points: np.ndarray) -> Stance:
-        """The same way up, at other places (n, 3)."""
-        return replace(self, extent=_box(points))
+        """The same way up, at other places (..., 3)."""
+        return replace(self, extent=_box(points.reshape(-1, 3)))
 
     def camera(self, up: np.ndarray | None = None) -> Camera:
         """A view from beside the front, this way up."""
         up = self.up if up is None else up
-        axis, sign = int(np.abs(up).argmax()), float(np.sign(up.sum()))
-        a, b = self.front[(axis + 1) % 3], self.front[(axis + 2) % 3]
-        azimuth = np.degrees(np.arctan2(b, a)) if np.hypot(a, b) > 1e-6 else 0.0
-        camera = Camera.around(self.extent, float(azimuth) + sign * TURN, sign * ELEVATION, axis)
-        if sign > 0:
-            return camera
-        return replace(camera, axes=camera.axes * np.array([[-1.0], [-1.0], [1.0]]), vertical=up)
+        front = self.front if np.linalg.norm(np.cross(self.front, up)) > 0.1 else np.roll(up, 1)
+        flat = front - (front @ up) * up
+        side = np.cos(TURN) * flat + np.sin(TURN) * np.cross(up, flat)
+        return Camera.from_side(self.extent, side, up, ELEVATION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,17 +88,17 @@ class Content:
 def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray] | None = None) -> Content:
     """A mesh, or points (n, 3), with landmarks."""
     mesh = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
-    stance = Stance.of(mesh)
-    size = float(np.linalg.norm(np.ptp(stance.extent, axis=0)))
+    stands = Stance.of(mesh)
+    size = float(np.linalg.norm(np.ptp(stands.extent, axis=0)))
     marks = _landmarks(landmarks, size)
     if not len(mesh.faces):
         every = max(1, len(mesh.vertices) // POINTS)
-        return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stance,
+        return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stands,
                        f"{len(mesh.vertices):,} points")
     shown = thinned(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), TRIANGLES)
     few = len(shown.mesh.faces) < len(mesh.faces)
     notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * few
-    return Content(name, [shown, *marks], stance, sizes(mesh), notes=notes)
+    return Content(name, [shown, *marks], stands, sizes(mesh), notes=notes)
 
 
 def sizes(mesh: Mesh) -> str:

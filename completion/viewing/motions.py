@@ -28,7 +28,7 @@ def of_motion(name: str, motion: Motion, subject: Subject, markers: MarkerSequen
     shapes = [Moving(body_shades(body, subject.skeleton.part_of_face, name="body"), frames[:1], motion.rate,
                      (basis, coefficients))]
     at_rest = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))))
-    stance = Stance.of(at_rest).turned(motion.poses, frames[:, ::7])
+    stance = Stance.of(at_rest, motion.poses).around(frames[:, ::7])
     content = Content(name, shapes, stance, lasting(motion.poses, motion.rate), stance.around(frames[0]))
     return content if markers is None else with_markers(content, motion, markers)
 
