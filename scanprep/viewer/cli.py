@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ..cli import MeshArg, Unit
-from ..console import Metric, Outcome
+from ..console import Metric, Outcome, bar
 from ..pipeline.scans import find_scans
 from ..ranges import Range
 from .landmark_names import read_names
@@ -39,7 +39,10 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
 
     ending = ".landmarks.json" if format == "json" else "." + format
     template, *others = [Clicked.found(path, ending, unit, file) for path, file in ((mesh, None), *_files(scans))]
-    _ = template.body                                     # a file that is no mesh is refused before a browser opens
+    with bar("reading") as progress:                      # a file that is no mesh is refused before a browser opens
+        for number, one in enumerate(first := [template, *others[:1]]):
+            progress(number, len(first))
+            _ = one.shown
     app = PickApp(template, others, read_names(names))
     before = {one.path: len(one.places) for one in (template, *others)}
     show(app, serve or None, serve is None)

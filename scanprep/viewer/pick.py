@@ -5,6 +5,7 @@ page is sent the whole state, which is small. So a second tab, or one that was l
 """
 from __future__ import annotations
 
+import contextlib
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -21,12 +22,14 @@ from ..geometry.surface import Surface
 from ..pictures.camera import Camera, upright
 from ..pictures.scene import Pane, pack_scene
 from ..pictures.shading import CLAY, Dots, Shape, Solid
+from ..pictures.thinning import thinned
 from .landmark_names import next_name
 from .messages import Message
 from .surface_clicks import Clickable
 
 TEMPLATE, SCAN = 0, 1                # panes
 ENOUGH = 4                           # landmarks from which the others can be predicted
+MOST_DOTS = 150_000                  # of a cloud
 SLIDES = -1                          # movements by key are one as long as they follow each other
 KEPT = ".before"                     # ending of the copy of a landmark file as it was found
 
@@ -44,6 +47,7 @@ class Clicked:
     places: Places = field(default_factory=dict)
     predicted: Places = field(default_factory=dict)
     surface: Clickable | None = None
+    _shown: Shape | None = None
 
     @classmethod
     def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
@@ -51,9 +55,18 @@ class Clicked:
         file = file or landmarks_beside(path)
         one = cls(path, file or path.with_name(path.name.split(".")[0] + ending), unit)
         if file is not None:
-            shape = one.body.shape
-            one.places = read_landmarks(file, shape if isinstance(shape, Mesh) else None, unit)
+            one.places = one._read(file)
         return one
+
+    def _read(self, file: Path) -> Places:
+        """The landmarks of a file; the mesh is read for them only if they need it, as a folder may be large."""
+        if not file.name.endswith(".mrk.json"):                  # which may be in another frame: the mesh tells
+            with contextlib.suppress(ValueError):
+                return read_landmarks(file, None, self.unit)
+        shape = self.body.shape
+        places = read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit)
+        self.forget()
+        return places
 
     @property
     def body(self) -> Clickable:
@@ -64,7 +77,7 @@ class Clicked:
 
     def forget(self) -> None:
         """Let go of the surface, not of the landmarks; it is read again when it is shown."""
-        self.surface = None
+        self.surface = self._shown = None
 
     def save(self) -> None:
         """Write all landmarks; a file that was there before is kept beside it, once."""
@@ -77,10 +90,16 @@ class Clicked:
 
     def pane(self, label: str) -> Pane:
         """Its surface as the browser gets it."""
-        shape = self.body.shape
-        shown: Shape = Solid(shape) if self.body.has_surface and isinstance(shape, Mesh) else \
-            Dots(self.body.points[::max(1, len(self.body.points) // 150_000)], CLAY, 0.004)
-        return Pane([shown], camera_of(shape), label)
+        return Pane([self.shown], camera_of(self.body.shape), label)
+
+    @property
+    def shown(self) -> Shape:
+        """What is drawn of it: no more triangles or points than one can see."""
+        if self._shown is None:
+            shape, points = self.body.shape, self.body.points
+            self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
+                Dots(points[::max(1, len(points) // MOST_DOTS)], CLAY, 0.004)
+        return self._shown
 
 
 def camera_of(shape: Mesh | np.ndarray) -> Camera:
