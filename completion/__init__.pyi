@@ -50,3 +50,5 @@ from .partial.settings import CompletionConfig as CompletionConfig
 from .synthetic_people import synthetic_model as synthetic_model
 from .tracking.sequence import track as track
 from .tracking.settings import TrackConfig as TrackConfig
+from .viewing.notebook import Viewed as Viewed
+from .viewing.notebook import view as view

@@ -8,6 +8,7 @@ from scanprep.command_line import dispatch
 COMMANDS = {
     "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
+    "view": ("Meshes, scans, models, motions and results in the browser.", "completion.viewing.cli:view_files"),
     "pick": ("Landmarks of scans, clicked in the browser.", "scanprep.viewer.cli:pick_landmarks"),
     "learn": ("Registered meshes -> a body model.", "model.learning.cli:learn"),
     "model": ("Look into a body model and pose it.", "model.cli:group"),

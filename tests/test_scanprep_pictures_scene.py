@@ -107,6 +107,28 @@ def test_a_motion_comes_back_within_its_tolerance(body, dtype):
     np.testing.assert_allclose(read.frames(layer), frames, atol=1.3 * TOLERANCE)
 
 
+def test_a_motion_in_columns_is_taken_as_it_is(body):
+    frames = turning(body, 50)
+    basis, coefficients = low_rank(frames)
+    even = np.full((len(basis), 1), len(basis)**-0.5)
+    basis, change = np.linalg.qr(np.hstack([even, basis]))
+    coefficients = np.einsum("rs,tsc->trc", change[:, 1:], coefficients)
+    moving = Moving(Solid(body, name="body"), frames[:1], 25.0, (basis, coefficients))
+    read = SceneReader(pack_scene([pane(moving)]))
+    assert read.layer("body")["motion"]["frames"] == 50
+    np.testing.assert_allclose(read.frames(read.layer("body")), frames, atol=1.3 * TOLERANCE)
+
+
+def test_bodies_whose_vertices_will_be_moved_stay_whole():
+    many = Mesh(*sphere(6))
+    assert len(many.faces) > MOST
+    moving = Moving(Solid(many), np.stack([many.vertices, many.vertices + 1.0]), 25.0)
+    for packed, all_there in ((pack_scene([pane(Solid(many))], whole=True), True), (pack_scene([pane(moving)]), True),
+                              (pack_scene([pane(Solid(many))]), False)):
+        read = SceneReader(packed)
+        assert (len(read.faces(read.layers[0])) == len(many.faces)) is all_there
+
+
 def test_moving_dots_may_be_out_of_sight(body):
     frames = turning(body, 40)[:, ::30]
     frames[5:9, 3] = np.nan

@@ -61,12 +61,12 @@ def picture_panes(panes: Sequence[Pane], height: int, columns: int | None = None
     return side_by_side(images, labels if any(labels) else None, columns=columns)
 
 
-def pack_scene(panes: Sequence[Pane]) -> bytes:
-    """Panes as bytes."""
+def pack_scene(panes: Sequence[Pane], whole: bool = False) -> bytes:
+    """Panes as bytes; `whole`: with all triangles, of bodies whose vertices will be moved."""
     columns = _Columns()
     header = {"format": FORMAT, "panes": [
         {"label": pane.label, "camera": _camera(pane.camera), "origin": pane.camera.target.tolist(),
-         "layers": [_layer(shape, pane.camera.target, columns) for shape in pane.shapes]} for pane in panes]}
+         "layers": [_layer(shape, pane.camera.target, columns, whole) for shape in pane.shapes]} for pane in panes]}
     text = json.dumps({**header, "columns": columns.described}, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     return zlib.compress(len(text).to_bytes(4, "little") + text + columns.data, 9)
@@ -128,14 +128,14 @@ def _camera(camera: Camera) -> dict[str, Any]:
             "up": camera.vertical.tolist(), "width": camera.width, "height": camera.height}
 
 
-def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
+def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, whole: bool) -> dict[str, Any]:
     """One shape of a pane."""
     if isinstance(shape, Moving):
-        return {**_layer(shape.shape, origin, columns), "motion": _motion(shape, origin, columns)}
+        return {**_layer(shape.shape, origin, columns, True), "motion": _motion(shape, origin, columns)}
     if isinstance(shape, Mesh):
         shape = Solid(shape)
     if isinstance(shape, Solid):
-        shape = thinned(shape)
+        shape = shape if whole else thinned(shape)
         points = shape.mesh.vertices
         first = shape.color if isinstance(shape.color, Heat) else own_color(shape)
         shades = [_shade(name, shade, shape.mesh, columns) for name, shade in {"": first, **shape.shades}.items()]
@@ -195,17 +195,24 @@ def _steps(values: np.ndarray, axes: int | tuple[int, ...], factor: np.ndarray |
 
 def _motion(moving: Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
     """Frames (T, n, 3) as columns (n, r) times coefficients (T, r, 3), both in whole steps; of dots without columns."""
-    frames = np.asarray(moving.frames) - origin.astype(moving.frames.dtype)
-    known = np.isfinite(frames).all(axis=2)
-    hidden: Mapping[str, Any] = {} if known.all() else {"seen": columns.add(known.astype(np.uint8))}
-    coefficients, basis = np.where(known[..., None], frames, np.float32(0)), None
-    steps, sizes = np.ones(frames.shape[1]), _steps(coefficients, (0, 2), 1.0)
-    if not isinstance(moving.shape, Dots):             # what each of those does tells nothing of the others
-        made, coefficients = low_rank(coefficients)
+    hidden: Mapping[str, Any] = {}
+    made: np.ndarray | None = None
+    if moving.columns is not None:                     # a shift of all points is one of the things that columns can do
+        made, coefficients = moving.columns
+        coefficients = coefficients - np.linalg.lstsq(made, np.ones(len(made)))[0][:, None] * origin
+    else:
+        frames = np.asarray(moving.frames) - origin.astype(moving.frames.dtype)
+        known = np.isfinite(frames).all(axis=2)
+        hidden = {} if known.all() else {"seen": columns.add(known.astype(np.uint8))}
+        coefficients = np.where(known[..., None], frames, np.float32(0))
+        if not isinstance(moving.shape, Dots):         # what each of those does tells nothing of the others
+            made, coefficients = low_rank(coefficients)
+    basis, steps, sizes = None, np.ones(coefficients.shape[1]), _steps(coefficients, (0, 2), 1.0)
+    if made is not None:
         steps = _steps(made, 0, np.abs(coefficients).max(axis=(0, 2)))
         sizes = _steps(coefficients, (0, 2), np.abs(made).max(axis=0))
         basis = columns.add(np.round(made / steps).astype(np.int16))
-    return {"rate": moving.rate, "frames": len(frames), "rank": len(steps), **hidden, "basis": basis,
+    return {"rate": moving.rate, "frames": len(coefficients), "rank": len(steps), **hidden, "basis": basis,
             "coefficients": columns.add(np.round(coefficients / sizes[:, None]).astype(np.int16).reshape(
-                len(frames), -1).view(np.uint16), True),
+                len(coefficients), -1).view(np.uint16), True),
             "scale": (steps * sizes).tolist()}

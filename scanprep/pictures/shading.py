@@ -71,6 +71,8 @@ class Moving:
     shape: Solid | Dots
     frames: np.ndarray  # (T, n, 3) float, metres: of its vertices or points
     rate: float  # frames a second
+    # the same as columns (n, r) times coefficients (T, r, 3), where they are known; `frames` is then the first alone
+    columns: tuple[np.ndarray, np.ndarray] | None = None
 
 
 Shape = Mesh | Solid | Dots | Bones

@@ -153,7 +153,8 @@ export class Figure {
     this.below.querySelectorAll(".sk-time").forEach((old) => old.remove());
     const moving = this.layers.filter((layer) => layer.motion);
     if (!moving.length) return;
-    const frames = Math.max(...moving.map((layer) => layer.motion.frames)), { rate } = moving[0].motion;
+    const { rate } = moving[0].motion;
+    const frames = Math.max(...moving.map(({ motion }) => Math.round((motion.frames - 1) / motion.rate * rate))) + 1;
     const slider = make("input", { type: "range", min: 0, max: frames - 1, value: 0, step: 1, "aria-label": "time",
       oninput: () => { this.go(Number(slider.value)); } });
     const clock = make("output", {});
@@ -169,10 +170,15 @@ export class Figure {
   go(frame) {
     const { slider, clock, frames, rate, moving } = this.time;
     this.frame = Math.max(0, Math.min(frames - 1, frame));
-    for (const layer of moving) layer.setFrame(Math.min(Math.round(this.frame), layer.motion.frames - 1));
+    for (const layer of moving) layer.setFrame(this.frameOf(layer));
     slider.value = this.frame;
     clock.textContent = `${(this.frame / rate).toFixed(2)} s`;
     for (const pane of this.panes) pane.redraw();
+  }
+
+  // Where a layer is in its own motion, which may have another rate.
+  frameOf({ motion }) {
+    return Math.min(Math.round(this.frame / this.time.rate * motion.rate), motion.frames - 1);
   }
 
   play(on) {

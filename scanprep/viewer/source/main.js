@@ -4,6 +4,7 @@ import { Figure } from "./figure.js";
 import { hasWebGL } from "./pane.js";
 import { Pick } from "./pick.js";
 import { fromBase64, unpackScene } from "./unpack.js";
+import { View } from "./view.js";
 
 // Every figure of a report becomes one that turns, when it comes into sight; without WebGL its picture stays.
 function startReport() {
@@ -33,7 +34,7 @@ async function turn(figure) {
   figure.dataset.turns = "";
 }
 
-const PROGRAMS = { complete: Complete, pick: Pick };
+const PROGRAMS = { complete: Complete, pick: Pick, view: View };
 
 export function start(name) {
   if (!name) startReport();

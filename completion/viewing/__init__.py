@@ -1,0 +1,1 @@
+"""What `scape view` shows, and how it moves."""

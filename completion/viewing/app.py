@@ -1,0 +1,246 @@
+"""The program behind `scape view`: what is shown, sliders, and what is saved of them.
+
+A move of a slider answers with `positions`, the places of all vertices as float32 relative to the origin of their pane,
+and with where all sliders stand. Older answers that still wait give way to newer ones.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanprep.pictures.scene import pack_scene
+from scanprep.viewer.messages import Message
+from scanprep.viewer.server import Send
+
+from .arrangement import over_each_other, side_by_side
+from .contents import AXES, Content
+from .controls import Controls, Shown
+from .files import Entry
+from .movable import MovableBody
+from .saving import save_bodies, save_poses
+
+MOST = 12                            # panes
+
+
+class ViewApp:
+    """Contents side by side, or over each other; ValueError where none of them can be read.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+    over : bool
+        All in one pane.
+    up : str, optional
+        Axis that is up in all panes, such as "y" or "-y".
+    output : Path
+        Folder for what is saved.
+    """
+
+    name, title = "view", "View"
+    folders: Sequence[Path] = ()
+
+    def __init__(self, entries: Sequence[Entry], over: bool = False, up: str | None = None, output: Path = Path()
+                 ) -> None:
+        self.entries, self.over, self.output = list(entries), over, output
+        self.up = None if up is None else AXES[up]
+        self.controls, self.rng = Controls(), np.random.default_rng()
+        self.written: list[Path] = []                     # what was saved
+        self.problems: dict[int, str] = {}
+        self.contents: dict[int, Content] = {}
+        self.bodies: dict[int, MovableBody] = {}
+        self.number = 0                                   # of the scene, which positions name
+        self._scene: list[Message] = []                   # and what belongs to it
+        self._notes: tuple[str, ...] = ()
+        self._about: dict[int, str] = {}
+        self._positions: dict[tuple[int, int], Message] = {}
+        first = [i for i, entry in enumerate(self.entries) if entry.first] or [0]
+        self.show(first if len(first) <= MOST else first[:1])
+        if not self.shown:
+            raise ValueError(next(iter(self.problems.values()), "FILES: nothing to show"))
+
+    # what the page is sent
+
+    def greet(self) -> list[Message]:
+        """The scene, where everything stands, and what moved since."""
+        return [*self._scene, self.state(), *list(self._positions.values())]
+
+    def state(self) -> Message:
+        """All but the shapes."""
+        sliders = self.controls
+        return Message("state", {
+            "entries": [{"name": entry.name, "shown": i in self.shown, "problem": self.problems.get(i, ""),
+                         "about": self._about.get(i, "")} for i, entry in enumerate(self.entries)],
+            "notes": list(self._notes), "problems": list(self.problems.values()),
+            "saved": [str(path) for path in self.written],
+            "parts": list(sliders.turns), "models": [{"pane": one.pane, "layer": one.layer, "name": one.name}
+                                                     for one in sliders.shown],
+            **self._where()}, latest="state")
+
+    def _where(self) -> dict[str, Any]:
+        one = self.controls
+        return {"betas": one.betas.tolist(), "turns": {name: turn.tolist() for name, turn in one.turns.items()},
+                "chosen": one.chosen}
+
+    def _residuals(self) -> list[Message]:
+        """Of measured markers, in every frame."""
+        out = []
+        for i, pane, layer in self._places():
+            told = self.contents[i].markers
+            if told is not None:
+                fields = {"pane": pane, "layer": layer + told.shape, "labels": told.labels, **told.colors()}
+                out.append(Message("residuals", fields, told.residuals.astype("<f4").tobytes()))
+        return out
+
+    # what is shown
+
+    def show(self, wanted: Sequence[int]) -> None:
+        """Read these entries and make their scene; those that cannot be read tell why."""
+        if len(wanted) > MOST:
+            raise ValueError(f"at most {MOST} can be shown at a time")
+        read: list[int] = []
+        for i in wanted:
+            try:
+                if i not in self.contents:
+                    content = self.entries[i].load()
+                    self.contents[i] = replace(content, name=self.entries[i].name,
+                                               stance=content.start or content.stance)
+                    self._about[i] = content.about
+                model = self.contents[i].model
+                if model is not None and i not in self.bodies:
+                    self.bodies[i] = MovableBody(model)
+            except (ValueError, OSError) as problem:
+                self.problems[i] = str(problem)
+            else:
+                self.problems.pop(i, None)
+                read.append(i)
+        self.shown = read
+        self.contents = {i: self.contents[i] for i in read}
+        self.bodies = {i: body for i, body in self.bodies.items() if i in read}
+        if read:
+            self._make_scene()
+
+    def _places(self) -> list[tuple[int, int, int]]:
+        """Entry, pane and first layer of everything that is shown."""
+        out, layer = [], 0
+        for pane, i in enumerate(self.shown):
+            out.append((i, 0, layer) if self.over else (i, pane, 0))
+            layer += len(self.contents[i].shapes)
+        return out
+
+    def _make_scene(self) -> None:
+        shown = [self.contents[i] for i in self.shown]
+        self.cameras, panes = over_each_other(shown, self.up) if self.over else side_by_side(shown, self.up)
+        self.number += 1
+        self._scene = [Message("scene", {"number": self.number}, pack_scene(panes, whole=True)), *self._residuals()]
+        self._notes = tuple(note for content in shown for note in content.notes)
+        self.controls.take([Shown(self.bodies[i], self.contents[i].name, pane, layer)
+                            for i, pane, layer in self._places() if i in self.bodies])
+        self._positions = {}
+        for one in self.controls.shown:
+            self._moved(one)
+
+    def _moved(self, one: Shown) -> Message:
+        """Where the vertices of a body are now."""
+        body = one.body
+        y = self.controls.vertices(body) + (body.origin - self.cameras[one.pane].target).astype(np.float32)
+        joint = None
+        if self.controls.chosen in body.parts:
+            joint = body.regressor[[body.parts.index(self.controls.chosen)]] @ y
+        fields = {"scene": self.number, "pane": one.pane, "layer": one.layer, "joint": joint, **self._where()}
+        message = Message("positions", fields, np.ascontiguousarray(y, dtype="<f4").tobytes(),
+                          f"positions {one.pane} {one.layer}")
+        self._positions[one.pane, one.layer] = message
+        return message
+
+    # what the page sends
+
+    def handle(self, message: Message, send: Send) -> None:
+        """A slider, a button, a click."""
+        action = getattr(self, f"on_{message.kind}", None)
+        if action is None:
+            raise ValueError(f"a message of kind '{message.kind}', which nothing here answers")
+        action(send, **message.fields)
+
+    def receive(self, name: str, path: Path, send: Send) -> None:
+        """Files are named on the command line."""
+        raise ValueError("name files on the command line: scape view FILES")
+
+    def close(self) -> None:
+        """All that was wanted was saved."""
+
+    def _tell(self, send: Send) -> None:
+        for one in self.controls.shown:
+            send(self._moved(one))
+
+    def on_show(self, send: Send, entries: list[int]) -> None:
+        """Other things."""
+        wanted = [i for i in entries if 0 <= i < len(self.entries)]
+        before = self.shown, self.contents, self.bodies
+        self.show(wanted)
+        if not self.shown:
+            self.shown, self.contents, self.bodies = before
+        else:
+            for message in [*self._scene, *self._positions.values()]:
+                send(message)
+        send(self.state())
+
+    def on_beta(self, send: Send, index: int, value: float) -> None:
+        """A slider of the shape."""
+        self.controls.set_beta(index, value)
+        self._tell(send)
+
+    def on_turn(self, send: Send, part: str, turn: list[float]) -> None:
+        """The angles of a part."""
+        self.controls.set_turn(part, turn)
+        self._tell(send)
+
+    def on_choose(self, send: Send, part: str) -> None:
+        """The part whose angles are shown."""
+        if part in self.controls.turns:
+            self.controls.chosen = part
+        self._tell(send)
+
+    def on_touch(self, send: Send, pane: int, layer: int, vertex: int) -> None:
+        """The part that was clicked."""
+        self.controls.choose(pane, layer, vertex)
+        self._tell(send)
+
+    def on_grab(self, send: Send, pane: int, layer: int, vertex: int) -> None:
+        """A vertex is taken hold of."""
+        self.controls.grab(pane, layer, vertex)
+        self._tell(send)
+
+    def on_drag(self, send: Send, target: list[float]) -> None:
+        """It is wanted there."""
+        self.controls.drag(target)
+        self._tell(send)
+
+    def on_random_body(self, send: Send) -> None:
+        """Other betas."""
+        self.controls.random_body(self.rng)
+        self._tell(send)
+
+    def on_random_pose(self, send: Send) -> None:
+        """Another pose."""
+        if self.controls.shown:
+            self.controls.random_pose(self.rng)
+            self._tell(send)
+
+    def on_reset(self, send: Send) -> None:
+        """Mean body, at rest."""
+        self.controls.reset()
+        self._tell(send)
+
+    def on_save_body(self, send: Send) -> None:
+        """Each body as a mesh."""
+        self.written += save_bodies(self.controls, self.output)
+        send(self.state())
+
+    def on_save_pose(self, send: Send) -> None:
+        """The pose of each as a motion of one frame."""
+        self.written += save_poses(self.controls, self.output)
+        send(self.state())

@@ -1,0 +1,48 @@
+"""Contents beside each other or in one place."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import Camera
+from scanprep.pictures.scene import Pane, framed_alike
+from scanprep.pictures.shading import CLAY, Moving, Shape, Solid
+
+from .contents import Content
+
+ALIKE = 3.0                          # things whose sizes differ less are shown in one scale
+LAID_OVER = (CLAY, (0.55, 0.66, 0.80), (0.83, 0.62, 0.55), (0.62, 0.75, 0.60), (0.72, 0.63, 0.78))
+
+
+def side_by_side(contents: Sequence[Content], up: np.ndarray | None) -> tuple[list[Camera], list[Pane]]:
+    """A pane for each, in one scale, so that they can be compared."""
+    panes = [Pane(content.shapes, content.stance.camera(up), content.name) for content in contents]
+    sizes = [pane.camera.distance for pane in panes]
+    if max(sizes) < ALIKE * min(sizes):                # else one of them is in another unit
+        panes = framed_alike(panes)
+    return [pane.camera for pane in panes], panes
+
+
+def over_each_other(contents: Sequence[Content], up: np.ndarray | None) -> tuple[list[Camera], list[Pane]]:
+    """One pane for all, each in its own colour and with its name, so that it can be hidden."""
+    shapes = [_renamed(shape, content, k, LAID_OVER[i % len(LAID_OVER)])
+              for i, content in enumerate(contents) for k, shape in enumerate(content.shapes)]
+    extent = np.concatenate([content.stance.extent for content in contents])
+    camera = replace(contents[0].stance, extent=np.stack([extent.min(axis=0), extent.max(axis=0)])).camera(up)
+    return [camera], [Pane(shapes, camera)]
+
+
+def _renamed(shape: Shape | Moving, content: Content, number: int, color: tuple[float, float, float]
+             ) -> Shape | Moving:
+    """A shape of a content with its name, the first of them in its colour."""
+    if isinstance(shape, Moving):
+        inner = _renamed(shape.shape, content, number, color)
+        assert not isinstance(inner, Moving)
+        return replace(shape, shape=inner)                                         # type: ignore[arg-type]
+    shape = Solid(shape) if isinstance(shape, Mesh) else shape
+    name = f"{content.name}: {shape.name}" if number else content.name
+    return replace(shape, name=name, color=color) if isinstance(shape, Solid) and not number else replace(
+        shape, name=name)

@@ -1,0 +1,131 @@
+"""The sliders of models that are shown: shape, pose and place, which all models share as far as they have them."""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from model.priors import LEAST_POSES, JointLimits, sample_poses
+from scanprep.ranges import BETAS, TURNS
+
+from .dragging import Drag
+from .movable import MovableBody
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """The body of a model, and which layer of which pane it is."""
+
+    body: MovableBody
+    name: str
+    pane: int
+    layer: int
+
+
+@dataclass(eq=False)
+class Controls:
+    """Where the sliders stand.
+
+    Betas of the same number and parts of the same name go together; a model without betas is its template's own body.
+    """
+
+    shown: list[Shown] = field(default_factory=list)
+    betas: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    turns: dict[str, np.ndarray] = field(default_factory=dict)
+    trans: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    chosen: str = ""                     # part whose angles are shown
+    held: tuple[Shown, Drag] | None = None
+
+    def take(self, shown: list[Shown]) -> None:
+        """Other bodies; what the sliders say stays as far as they have it."""
+        count = max([one.body.model.n_betas for one in shown], default=0)
+        betas = np.zeros(count)
+        betas[:min(count, len(self.betas))] = self.betas[:count]
+        names = dict.fromkeys(name for one in shown for name in one.body.parts)
+        self.turns = {name: self.turns.get(name, np.zeros(3)) for name in names}
+        self.shown, self.betas, self.held = shown, betas, None
+        if self.chosen not in names:
+            self.chosen = next(iter(names), "")
+
+    def pose_of(self, body: MovableBody) -> np.ndarray:
+        """(J, 3)"""
+        return np.array([self.turns[name] for name in body.parts])
+
+    def betas_of(self, body: MovableBody) -> np.ndarray | None:
+        """(K,), or None for a model without."""
+        return self.betas[:body.model.n_betas] if body.model.n_betas else None
+
+    def vertices(self, body: MovableBody) -> np.ndarray:
+        """(N, 3) float32, metres, relative to the body's `origin`."""
+        return body.vertices(self.betas_of(body), self.pose_of(body), self.trans)
+
+    # what sliders and buttons do
+
+    def set_beta(self, index: int, value: float) -> None:
+        """One component of the shape, standard deviations."""
+        if not 0 <= index < len(self.betas):
+            raise ValueError(f"index: expected 0 to {len(self.betas) - 1}, got {index}")
+        BETAS.check(np.array(value), "betas")
+        betas = self.betas.copy()
+        betas[index] = value
+        self.betas = betas
+
+    def set_turn(self, part: str, turn: list[float]) -> None:
+        """A part against its parent, axis times angle in radians."""
+        value = np.asarray(turn, dtype=float)
+        if part not in self.turns or value.shape != (3,):
+            raise ValueError(f"part: expected one of {', '.join(self.turns)} and three angles, got {part} {turn}")
+        TURNS.check(value, "pose")
+        self.turns[part] = value
+
+    def random_body(self, rng: np.random.Generator) -> None:
+        """Betas drawn as the training people's are spread."""
+        self.betas = rng.normal(size=len(self.betas))
+
+    def random_pose(self, rng: np.random.Generator) -> None:
+        """A pose from the prior of the first model, within what its joints were seen to do."""
+        body = self.shown[0].body
+        examples = body.model.pose_examples
+        limits = JointLimits.from_poses(examples) if len(examples) >= LEAST_POSES else None
+        pose = sample_poses(body.model, 1, rng, limits)[0]
+        pose[0] = 0
+        self.turns.update(zip(body.parts, pose, strict=True))
+        self.trans = np.zeros(3)
+
+    def reset(self) -> None:
+        """The mean body at rest."""
+        self.betas = np.zeros_like(self.betas)
+        self.turns = {name: np.zeros(3) for name in self.turns}
+        self.trans = np.zeros(3)
+
+    # dragging
+
+    def find(self, pane: int, layer: int) -> Shown:
+        """The body of a layer."""
+        for one in self.shown:
+            if (one.pane, one.layer) == (pane, layer):
+                return one
+        raise ValueError(f"pane and layer: expected a model's body, got {pane}, {layer}")
+
+    def choose(self, pane: int, layer: int, vertex: int) -> Shown:
+        """The part that was clicked."""
+        one = self.find(pane, layer)
+        if not 0 <= vertex < len(one.body.part_of_vertex):
+            raise ValueError(f"vertex: expected 0 to {len(one.body.part_of_vertex) - 1}, got {vertex}")
+        self.chosen = one.body.parts[int(one.body.part_of_vertex[vertex])]
+        return one
+
+    def grab(self, pane: int, layer: int, vertex: int) -> None:
+        """Take hold of a vertex."""
+        one = self.choose(pane, layer, vertex)
+        self.held = one, Drag(one.body, vertex, self.betas_of(one.body), self.pose_of(one.body))
+
+    def drag(self, target: list[float]) -> None:
+        """Move it towards a place (3,), metres."""
+        wanted = np.asarray(target, dtype=float)
+        if wanted.shape != (3,) or not np.isfinite(wanted).all():
+            raise ValueError(f"target: expected three finite numbers, got {target}")
+        if self.held is not None:
+            one, held = self.held
+            pose, self.trans = held.moved(self.pose_of(one.body), self.trans, wanted)
+            self.turns.update(zip(one.body.parts, pose, strict=True))

@@ -1,0 +1,204 @@
+"""What a file or folder is, told by what is in it, and how it is shown."""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from model.body import BodyModel
+from model.files import load_model
+from scanprep.dataset import RegisteredSet
+from scanprep.geometry.files import read_mesh, read_scan
+from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.shading import Dots
+
+from ..mocap.files.markers import MarkerSequence, read_markers
+from ..motion import Motion
+from ..partial.completion import load_completion
+from .contents import MARKER, Content, of_completion, of_mesh, of_model, told
+from .kinds import kind_of, layout_places, reported_model, worst_first
+from .motions import of_markers, of_motion
+
+PLACES = (".pp", ".json", ".lnd", ".landmarks.txt")
+COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
+SHOWN, TABLES = ("surface", "model", "motion", "markers"), (".csv", ".txt")     # of folders; tables may hold anything
+ENOUGH = 3                           # labels that a recording and a motion have in common
+DEEP = 3                             # folders inside folders that are looked into
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A thing that can be shown, read when it is; `first`: among those that are shown at first."""
+
+    name: str
+    load: Callable[[], Content]
+    first: bool = True
+
+
+class Files:
+    """The things in files and folders that were named.
+
+    Parameters
+    ----------
+    paths : Paths
+    model : Path, optional
+        Of motions that do not tell theirs.
+    unit : str, optional
+        Of meshes, points, landmarks and markers.
+    over : bool
+        Recordings of markers are shown with the motions that were made of them, not by themselves.
+    """
+
+    def __init__(self, paths: tuple[Path, ...], model: Path | None = None, unit: str | None = None,
+                 over: bool = False) -> None:
+        self.paths, self.model, self.unit, self.over = paths, model, unit, over
+        self._models: dict[Path, BodyModel] = {}
+        self._found: list[Path] = []                     # models among the files
+        self._recordings: list[Path] = []                # of markers, to be laid over motions
+
+    def entries(self) -> list[Entry]:
+        """All things, in order; ValueError for a file that is not there, or cannot be shown whatever is in it."""
+        found: list[Entry] = []
+        for path in self.paths:
+            if not path.exists():
+                raise ValueError(f"{path}: no such file or folder")
+            if path.name.lower().endswith(PLACES):
+                self._lay_on(found, path)
+            else:
+                found += self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
+        shared = f"{found[0].name.split('/')[0]}/" if found else ""
+        if len(found) > 1 and all(entry.name.startswith(shared) for entry in found):
+            found = [replace(entry, name=entry.name.removeprefix(shared)) for entry in found]
+        return found
+
+    def read_model(self, path: Path) -> BodyModel:
+        """Each model is read once."""
+        path = path.resolve()
+        if path not in self._models:
+            self._models[path] = load_model(path)
+        return self._models[path]
+
+    # files
+
+    def _of_file(self, path: Path, name: str) -> Entry:
+        kind = kind_of(path)
+        if kind == "model":
+            self._found.append(path)
+            return Entry(name, lambda: of_model(name, self.read_model(path)))
+        if kind == "motion":
+            return Entry(name, lambda: told(lambda: self._motion(path, name)))
+        if kind == "completion":
+            return Entry(name, lambda: of_completion(name, load_completion(path.parent)))
+        if kind == "markers":
+            self._recordings.append(path)
+            return Entry(name, lambda: told(lambda: of_markers(name, read_markers(path, self.unit))), not self.over)
+        if kind == "surface":
+            return Entry(name, lambda: told(lambda: self._surface(path, name)))
+        raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks or a folder, "
+                         f"found {kind}")
+
+    def _surface(self, path: Path, name: str) -> Content:
+        shape, file = read_scan(path, self.unit), landmarks_beside(path)
+        if file is None:
+            return of_mesh(name, shape)
+        try:
+            return of_mesh(name, shape, read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit))
+        except ValueError as problem:                    # a file of another kind that happens to have its name
+            return replace(of_mesh(name, shape), notes=(f"no landmarks beside {name}: {problem}",))
+
+    def _lay_on(self, found: list[Entry], path: Path) -> None:
+        """Landmarks, or a marker layout, on the thing that was named before them."""
+        if not found:
+            raise ValueError(f"{path}: landmarks and layouts are shown on a mesh or model; name that before them")
+        last = found.pop()
+
+        def load() -> Content:
+            content = last.load()
+            mesh = getattr(content.shapes[0], "mesh", None)
+            size = float(np.linalg.norm(np.ptp(content.stance.extent, axis=0)))
+            places = layout_places(path, mesh) or read_landmarks(path, mesh, self.unit)
+            dots = Dots(np.array(list(places.values())), MARKER, size / 160, True, name=path.name, labels=tuple(places))
+            still = (f"{path.name}: shown on the body at rest, without sliders",) * (content.model is not None)
+            return replace(content, shapes=[*content.shapes, dots], model=None, notes=(*content.notes, *still))
+
+        found.append(Entry(last.name, load, last.first))
+
+    # folders
+
+    def _of_folder(self, folder: Path) -> list[Entry]:
+        entries = list(self._inside(folder, folder.resolve().name, DEEP))
+        if not entries:
+            raise ValueError(f"{folder}: expected meshes, a registered set, or what a command wrote; found none")
+        return entries
+
+    def _inside(self, folder: Path, name: str, deep: int) -> Iterator[Entry]:
+        if (folder / SET).is_file():
+            yield from self._of_set(folder, name)
+        elif (folder / COMPLETION).is_file():
+            yield Entry(name, lambda: of_completion(name, load_completion(folder)))
+        elif (folder / MOTION).is_file():
+            yield Entry(name, lambda: told(lambda: self._motion(folder / MOTION, name)))
+            if (folder / "onto.npz").is_file():
+                yield Entry(f"{name}, other person", lambda: told(lambda: self._motion(folder / "onto.npz", name)))
+        else:
+            for path in sorted(folder.iterdir()):
+                if path.name.startswith("."):
+                    continue
+                if path.is_dir() and deep:
+                    yield from self._inside(path, f"{name}/{path.name}", deep - 1)
+                elif path.is_file() and path.suffix.lower() not in TABLES and kind_of(path) in SHOWN:
+                    yield self._of_file(path, f"{name}/{path.name}")
+
+    def _of_set(self, folder: Path, name: str) -> Iterator[Entry]:
+        """The meshes of a registered set, worst first, of which the first is shown; then its template."""
+        whole = RegisteredSet.load(folder)
+
+        def load(label: str, path: Path) -> Content:
+            return of_mesh(label, read_mesh(path, "m"))
+
+        for i, (scan, why) in enumerate(worst_first(whole)):
+            path = folder / next(entry.file for entry in whole.entries if entry.name == scan)
+            label = f"{name}/{scan}" + (f": {why}" if why else "")
+            yield Entry(label, lambda label=label, path=path: load(label, path), i == 0)       # type: ignore[misc]
+        yield Entry(f"{name}/template", lambda: load(f"{name}/template", folder / "template.ply"), False)
+
+    # motions
+
+    def _motion(self, path: Path, name: str) -> Content:
+        motion = Motion.load(path)
+        model = self._model_of(path, motion)
+        parts = len(model.skeleton.parents)
+        if motion.poses.shape[1] != parts:
+            raise ValueError(f"{path}: expected a motion of the model's {parts} parts, found {motion.poses.shape[1]}; "
+                             "name its own model with -m")
+        betas = motion.betas
+        if betas is not None and len(betas) > model.n_betas:
+            raise ValueError(f"{path}: expected at most the {model.n_betas} betas of the model, found {len(betas)}; "
+                             "name its own model with -m")
+        return of_motion(name, motion, model.subject(betas, np.float32), self._markers_of(path, motion))
+
+    def _markers_of(self, path: Path, motion: Motion) -> MarkerSequence | None:
+        """What was measured: the mended recording beside the motion, or one among the files that is laid over it."""
+        virtual = path.with_name("virtual.c3d")
+        tried = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
+        for file, unit in [*tried, *((one, self.unit) for one in self._recordings if self.over)]:
+            markers = read_markers(file, unit)
+            if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= ENOUGH:
+                return markers
+        return None
+
+    def _model_of(self, path: Path, motion: Motion) -> BodyModel:
+        """The model that was named, that the report beside the motion names, or one among the files."""
+        if self.model is not None:
+            return self.read_model(self.model)
+        for folder in list(path.resolve().parents)[:DEEP]:
+            name = reported_model(folder / "report.json")
+            if name is not None and name.is_file():
+                return self.read_model(name)
+        fitting = [m for m in map(self.read_model, self._found) if len(m.skeleton.parents) == motion.poses.shape[1]]
+        if not fitting:
+            raise ValueError(f"{path}: a motion needs its model; name it with -m")
+        return fitting[0]

@@ -1,0 +1,68 @@
+"""What a file is, and what files beside others tell of them."""
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanprep.dataset import RegisteredSet
+from scanprep.geometry import storage
+from scanprep.geometry.mesh import Mesh
+
+from ..mocap.files.markers import READERS
+from ..mocap.marker_sets.layout import MarkerLayout
+
+SURFACES = (".ply", ".obj", ".stl", ".off", ".glb", ".gz", ".xyz", ".pcd", ".pts", ".txt")
+CACHED = "cached at "                # in reports, before the file of the model of synthetic people
+
+
+def kind_of(path: Path) -> str:
+    """What a file is: model, motion, completion, markers, surface, or words for what it is instead."""
+    if zipfile.is_zipfile(path):
+        with storage.taking_apart(path, "a model or a motion"), zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+        if storage.HEADER not in names:
+            return "motion" if "poses" in names else f"an archive of {', '.join(sorted(names)) or 'nothing'}"[:100]
+        kind = storage.kind_of(path)
+        return {"scape": "model", "blendscape": "model", "skinning": "model", "completion": "completion"}.get(
+            kind, f"a file of kind '{kind}'")
+    suffix = path.suffix.lower()
+    if suffix in READERS:
+        return "markers"
+    return "surface" if suffix in SURFACES else f"'{path.suffix or path.name}'"
+
+
+def reported_model(path: Path) -> Path | None:
+    """The model that a command's report names."""
+    try:
+        settings: Any = storage.read_json(path, "a report").get("settings", {})
+        name = str(settings["model"])
+    except (storage.StorageError, AttributeError, KeyError, TypeError):
+        return None
+    return Path(name.split(CACHED)[-1])
+
+
+def worst_first(whole: RegisteredSet) -> list[tuple[str, str]]:
+    """Names and what is to be said of them; in the order of the set where there are no figures."""
+    from scanprep.pipeline.figures import read_figures, review
+
+    try:
+        verdicts = review(read_figures(whole.folder), {}, float(np.ptp(whole.template.vertices, axis=0).max()),
+                          len(whole.template.faces))
+    except (OSError, ValueError):
+        return [(name, "") for name in whole.names]
+    judged = {verdict.name: next(iter(verdict.reasons), "") for verdict in verdicts if verdict.name in whole.names}
+    return [*judged.items(), *((name, "") for name in whole.names if name not in judged)]
+
+
+def layout_places(path: Path, mesh: Mesh | None) -> dict[str, np.ndarray]:
+    """Where the markers of a layout are on a mesh; none of a file that is no layout."""
+    if path.suffix.lower() != ".json" or mesh is None:
+        return {}
+    tree = storage.read_json(path, "landmarks or a layout")
+    if not isinstance(tree, dict) or "markersets" not in tree:
+        return {}
+    layout = MarkerLayout.load(path, len(mesh.vertices))
+    return dict(zip(layout.labels, layout.place(mesh), strict=True))

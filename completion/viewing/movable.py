@@ -1,0 +1,126 @@
+"""A body whose shape and pose change from moment to moment, by sliders: a product of matrices at every move.
+
+Vertices are affine in betas and linear in the terms of the fast path, `Y = W(pose) (T + Σ_k Δβ_k D_k)`. `D_k` is what
+the basis gains by one standard deviation of component k; it is made when that slider is first moved. While the pose
+stands still, `W T` and `W D_k` are kept and a move of a shape's slider is one multiplication of vertices.
+"""
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import PointOperator, posed_product
+from scanprep.skeleton.names import in_words
+
+FEW = 3                              # differences beside the basis at a new pose: for more it gets these betas itself
+KEPT = 24                            # differences of the basis that are kept, those used last
+
+
+class MovableBody:
+    """A model with betas and a pose.
+
+    Parameters
+    ----------
+    model : BodyModel
+    """
+
+    def __init__(self, model: BodyModel) -> None:
+        self.model, self.skeleton = model, model.skeleton
+        self.parts = tuple(map(part_in_words, model.skeleton.names))
+        self.part_of_vertex = model.skeleton.part_of_vertex(model.template)
+        self.regressor = model.skeleton.joint_regressor(model.template)
+        self.betas: np.ndarray | None = np.zeros(model.n_betas) if model.n_betas else None
+        self.basis = self._made(self.betas)                       # (3M, N) float32, of `betas`
+        self._differences: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._pose = np.zeros((0, 3))
+        self._products: dict[int, np.ndarray] = {}                # at `_pose`; -1 is that of the basis
+
+    @property
+    def n_parts(self) -> int:
+        """J."""
+        return len(self.skeleton.parents)
+
+    def vertices(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """(N, 3) float32, metres, relative to the root's joint, of betas (K,), or None, and a pose (J, 3); plus trans.
+
+        Relative to `origin`, so that single precision holds a few micrometres wherever the body is.
+        """
+        moved = not np.array_equal(pose, self._pose)
+        changed = self._changed(betas)
+        if changed is None or len(changed) > (FEW if moved else KEPT):
+            self._settle(betas)
+            changed, moved = np.zeros(0, dtype=np.int64), True
+        if moved:
+            self._pose, self._products = np.array(pose), {}
+        y = self._product(-1).copy()
+        for k in changed.tolist():
+            assert betas is not None and self.betas is not None
+            y += np.float32(betas[k] - self.betas[k]) * self._product(k)
+        if trans is not None:
+            y += trans.astype(np.float32)[:, None]
+        return y.T
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) metres: where the root's joint is when trans is zero."""
+        return self.skeleton.joints[0]
+
+    def point(self, vertex: int, betas: np.ndarray | None) -> PointOperator:
+        """One vertex of the body with these betas, as a function of the pose."""
+        self._settle(betas)
+        column = self.basis[:, vertex].astype(np.float64).reshape(-1, 1, 3)
+        return PointOperator(self.model.terms, column, self.origin)
+
+    def _changed(self, betas: np.ndarray | None) -> np.ndarray | None:
+        """Which betas are not those of the basis; None where it has to be made again."""
+        if betas is None or self.betas is None:
+            return np.zeros(0, dtype=np.int64) if betas is None and self.betas is None else None
+        changed = np.flatnonzero(betas != self.betas)
+        missing = [k for k in changed.tolist() if k not in self._differences]
+        return changed if len(missing) < 2 else None               # to make all at once is quicker
+
+    def _settle(self, betas: np.ndarray | None) -> None:
+        """Give the basis these betas."""
+        changed = self._changed(betas)
+        if changed is None or any(k not in self._differences for k in changed.tolist()):
+            self.basis = self._made(betas)
+        elif len(changed):
+            assert betas is not None and self.betas is not None
+            basis = self.basis.copy()
+            for k in changed.tolist():
+                basis += np.float32(betas[k] - self.betas[k]) * self._differences[k]
+            self.basis = basis
+        self.betas = None if betas is None else np.array(betas)
+        self._pose, self._products = np.zeros((0, 3)), {}
+
+    def _made(self, betas: np.ndarray | None) -> np.ndarray:
+        T = self.model.basis(betas)
+        return np.ascontiguousarray(T.transpose(0, 2, 1), dtype=np.float32).reshape(-1, T.shape[1])
+
+    def _product(self, k: int) -> np.ndarray:
+        """(3, N) of the basis, or of difference k, at the pose."""
+        if k not in self._products:
+            flat = self.basis if k < 0 else self._difference(k)
+            self._products[k] = posed_product(self.model.terms, flat, self._pose)
+        return self._products[k]
+
+    def _difference(self, k: int) -> np.ndarray:
+        """(3M, N) what the basis gains by one standard deviation of component k."""
+        if k not in self._differences:
+            unit = np.zeros(self.model.n_betas)
+            unit[k] = 1
+            gained = self.model.basis(unit) - self.model.basis(np.zeros_like(unit))
+            self._differences[k] = np.ascontiguousarray(gained.transpose(0, 2, 1), dtype=np.float32).reshape(
+                -1, gained.shape[1])
+            while len(self._differences) > KEPT:
+                self._differences.popitem(last=False)
+        self._differences.move_to_end(k)
+        return self._differences[k]
+
+
+def part_in_words(name: str) -> str:
+    """A part's name by which models that name them otherwise share it: "left hand" for hand_left and l_hand."""
+    side = {"l_": "left", "r_": "right"}.get(name[:2])
+    return in_words(name if side is None else f"{name[2:]}_{side}")
