@@ -273,7 +273,7 @@ def test_a_completion_has_its_errors_as_heat(model, tmp_path):
     assert [shape.visible for shape in content.shapes] == [True, False]
 
 
-def test_a_recording_laid_over_its_motion_tells_residuals(files, tmp_path, model):
+def test_a_recording_laid_over_its_motion_tells_residuals(files, tmp_path, model, page):
     motion = a_motion(12, ("A", "B", "C"))
     motion.save(tmp_path / "walk.npz")
     subject = model.subject(motion.betas)
@@ -285,6 +285,18 @@ def test_a_recording_laid_over_its_motion_tells_residuals(files, tmp_path, model
     told = next(message for message in app.greet() if message.kind == "residuals")
     assert [told.fields[name] for name in ("pane", "layer", "labels")] == [0, 1, ("A", "B", "C")]
     assert np.allclose(np.frombuffer(told.data, "<f4"), 0.004)
+    with Server(app, say=lambda line: None) as server:
+        open_app(page, server)
+        wait_until(page, "program.markers.length === 1")
+        assert "distance of markers" in page.locator(".sk-legend").inner_text()
+        shade = "program.figure.panes[0].layers[1].valueAt"
+        assert page.evaluate(f"{shade}(0)") == "4.02 mm"                     # in 254 steps up to 30 mm
+        here = "program.figure.panes[0].controls.target.x"
+        before, _ = page.evaluate(here), page.evaluate("program.figure.go(11)")
+        assert page.evaluate(here) - before == pytest.approx(2 * np.pi, abs=0.1)        # the view goes along
+        page.get_by_label("follow").uncheck()
+        before, _ = page.evaluate(here), page.evaluate("program.figure.go(0)")
+        assert page.evaluate(here) == before
 
 
 REFUSED = {
