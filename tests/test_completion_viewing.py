@@ -315,7 +315,7 @@ def test_what_cannot_be_shown_is_refused_in_one_line(name, tmp_path, capsys):
     data, line = REFUSED[name]
     if data is not None:
         (tmp_path / name).write_bytes(data)
-    assert main(["view", str(tmp_path / name), "--no-open"]) == 1
+    assert main(["view", str(tmp_path / name), "--serve", "0"]) == 1
     told = capsys.readouterr().err
     assert line in told and len(told.strip().splitlines()) == 1 and "unforeseen" not in told
 

@@ -17,7 +17,7 @@ from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Send
 
 from .arrangement import over_each_other, side_by_side
-from .contents import AXES, Content
+from .contents import Content
 from .controls import Controls, Shown
 from .files import Entry
 from .movable import MovableBody
@@ -34,8 +34,6 @@ class ViewApp:
     entries : sequence of Entry
     over : bool
         All in one pane.
-    up : str, optional
-        Axis that is up in all panes, such as "y" or "-y".
     output : Path
         Folder for what is saved.
     """
@@ -43,10 +41,8 @@ class ViewApp:
     name, title = "view", "View"
     folders: Sequence[Path] = ()
 
-    def __init__(self, entries: Sequence[Entry], over: bool = False, up: str | None = None, output: Path = Path()
-                 ) -> None:
+    def __init__(self, entries: Sequence[Entry], over: bool = False, output: Path = Path()) -> None:
         self.entries, self.over, self.output = list(entries), over, output
-        self.up = None if up is None else AXES[up]
         self.controls, self.rng = Controls(), np.random.default_rng()
         self.written: list[Path] = []                     # what was saved
         self.problems: dict[int, str] = {}
@@ -133,7 +129,7 @@ class ViewApp:
 
     def _make_scene(self) -> None:
         shown = [self.contents[i] for i in self.shown]
-        self.cameras, panes = over_each_other(shown, self.up) if self.over else side_by_side(shown, self.up)
+        self.cameras, panes = over_each_other(shown) if self.over else side_by_side(shown)
         self.number += 1
         self._scene = [Message("scene", {"number": self.number}, pack_scene(panes, whole=True)), *self._residuals()]
         self._notes = tuple(note for content in shown for note in content.notes)

@@ -17,7 +17,7 @@ ALIKE = 3.0                          # things whose sizes differ less are shown 
 LAID_OVER = (CLAY, (0.55, 0.66, 0.80), (0.83, 0.62, 0.55), (0.62, 0.75, 0.60), (0.72, 0.63, 0.78))
 
 
-def side_by_side(contents: Sequence[Content], up: np.ndarray | None) -> tuple[list[Camera], list[Pane]]:
+def side_by_side(contents: Sequence[Content], up: np.ndarray | None = None) -> tuple[list[Camera], list[Pane]]:
     """A pane for each, in one scale, so that they can be compared."""
     panes = [Pane(content.shapes, content.stance.camera(up), content.name) for content in contents]
     sizes = [pane.camera.distance for pane in panes]
@@ -26,7 +26,7 @@ def side_by_side(contents: Sequence[Content], up: np.ndarray | None) -> tuple[li
     return [pane.camera for pane in panes], panes
 
 
-def over_each_other(contents: Sequence[Content], up: np.ndarray | None) -> tuple[list[Camera], list[Pane]]:
+def over_each_other(contents: Sequence[Content], up: np.ndarray | None = None) -> tuple[list[Camera], list[Pane]]:
     """One pane for all, each in its own colour and with its name, so that it can be hidden."""
     shapes = [_renamed(shape, content, k, LAID_OVER[i % len(LAID_OVER)])
               for i, content in enumerate(contents) for k, shape in enumerate(content.shapes)]

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -13,12 +13,10 @@ from scanprep.viewer.cli import Port
 from ..cli import ModelOrNone
 
 FilesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE [FILE ...]")]
-Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 
 def view_files(files: FilesArg, model: ModelOrNone = None, over: bool = False, unit: Unit | None = None,
-               up: Axis | None = None, port: Port | None = None, open: bool = True,
-               save_in: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path()) -> Outcome:
+               serve: Port | None = None, save_in: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path()) -> Outcome:
     """Look at meshes, scans, models, motions and results in the browser, and move models by sliders.
 
     Example: scape view scan.ply completed -m model.npz
@@ -32,21 +30,20 @@ def view_files(files: FilesArg, model: ModelOrNone = None, over: bool = False, u
         model: Model of motions that do not tell theirs.
         over: Lay everything over each other instead of side by side.
         unit: Unit of meshes, points, landmarks and markers.
-        up: Axis that points up; without it the one along which a body is largest.
-        port: Port of this machine to use; else any that is free.
-        open: Open the browser. With --no-open the address is printed, and how to reach it from another machine.
+        serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
+            to reach it is printed.
         save_in: Folder for bodies and poses that are saved; files that are there stay.
     """
-    from scanprep.viewer.server import serve
+    from scanprep.viewer.server import serve as show
 
     from .app import ViewApp
     from .files import Files
 
     if not files:
         raise ValueError("FILE: expected at least one file or folder")
-    app = ViewApp(Files(files, model, unit, over).entries(), over, up, save_in)
+    app = ViewApp(Files(files, model, unit, over).entries(), over, save_in)
     for problem in app.problems.values():
         say(f"scape view: note: {problem}")
-    serve(app, port, open)
+    show(app, serve or None, serve is None)
     return Outcome(None, [Metric("things", len(app.entries)), Metric("shown at last", len(app.shown)),
                           Metric("files saved", len(app.written))])

@@ -38,7 +38,13 @@ export class Program {
 
   send(kind, fields = {}, latest = "", data = undefined) { this.connection.send(kind, fields, data, latest); }
 
-  async received(message) {
+  // Messages one after the other: a scene takes a moment to unpack, and what comes after belongs to it.
+  received(message) {
+    this.turn = (this.turn ?? Promise.resolve()).then(() => this.answer(message)).catch((error) => { setTimeout(() => { throw error; }); });
+    return this.turn;
+  }
+
+  async answer(message) {
     if (message.kind === "scene") await this.show(message.data);
     else if (message.kind === "positions") this.move(message);
     else if (message.kind === "error") this.say(message.fields.text, "bad");

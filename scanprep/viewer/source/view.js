@@ -18,20 +18,15 @@ export class View extends Program {
     document.body.classList.add("sk-looking");
     this.markers = [];
     this.count = FIRST;
-    this.turn = Promise.resolve();
     this.on("state", (fields) => this.update(fields));
     this.on("residuals", (fields, data) => this.addMarkers({ ...fields, values: new Float32Array(data.slice().buffer) }));
     this.build();
     addEventListener("keydown", (event) => this.key(event));
   }
 
-  // Messages one after the other: a scene takes a moment to unpack, and what comes after belongs to it.
-  received(message) {
-    this.turn = this.turn.then(() => {
-      if (message.kind === "scene") { this.number = message.fields.number; this.markers = []; }
-      return super.received(message);
-    }).catch((error) => { setTimeout(() => { throw error; }); });
-    return this.turn;
+  answer(message) {
+    if (message.kind === "scene") { this.number = message.fields.number; this.markers = []; }
+    return super.answer(message);
   }
 
   build() {
