@@ -5,8 +5,17 @@ import numpy as np
 import pytest
 from people_bodies import kept, small_people
 
+from completion.mocap.files.text import MarkerFileError
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import FOLDER, faces_digest, fitting_layout, layout_names, named_layout
+from completion.mocap.marker_sets.named import (
+    FOLDER,
+    faces_digest,
+    fitting_layout,
+    layout_names,
+    named_layout,
+    read_layout,
+)
+from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
@@ -165,3 +174,24 @@ def test_mosh67_is_vicon47_and_twenty_more(person):
     few, many = (named_layout(name, person) for name in ("vicon47", "mosh67"))
     assert set(few.labels) < set(many.labels) and many.aliases == few.aliases and not many.loose
     np.testing.assert_array_equal(many.select(few.labels).vertices, few.vertices)
+
+
+def test_places_clicked_on_the_template_are_a_layout(tmp_path):
+    """Saved by `scape pick` in any format; others than on the template are refused, layouts are read as before."""
+    person = small_people()
+    body, rng = person.template, np.random.default_rng(0)
+    points, face, bary = body.sample(12, rng)
+    clicked = {f"M{i:02d}": point for i, point in enumerate(points)}
+    for ending in (".landmarks.json", ".pp", ".mrk.json"):
+        write_landmarks(tmp_path / f"markers{ending}", clicked)
+        layout = read_layout(tmp_path / f"markers{ending}", body)
+        assert layout.labels == tuple(clicked)
+        np.testing.assert_allclose(layout.skin_points(body.vertices), points, atol=1e-6)
+        posed = person.vertices(0.2 * rng.normal(size=(len(person.skeleton.parents), 3)), None)
+        np.testing.assert_allclose(layout.skin_points(posed), np.einsum("nk,nkd->nd", bary, posed[body.faces[face]]),
+                                   atol=1e-5)
+    write_landmarks(tmp_path / "far.json", {**clicked, "M03": points[3] + [0, 0, 0.3]})
+    with pytest.raises(MarkerFileError, match=r"far\.json: .*'M03' is \d+ mm off"):
+        read_layout(tmp_path / "far.json", body)
+    layout.save(tmp_path / "layout.json")
+    np.testing.assert_array_equal(read_layout(tmp_path / "layout.json", body).vertices, layout.vertices)

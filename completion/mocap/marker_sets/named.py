@@ -12,11 +12,15 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.geometry import storage
+from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.judgement import size
 
+from ..files.text import MarkerFileError
 from .layout import MarkerLayout
 
+OFF = 0.015                          # of the template's size: farthest from it that a clicked marker may be
 FOLDER = Path(__file__).parent / "layouts"
 OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {LABEL: VERTEX, ...}}]} '
        "and load it with MarkerLayout.load (--layout FILE)")
@@ -110,10 +114,36 @@ def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[s
 
 
 def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
-    """The layout for a body that is named, or in a file."""
+    """The layout for a body that is named, or in a file: a layout, or places that were clicked on the template."""
     named = layout_or_file(given)
-    return named_layout(named, template, kept) if isinstance(named, str) else \
-        MarkerLayout.load(named, len(template.vertices))
+    if isinstance(named, str):
+        return named_layout(named, template, kept)
+    return clicked_layout(named, template) if _is_clicked(named) else MarkerLayout.load(named, len(template.vertices))
+
+
+def clicked_layout(path: Path, template: Mesh) -> MarkerLayout:
+    """Markers where somebody clicked them on the template of the model, as `scape pick` saves them.
+
+    MarkerFileError for places that are not on it.
+
+    [SCAPE] §8
+    """
+    places = read_landmarks(path, template)
+    found = Surface(template).closest(np.array(list(places.values())))
+    far = found.distances.argmax()
+    if found.distances[far] > OFF * size(template):
+        raise MarkerFileError(f"{path}: expected places on the model's template, '{list(places)[far]}' is "
+                              f"{1000 * found.distances[far]:.0f} mm off it; click them on the template")
+    return MarkerLayout(tuple(places), template.faces[found.faces], weights=found.bary)
+
+
+def _is_clicked(path: Path) -> bool:
+    """Whether a file holds landmarks, not a layout."""
+    if path.suffix.lower() != ".json" or path.name.endswith(".mrk.json"):
+        return True
+    tree = storage.read_json(path, "a marker layout", MarkerFileError)
+    return isinstance(tree, dict) and bool(tree) and "markersets" not in tree and all(
+        isinstance(place, list | int) or (isinstance(place, dict) and "face" in place) for place in tree.values())
 
 
 def layout_or_file(given: str | Path) -> str | Path:
