@@ -113,6 +113,13 @@ def depth_camera(report: dict) -> str:
                   "right but flagged", "time (s CPU)"), rows)
 
 
+def viewer_speed(report: dict) -> str:
+    """Round trips of sliders."""
+    rows: Rows = [(kind, report[kind]["a_second"], report[kind]["median_ms"], report[kind]["p95_ms"])
+                  for kind in ("shape", "pose", "both")]
+    return table(("slider", "round trips a second", "median (ms)", "95th percentile (ms)"), rows)
+
+
 COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "half_views": (
         "Half views of held-out poses, known subject, seven landmarks",
@@ -182,4 +189,9 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "A walk of 120 frames at 30 Hz of a synthetic person who is not in the model of the synthetic people, two "
         "depth cameras with 5 mm noise, no landmarks. The run was stopped before its last two rows, frames that show "
         "nothing and frames that show half. `surface`: the model's vertices to the true surface of the whole body."),
+    "viewer_speed": (
+        "Sliders of a model in the browser",
+        "python tests/benchmarks/viewer_speed.py -m MODEL", viewer_speed,
+        "From a slider in the page to the new vertices there, 12,500 of them, without drawing; the suite of tests was "
+        "running on both cores. Chromium with software rendering."),
 }
