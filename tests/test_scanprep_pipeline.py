@@ -194,14 +194,23 @@ def test_processes_change_nothing(six, template, tmp_path):
     assert contents(tmp_path / "set") == contents(whole)
 
 
-@pytest.mark.parametrize("processes, ship", [(True, False), (False, True)])
-def test_a_cluster_changes_nothing(six, template, tmp_path, processes, ship):
-    from distributed import LocalCluster
+@pytest.mark.parametrize("processes, seen", [(True, True), (False, False)])
+def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, monkeypatch):
+    """Nor one whose workers do not see the files, which then travel along."""
+    from distributed import Client, LocalCluster
 
     scans, whole = six
     layout = {"n_workers": 2, "threads_per_worker": 1} if processes else {"n_workers": 1, "threads_per_worker": 3}
     with LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
-        config = dataclasses.replace(WITH_PICTURES, workers=Workers(0, local.scheduler_address, ship))
+        with Client(local, set_as_default=False) as client:
+            here = [task.scan for task in find_scans(scans)]
+            assert cluster._seen_there(client, here) and cluster._seen_there(client, [tmp_path / "none"])
+            monkeypatch.setattr(Path, "absolute", lambda path: Path("/elsewhere") / path.name)
+            assert not cluster._seen_there(client, here)
+            monkeypatch.undo()
+        if not seen:
+            monkeypatch.setattr(cluster, "_seen_there", lambda client, given: False)
+        config = dataclasses.replace(WITH_PICTURES, workers=Workers(0, local.scheduler_address))
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
     assert contents(tmp_path / "set") == contents(whole)
 

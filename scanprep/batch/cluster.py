@@ -18,12 +18,12 @@ from .room import Failure, Job, attempt
 ANSWER = 10                    # seconds that a scheduler may take
 
 
-def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = False) -> Iterator[tuple[Job, Any]]:
+def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tuple[Job, Any]]:
     """Each job with what the work returned, or a Failure, as they finish; ValueError where no scheduler serves.
 
     The work travels to each worker once. Files come back to this process, which alone writes, so workers need no
-    place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`). With `ship` the files
-    of each job travel along, for workers that do not see them under the same path.
+    place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`). Where a
+    worker does not see the files under the same path, those of each job travel along.
     """
     from distributed import Client, as_completed
 
@@ -40,6 +40,7 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = Fa
         # a task that gives its argument back: unlike scattered data it is made anew where all copies are lost
         shared = client.submit(bytes, pickle.dumps((work, _versions())), pure=False)
         there = _entrance()
+        ship = not all(_seen_there(client, job.given) for job in jobs[:1])
         waiting = iter(jobs)
         job_of: dict[Any, Job] = {}
         running = as_completed([], loop=client.loop)
@@ -60,6 +61,17 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = Fa
             job = job_of.pop(future)
             submit()
             yield job, _outcome(future, job, address)
+
+
+def _seen_there(client: Any, given: Any) -> bool:
+    """Whether every worker has the files of a job, by path and size."""
+    def same(files: list[tuple[str, int]]) -> bool:
+        import os
+
+        return all(os.path.exists(path) and os.path.getsize(path) == size for path, size in files)
+
+    files = [(str(path.absolute()), path.stat().st_size) for path in paths_of(given) if path.is_file()]
+    return all(client.run(same, files).values())
 
 
 def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes]]]:

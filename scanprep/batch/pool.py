@@ -25,13 +25,10 @@ class Workers(Settings):
         Processes on this machine; 0 for one a core.
     scheduler : str, optional
         Address of a Dask scheduler, whose workers do the work instead, such as tcp://host:8786.
-    ship : bool
-        Send the files of each task to those workers, which otherwise read them under the same path.
     """
 
     workers: Annotated[Processes, FLAG] = 0
     scheduler: Annotated[str | None, FLAG] = None
-    ship: bool = False
 
 
 def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress | None = None
@@ -42,7 +39,7 @@ def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress 
     if workers.scheduler is not None:
         from .cluster import run_on_cluster
 
-        return run_on_cluster(workers.scheduler, work, jobs, workers.ship)
+        return run_on_cluster(workers.scheduler, work, jobs)
     count = min(workers.workers or os.cpu_count() or 1, len(jobs))
     if count == 1:
         return ((job, attempt(work, job, inside)) for job in jobs)
