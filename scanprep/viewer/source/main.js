@@ -1,6 +1,7 @@
 // What a page calls: `scapekit.start()` in reports, `scapekit.start("view")` and the like in programs.
 import { Complete } from "./complete.js";
 import { Figure } from "./figure.js";
+import { Mend } from "./mend.js";
 import { hasWebGL } from "./pane.js";
 import { Pick } from "./pick.js";
 import { fromBase64, unpackScene } from "./unpack.js";
@@ -33,7 +34,7 @@ async function turn(figure) {
   figure.dataset.turns = "";
 }
 
-const PROGRAMS = { complete: Complete, pick: Pick };
+const PROGRAMS = { complete: Complete, mend: Mend, pick: Pick };
 
 export function start(name) {
   if (!name) startReport();
