@@ -125,10 +125,14 @@ def _inline(item: Any) -> str:
 
 def read(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
     """Settings with what a file changes in them; ValueError names file, line, what was expected, the nearest name."""
+    return parsed(path.read_text(encoding="utf-8"), path, settings)
+
+
+def parsed(text: str, path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
+    """The same of a text that stands in a file."""
     import tomlkit
     from tomlkit.exceptions import ParseError
 
-    text = path.read_text(encoding="utf-8")
     try:
         tree = tomlkit.parse(text).unwrap()
     except ParseError as error:

@@ -15,17 +15,14 @@ from ..batch.workspace import Workspace
 from ..cleaning.clean_scan import CleanScanConfig
 from ..cli import MM, Output, SetArg
 from ..console import Metric, Outcome, bar, say
-from ..geometry.files import read_mesh
-from ..geometry.landmarks import read_template_landmarks
 from ..geometry.mesh import Mesh
+from .again import LISTED, Call
 from .figures import Limits, Verdict
 from .page import PAGE, judge_set, write_set_page
-from .prepare import PrepareConfig, Prepared, prepare
-from .scan import Init
-from .scans import ScanTask, find_scans
+from .prepare import PrepareConfig, Prepared, Progress, prepare
+from .scans import ScanTask
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
-LISTED = 5                    # scans that the closing table names
 
 
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -46,15 +43,28 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         clean: Take floor, furniture and specks off each scan before.
         subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
     """
-    body, tasks = read_mesh(template), find_scans(scans, landmarks, subject)
     if clean and config.scan.clean is None:
         config = replace(config, scan=replace(config.scan, clean=CleanScanConfig()))
-    marks = _template_marks(template, template_landmarks, body, tasks, config.scan.init)
+    call = Call(scans, template, landmarks, template_landmarks, subject, config)
+    given = call.inputs(say)
     with bar("finding the parts of a person") as naming, bar("registering scans") as registering, \
             bar("finding the skeleton") as finding:
-        done = prepare(tasks, body, marks, space.folder, config, registering, finding, naming)
-    return Outcome(output, [*_progress_made(done, tasks), *_quality(judge_set(output)),
-                            Metric("unit assumed", config.scan.unit or "m")], {"prepare": config}, list(done.failures))
+        return carried_out(call, given, space, registering, finding, naming)
+
+
+def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], space: Workspace,
+                *tell: Progress) -> Outcome:
+    """Register what has changed of a folder in a set that is open, and keep there what was asked for.
+
+    `tell` is the progress of scans, the skeleton, the parts of a person, and inside a scan.
+    """
+    tasks, body, marks = given
+    done = prepare(tasks, body, marks, space.folder, call.config, *tell)
+    with space.staging("run") as staged:
+        call.write(staged.folder)
+    return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(judge_set(space.folder)),
+                                  Metric("unit assumed", call.config.scan.unit or "m")],
+                   {"prepare": call.config}, list(done.failures))
 
 
 def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B008
@@ -69,22 +79,6 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B00
         write_set_page(registered, limits, to=staged.folder)
     say(f"written: {registered / PAGE}")
     return Outcome(None, _quality(judge_set(registered, limits)), {"limits": limits})
-
-
-def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], init: Init
-                    ) -> dict[str, int]:
-    """The landmarks of the template, where any scan is led by landmarks."""
-    without = [task.name for task in tasks if task.landmarks is None]
-    if init == "pose":
-        say("note: no landmarks are used; all scans must be near the template's pose")
-        return {}
-    if init == "automatic" or (init == "best" and len(without) == len(tasks)):
-        say("note: no landmarks are used; look at the page for scans turned round or mirrored")
-        return {}
-    if without and init == "best":
-        say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
-            "look at the page for those turned round or mirrored")
-    return read_template_landmarks(template, body, given)
 
 
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:

@@ -100,7 +100,8 @@ def _explanation(limits: Limits, size: float) -> str:
         "joints that roll or bend as no person's do and limbs whose skin is out of shape count too: a rolled limb lies "
         "on the scan as well as the right one.\n\n"
         "To mend a scan, correct its landmarks or click more of them where it went wrong and run the same command "
-        "again: only scans whose files have changed are registered anew.")
+        "again: only scans whose files have changed are registered anew. `scape pick` with the folder of this set "
+        "does both in the browser.")
 
 
 def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:

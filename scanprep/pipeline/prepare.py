@@ -66,13 +66,15 @@ class Prepared:
 
 def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,
             config: PrepareConfig | None = None, progress: Progress | None = None,
-            skeleton_progress: Progress | None = None, person_progress: Progress | None = None) -> Prepared:
+            skeleton_progress: Progress | None = None, person_progress: Progress | None = None,
+            scan_progress: Progress | None = None) -> Prepared:
     """Register the template to every scan, find the skeleton, and write a page that shows how it went.
 
     What the folder already holds is done again only where something that it depends on has changed. A scan that cannot
     be read or registered is listed; scans of earlier calls, and a skeleton that was edited, stay as they are. Nothing
     that is written depends on the number of workers, their order or interruptions, but for `times.csv`. ValueError for
     a template that cannot serve, or a folder of other scans registered with another template or settings.
+    `scan_progress` is told of the steps of each scan that is registered in this process.
     """
     config = config or PrepareConfig()
     check_template(template)
@@ -88,7 +90,8 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         failures: dict[str, str] = {}
         fresh: tuple[str, ...] = ()
         try:
-            done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress)
+            done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress,
+                             scan_progress)
             failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
             registered = tables.write(failures)
             _with_doubts(space, registered, parts)
@@ -112,7 +115,8 @@ class RegisterScan:
     parts: PersonParts | None = None         # of the template, where it is a person
 
     def __call__(self, task: ScanTask, room: Room) -> ScanFigures:
-        found = register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts)
+        found = register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts,
+                              room.tell)
         write_mesh(room.folder / mesh_file(task.name), self.template.with_vertices(found.vertices))
         if found.picture:
             (room.folder / PICTURES).mkdir()

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from ..batch.room import Progress
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
@@ -70,7 +71,8 @@ class RegisteredScan:
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
-                  settings: ScanSettings, parts: PersonParts | None = None) -> RegisteredScan:
+                  settings: ScanSettings, parts: PersonParts | None = None,
+                  progress: Progress | None = None) -> RegisteredScan:
     """Read and register one scan, and try other rolls of limbs where the template has the parts of a person.
 
     ValueError for files that cannot be read, or a registration that means nothing.
@@ -81,7 +83,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         _check_unit(task, scan, template)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
         scan, removed = _cleaned(scan, landmarks, settings.clean)
-        fit, pairs, init = _registered(template, scan, landmarks, settings)
+        fit, pairs, init = _registered(template, scan, landmarks, settings, progress)
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
@@ -118,14 +120,14 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         raise ValueError(f"{task.landmarks}: {error}") from None
 
 
-def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
-                ) -> tuple[Registration, Correspondences | None, str]:
+def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings,
+                progress: Progress | None) -> tuple[Registration, Correspondences | None, str]:
     """The template on the scan, and what led it there: landmarks, or correspondences, or its pose; that in words."""
     if landmarks is not None or settings.init == "pose":
-        return (register(template, scan, landmarks, settings.registration), None,
+        return (register(template, scan, landmarks, settings.registration, progress), None,
                 "pose" if landmarks is None else f"{len(landmarks[0])} landmarks")
     try:
-        fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences)
+        fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences, progress)
         return fit, pairs, f"{len(pairs)} correspondences"
     except ValueError as error:
         raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None

@@ -1,6 +1,7 @@
 """`scape pick`: landmarks clicked in the browser."""
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,10 +23,12 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
                    unit: Unit | None = None, serve: Port | None = None) -> Outcome:
     """Click named points on a template and on scans, in the browser. Every click is saved at once.
 
+    Of a set that scape prep run made, the scans come worst first, and are registered again where they were mended.
+
     Example: scape pick template.ply scans
 
     Args:
-        mesh: The template, or any mesh whose landmarks are wanted.
+        mesh: The template, or any mesh whose landmarks are wanted; or the folder of a registered set.
         scans: Scans to click the same landmarks on, one after the other, or folders of them.
         names: Names to offer beside those that are there already: "ten" for people, "caesar" for the 73 of CAESAR, or
             a text file with one name in each line.
@@ -35,18 +38,40 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
         serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
             to reach it is printed.
     """
-    from .server import serve as show
-
     ending = ".landmarks.json" if format == "json" else "." + format
+    if (mesh / "set.json").exists():
+        return _mended(mesh, scans, ending, names, unit, serve)
     template, *others = [Clicked.found(path, ending, unit, file) for path, file in ((mesh, None), *_files(scans))]
     with bar("reading") as progress:                      # a file that is no mesh is refused before a browser opens
         for number, one in enumerate(first := [template, *others[:1]]):
             progress(number, len(first))
             _ = one.shown
     app = PickApp(template, others, read_names(names))
-    before = {one.path: len(one.places) for one in (template, *others)}
+    return _shown(app, serve)
+
+
+def _mended(folder: Path, scans: tuple[Path, ...], ending: str, names: str, unit: Unit | None, serve: Port | None
+            ) -> Outcome:
+    """The same for the scans of a set, which are registered again there."""
+    from ..pipeline.mend import MendApp
+
+    if scans or unit:
+        raise ValueError(f"{folder}: a registered set knows its scans and their unit; name nothing but the set")
+    app = MendApp(folder, ending, () if names == "ten" else read_names(names))
+    done = _shown(app, serve)
+    return replace(done, metrics=[*done.metrics, Metric("scans that need a look",
+                                                        sum(v.suspect for v in app.verdicts.values())),
+                                  Metric("scans changed and not registered again", len(app.changed - {-1}))])
+
+
+def _shown(app: PickApp, serve: Port | None) -> Outcome:
+    """An app in the browser until it is ended, and what was clicked."""
+    from .server import serve as show
+
+    all_bodies = (app.template, *app.scans)
+    before = {one.path: len(one.places) for one in all_bodies}
     show(app, serve or None, serve is None)
-    done = [one for one in (template, *others) if one.places]
+    done = [one for one in all_bodies if one.places]
     return Outcome(None, [Metric("bodies with landmarks", len(done)),
                           Metric("landmarks", sum(len(one.places) for one in done)),
                           Metric("more than before", sum(len(one.places) - before[one.path] for one in done)),

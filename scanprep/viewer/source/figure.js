@@ -42,7 +42,7 @@ export class Figure {
     const box = make("div", { class: "sk-pane" });
     this.row.append(box);
     const pane = new Pane(box, described);
-    for (const layer of described.layers) pane.add(new Layer(layer, this.scene.columns));
+    for (const layer of described.layers) pane.add(new Layer(layer, described.columns ?? this.scene.columns));
     if (described.label) box.append(make("div", { class: "sk-label" }, described.label));
     box.append(pane.tip = make("div", { class: "sk-tip", hidden: true }));
     const moves = pane.layers.some((layer) => layer.motion);

@@ -1,6 +1,7 @@
 // What a page calls: `scapekit.start()` in reports, `scapekit.start("view")` and the like in programs.
 import { Complete } from "./complete.js";
 import { Figure } from "./figure.js";
+import { Mend } from "./mend.js";
 import { hasWebGL } from "./pane.js";
 import { Pick } from "./pick.js";
 import { fromBase64, unpackScene } from "./unpack.js";
@@ -34,7 +35,7 @@ async function turn(figure) {
   figure.dataset.turns = "";
 }
 
-const PROGRAMS = { complete: Complete, pick: Pick, view: View };
+const PROGRAMS = { complete: Complete, mend: Mend, pick: Pick, view: View };
 
 export function start(name) {
   if (!name) startReport();

@@ -45,7 +45,7 @@ export class Program {
   }
 
   async answer(message) {
-    if (message.kind === "scene") await this.show(message.data);
+    if (message.kind === "scene") await this.show(message.data, message.fields);
     else if (message.kind === "positions") this.move(message);
     else if (message.kind === "error") this.say(message.fields.text, "bad");
     this.answers[message.kind]?.(message.fields, message.data);
@@ -60,8 +60,11 @@ export class Program {
     this.lost = state !== "open";
   }
 
-  async show(data) {
-    const scene = await unpackScene(data);
+  // What a scene message holds; programs may put more behind the panes.
+  unpack(data) { return unpackScene(data); }
+
+  async show(data, fields) {
+    const scene = await this.unpack(data, fields);
     const before = this.figure?.panes.map((pane) => pane.view());
     this.figure = new Figure(this.stage, scene, this.linked ?? true);
     if (before?.length === scene.panes.length) this.figure.panes.forEach((pane, i) => pane.restore(before[i]));

@@ -1,0 +1,40 @@
+// `scape pick SET`: scans worst first, their landmarks mended as in `scape pick`, and a button that registers them again.
+import { make } from "./figure.js";
+import { button, Pick } from "./pick.js";
+import { unpackScene } from "./unpack.js";
+
+const WORDS = { good: "good", check: "look at it", failed: "failed", new: "new" };
+
+export class Mend extends Pick {
+  build() {
+    super.build();
+    this.verdict = make("div", { class: "sk-verdict" });
+    this.go = button("register again", "what scape prep run does, for scans that have changed", () => this.send("register"));
+    this.go.classList.add("sk-main-button");
+    this.scans.after(this.verdict, make("div", { class: "sk-buttons" }, this.go));
+  }
+
+  // The template on the scan, from the page of the set, has columns of its own.
+  async unpack(data, { first }) {
+    const scene = await unpackScene(data.slice(0, first));
+    if (first < data.length) {
+      const { panes, columns } = await unpackScene(data.slice(first));
+      scene.panes.push({ ...panes[1], columns });
+    }
+    return scene;
+  }
+
+  update(state) {
+    super.update(state);
+    const { scans, scan, verdicts, changed, template_changed: all, working } = state;
+    this.scans.replaceChildren(...scans.map(({ name, count }, i) => make("option", { selected: i === scan },
+      `${WORDS[verdicts[i].verdict]} · ${name} (${count})`)));
+    const { verdict, reasons } = verdicts[scan];
+    this.verdict.dataset.verdict = verdict;
+    const mended = all || changed.includes(scans[scan].name.split(".")[0]);
+    this.verdict.replaceChildren(make("strong", {}, mended ? `${WORDS[verdict]}; its landmarks changed since` : WORDS[verdict]),
+      make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))));
+    this.go.disabled = Boolean(working);
+    this.go.textContent = all ? "register all scans again" : changed.length > 1 ? `register ${changed.length} scans again` : "register again";
+  }
+}

@@ -1,0 +1,151 @@
+"""`scape pick SET`: scans worst first, landmarks mended, registered again; the others' files stay as they are."""
+import time
+
+import pytest
+from browser import wait_until
+from scan_folders import MARKS, WITH_PICTURES, ball, contents, write_scans
+
+from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
+from scanprep.batch.opening import locked, workspace
+from scanprep.batch.ownership import HOME
+from scanprep.geometry.landmarks import read_landmarks
+from scanprep.geometry.storage import StorageError
+from scanprep.pipeline.again import RUN, Call
+from scanprep.pipeline.cli import carried_out
+from scanprep.pipeline.mend import MendApp
+from scanprep.viewer.messages import Message
+from scanprep.viewer.pick import KEPT
+from scanprep.viewer.server import Server
+
+ENDING, WRONG = ".landmarks.json", {"top": "front", "front": "top"}        # whose places are exchanged
+READY = "Boolean(window.program?.figure && program.state) && program.figure.panes.every((pane) => pane.drawn > 1)"
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A set of three scans; two landmarks of body1 are exchanged."""
+    template = ball()
+    write_mesh(tmp_path / "template.ply", template)
+    write_landmarks(tmp_path / "template.landmarks.json", MARKS)
+    scans = write_scans(tmp_path / "scans", template)
+    file = scans / "body1.landmarks.json"
+    marks = read_landmarks(file)
+    write_landmarks(file, {name: marks[WRONG.get(name, name)] for name in marks})
+    call = Call(scans, tmp_path / "template.ply", config=WITH_PICTURES)
+    with workspace(tmp_path / "set") as space:
+        carried_out(call, call.inputs(lambda line: None), space)
+    return tmp_path
+
+
+def sent(app, kind, **fields):
+    told = []
+    app.handle(Message(kind, fields), told.append)
+    return told
+
+
+def wait(app, seconds=60):
+    end = time.monotonic() + seconds
+    while app.working is not None:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def true_place(place, name):
+    """Where a landmark of body1 is, and the way outward there."""
+    body = read_mesh(place / "scans" / "body1.ply")
+    return body.vertices[MARKS[name]], body.vertex_normals[MARKS[name]]
+
+
+def mend(app, place):
+    for name in WRONG:
+        spot, out = true_place(place, name)
+        sent(app, "place", pane=1, name=name, origin=(spot + 0.5 * out).tolist(), direction=(-out).tolist())
+
+
+def test_what_a_set_was_made_with_is_read_back(place):
+    call = Call.read(place / "set")
+    assert call == Call(place / "scans", place / "template.ply", config=WITH_PICTURES)
+    RegisteredSet.load(place / "set")                      # the set itself is as it was
+    (place / "set" / RUN).write_text('{"kind": "call of scape prep run", "version": 2}')
+    with pytest.raises(StorageError, match=r"run\.json"):
+        Call.read(place / "set")
+    (place / "set" / RUN).unlink()
+    with pytest.raises(StorageError, match="run the same command once more"):
+        MendApp(place / "set", ENDING)
+
+
+def test_exchanged_landmarks_are_mended_and_only_that_scan_is_registered(place):
+    app = MendApp(place / "set", ENDING)
+    state = app.greet()[-1].fields
+    assert state["scans"][0]["name"] == "body1.ply"                                      # worst first
+    assert [v["verdict"] for v in state["verdicts"]][1:] == ["good", "good"]
+    assert state["verdicts"][0]["verdict"] in ("check", "failed") and state["verdicts"][0]["reasons"]
+    before, page = contents(place), (place / "set" / "report.html").read_bytes()
+    mend(app, place)
+    assert app.greet()[-1].fields["changed"] == ["body1"]
+    sent(app, "register")
+    wait(app)
+    state = app.greet()[-1].fields
+    assert "1 of 3 scans registered again" in state["note"] and not state["changed"]
+    assert state["verdicts"][0] == {"verdict": "good", "reasons": []} and state["scans"][0]["name"] == "body1.ply"
+    after = contents(place)
+    changed = {name for name in after if after[name] != before.get(name)}
+    assert {name for name in changed if not name.startswith("set/")} == {
+        "scans/body1.landmarks.json", "scans/body1.landmarks.json" + KEPT}
+    assert {name for name in changed if "body" in name and name.startswith("set/")} <= {
+        "set/meshes/body1.ply", "set/pictures/body1.webp", "set/pictures/body1.scene"}
+    assert after["scans/body1.landmarks.json" + KEPT] == before["scans/body1.landmarks.json"]
+    assert (place / "set" / "report.html").read_bytes() != page
+    scene = app.scene()
+    assert len(scene.data) - scene.fields["first"] == len(after["set/pictures/body1.scene"])
+    call = Call.read(place / "set")                             # and the command itself has nothing left to do
+    with workspace(place / "set") as space:
+        done = carried_out(call, call.inputs(lambda line: None), space)
+    assert {m.name: m.value for m in done.metrics}["of them in this run"] == 0
+
+
+def test_another_run_on_the_set_is_told_and_nothing_is_lost(place):
+    app = MendApp(place / "set", ENDING)
+    mend(app, place)
+    before = contents(place / "set")
+    with locked(place / "set" / HOME / "lock", place / "set"):
+        sent(app, "register")
+        wait(app)
+    assert "another run is at work" in app.note and app.greet()[-1].fields["changed"] == ["body1"]
+    assert contents(place / "set") == before
+    sent(app, "register")
+    wait(app)
+    assert app.greet()[-1].fields["verdicts"][0]["verdict"] == "good"
+
+
+def test_new_landmark_files_lie_where_the_run_reads_them(place):
+    (place / "scans" / "body2.landmarks.json").unlink()
+    app = MendApp(place / "set", ".pp")
+    scan = app.scans[app.scan_names.index("body2")]
+    assert scan.file == place / "scans" / "body2.pp" and not scan.places
+    app.call = Call(app.call.scans, app.call.template, place / "marks", config=app.call.config)
+    task = next(task for task in Call.read(place / "set").tasks() if task.name == "body2")
+    assert app._clicked(task, ".pp").file == place / "marks" / "body2.pp"
+
+
+def test_a_set_is_mended_in_the_browser(new_page, place):
+    """The wrong landmarks are taken away by key, the scan is registered again by a button: all is new."""
+    app = MendApp(place / "set", ENDING)
+    with Server(app) as server:
+        page = new_page(viewport={"width": 1200, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, READY)
+        assert page.locator(".sk-verdict").get_attribute("data-verdict") in ("check", "failed")
+        for name in WRONG:
+            page.locator(".sk-names li").filter(has_text=name).first.click()
+            wait_until(page, f"program.state.chosen === '{name}'")
+            page.keyboard.press("Delete")
+            wait_until(page, f"!('{name}' in program.state.panes[1].places)")
+        assert "changed since" in page.locator(".sk-verdict strong").inner_text()
+        page.locator("button", has_text="register again").click()
+        wait_until(page, "program.state.verdicts[0].verdict === 'good' && !program.state.working", 60)
+        wait_until(page, "program.figure.panes.length === 3 && program.figure.panes.every((pane) => pane.drawn > 1)")
+        assert page.locator(".sk-verdict strong").inner_text() == "good"
+        shades = page.evaluate("program.figure.panes[2].layers[0].described.shades.length")
+        assert shades == 3 and page.errors == []                             # distance, confidence, plain
+    assert set(read_landmarks(place / "scans" / "body1.landmarks.json")) == set(MARKS) - set(WRONG)
