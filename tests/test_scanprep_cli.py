@@ -104,7 +104,7 @@ def test_run(place, tmp_path, capsys, quick):
     assert figures["led by landmarks"] == 3 and figures["scans that need a look"] >= 1
     assert figures["  broken"] == "failed"
     page = (tmp_path / "set" / "report.html").read_text()
-    assert page.index("scan-broken") and page.count('loading="lazy"') == 3
+    assert page.index("scan-broken") and page.count("<figure data-scene=") == 3
 
 
 def test_page_with_other_limits(place, capsys):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -421,8 +422,9 @@ def test_a_signal_ends_serve_cleanly_though_a_job_does_not(tmp_path, ending):
         server.serve(App(), open_browser=False, say=say)
         print("returned", flush=True)
         """)
+    heard = partial(signal.signal, ending, signal.SIG_DFL)             # what runs in the background may ignore Ctrl-C
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                          cwd=Path(__file__).parents[1]) as run:
+                          cwd=Path(__file__).parents[1], preexec_fn=heard) as run:
         told = [run.stdout.readline() for _ in range(3)]
         address = told[0].split()[-1]
         assert "ssh -N -L" in told[2]
