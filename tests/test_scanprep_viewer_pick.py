@@ -170,6 +170,21 @@ def test_undo_and_redo_walk_through_all_changes_and_survive_a_reload(folder, per
     assert set(app.scans[0].places) == {"a", "b"}
 
 
+def test_left_and_right_are_swapped_and_back(folder):
+    app = app_of(folder)
+    with pytest.raises(ValueError, match="names a side"):
+        sent(app, "swap")
+    app.scans[0].places = {"left toe": np.array([1.0, 0, 0]), "right toe": np.array([-1.0, 0, 0]),
+                           "left knee": np.array([1.0, 0, 1]), "navel": np.zeros(3)}
+    before = dict(app.scans[0].places)
+    sent(app, "swap")
+    after = app.scans[0].places
+    assert set(after) == {"left toe", "right toe", "right knee", "navel"} and after["left toe"][0] == -1
+    assert after["right knee"] is before["left knee"] and set(read_landmarks(app.scans[0].file)) == set(after)
+    sent(app, "undo")
+    assert app.scans[0].places == before
+
+
 def test_a_click_that_meets_nothing_is_told_and_wrong_messages_are_refused(folder):
     app = app_of(folder)
     assert "met nothing" in click(app, [50.0, 0, 0], "a")[-1].fields["note"] and not app.scans[0].places

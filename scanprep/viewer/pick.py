@@ -18,6 +18,7 @@ import numpy as np
 from ..geometry.files import read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
+from ..geometry.sides import other_side
 from ..geometry.surface import Surface
 from ..pictures.camera import Camera, upright
 from ..pictures.scene import Pane, pack_scene
@@ -227,6 +228,16 @@ class PickApp:
         if name in self._editable(pane).places:
             self._change(self._number(pane), {name: None})
         self.chosen = name
+
+    def on_swap(self, send: Send) -> None:
+        """Exchange left and right of the scan: the commonest error of landmarks, and undone like any other change."""
+        places = self._editable(SCAN).places
+        others = {name: other_side(name) for name in places}
+        after = {other: places[name] for name, other in others.items() if other is not None}
+        gone = {name: None for name, other in others.items() if other is not None and name not in after}
+        if not after:
+            raise ValueError("no landmark of the scan names a side")
+        self._change(self._number(SCAN), {**after, **gone})
 
     def on_choose(self, send: Send, name: str) -> None:
         """The landmark that the next click sets; a new name joins the list."""

@@ -32,6 +32,7 @@ export class Pick extends Program {
     this.buttons = {
       undo: button("undo", "take the last change back (z)", () => this.send("undo")),
       redo: button("redo", "make it again (y)", () => this.send("redo")),
+      swap: button("swap left and right", "exchange the two sides of the scan's landmarks", () => this.send("swap")),
       predict: button("predict the others", "register the template to the scan and see where the other landmarks should be", () => this.send("predict")),
       confirm: button("confirm all", "take all predicted landmarks as they are (Enter)", () => this.confirm()),
     };
@@ -62,7 +63,7 @@ export class Pick extends Program {
     this.buttons.confirm.textContent = waiting ? `confirm ${waiting}` : "confirm all";
     const common = Object.keys(state.panes[0].places).filter((name) => name in (state.panes[1]?.places ?? {}));
     this.buttons.predict.disabled = common.length < state.enough || Boolean(state.working);
-    this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
+    this.buttons.swap.hidden = this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
     this.names();
     this.tellFile();
     if (state.working) this.work(state.working); else { this.work(null); this.say(state.note || this.hint()); }
