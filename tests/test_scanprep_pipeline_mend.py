@@ -13,8 +13,8 @@ from scanprep.geometry.storage import StorageError
 from scanprep.pipeline.again import RUN, Call
 from scanprep.pipeline.cli import carried_out
 from scanprep.pipeline.mend import MendApp
+from scanprep.viewer.clicked import KEPT
 from scanprep.viewer.messages import Message
-from scanprep.viewer.pick import KEPT
 from scanprep.viewer.server import Server
 
 ENDING, WRONG = ".landmarks.json", {"top": "front", "front": "top"}        # whose places are exchanged

@@ -13,9 +13,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import sphere
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import Person
+from scanprep.viewer.clicked import KEPT, Clicked, predict_landmarks
 from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
 from scanprep.viewer.messages import Message
-from scanprep.viewer.pick import KEPT, Clicked, PickApp, predict_landmarks
+from scanprep.viewer.pick import PickApp
 from scanprep.viewer.server import Server
 from scanprep.viewer.surface_clicks import Clickable
 
@@ -144,6 +145,50 @@ def test_a_file_of_the_user_is_kept_as_it_was(folder, person):
         click(app, moved(person.mesh.vertices[landmarks()[name]]), name)
     assert (folder / ("anna.pp" + KEPT)).read_bytes() == before
     assert set(read_landmarks(mine)) >= {"my own"}
+
+
+def test_what_was_taken_back_leaves_no_file_behind(folder, person):
+    """A file without landmarks could not be read again, and one of our own needs no copy."""
+    app = app_of(folder)
+    place = moved(person.mesh.vertices[landmarks()["top of head"]])
+    for name in "ab":
+        click(app, place, name)
+    for _ in "ab":
+        sent(app, "undo")
+    assert not list(folder.glob("anna.l*"))
+    assert app_of(folder).scans[0].places == {}
+    sent(app, "redo")
+    assert set(read_landmarks(app.scans[0].file)) == {"a"} and not list(folder.glob("*" + KEPT))
+
+
+@pytest.mark.parametrize("ending", [".landmarks.json", ".pp", ".mrk.json", ".lnd", ".txt"])
+@pytest.mark.parametrize("unit", [None, "m", "cm"])
+def test_a_unit_that_was_told_is_that_of_the_file(folder, person, ending, unit):
+    factor = 100 if unit == "cm" else 1
+    write_mesh(folder / "ben.ply", person.mesh.with_vertices(factor * person.mesh.vertices))
+    place = person.mesh.vertices[landmarks()["top of head"]]
+    if unit is None and ending == ".txt":
+        ending = ".landmarks.txt"
+    ben = Clicked.found(folder / "ben.ply", ending, unit)
+    app = PickApp(Clicked.found(folder / "template.ply", ending), [ben], TEN)
+    click(app, place, "top of head")
+    np.testing.assert_allclose(read_landmarks(ben.file, None, unit)["top of head"][2], place[2], atol=1e-3)
+
+
+def test_work_that_fails_does_not_leave_the_page_waiting(folder, capsys):
+    app, told = app_of(folder), []
+
+    def work(tell):
+        tell(1, 2)
+        raise KeyError("nobody foresaw")
+
+    app.beside("working", work, told.append, "it could not be done")
+    end = time.monotonic() + 5
+    while app.working is not None or len(told) < 2:
+        assert time.monotonic() < end
+    assert told[0].fields["working"] == ("working", 1, 2) and told[-1].fields["working"] is None
+    assert "it could not be done: unexpected KeyError" in told[-1].fields["note"]
+    assert "Traceback" in capsys.readouterr().err
 
 
 def test_undo_and_redo_walk_through_all_changes_and_survive_a_reload(folder, person):

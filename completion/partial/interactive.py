@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,10 @@ from scanprep.batch.opening import workspace
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.scene import Pane, pack_scene
+from scanprep.viewer.app import Send
+from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
-from scanprep.viewer.pick import Clicked, PickApp, Send
+from scanprep.viewer.pick import PickApp
 from scanprep.viewer.surface_clicks import Clickable
 
 from .completion import Completion, complete
@@ -69,8 +70,8 @@ class CompleteApp(PickApp):
         marks = {name: model.template.vertices[vertex] for name, vertex in work.marks.items()}
         super().__init__(template, [self._clicked(path) for path in scans], (), fixed=marks)
 
-    def _clicked(self, path: Path) -> Clicked:
-        one = Clicked.found(path, ".landmarks.json", self.work.unit)
+    def _clicked(self, path: Path, file: Path | None = None) -> Clicked:
+        one = Clicked.found(path, ".landmarks.json", self.work.unit, file)
         self._views[path] = read_views([path], self.work.unit)
         view = self._views[path].views[0]
         one.surface = Clickable(view if isinstance(view, Mesh) else view.points)
@@ -129,11 +130,14 @@ class CompleteApp(PickApp):
         """A scan that was dropped on the page; it is completed beside the others, its landmarks saved with it."""
         kept = self._dropped / name
         shutil.copyfile(path, kept)
-        one = self._clicked(kept)
-        one.file = self.output / f"{name.split('.')[0]}.landmarks.json"
+        file = self.output / f"{name.split('.')[0]}.landmarks.json"
+        one = self._clicked(kept, file if file.exists() else None)
+        one.file = file
         with self._lock:
-            self.scans.append(one)
-            self.current = len(self.scans) - 1
+            known = [i for i, other in enumerate(self.scans) if other.path == kept]
+            self.current = known[0] if known else len(self.scans)
+            self.scans[self.current:self.current + 1] = [one]        # dropped again it takes its own place
+            self.made.pop(kept, None)
             self.choose_next(None)
         send(self.scene())
         send(self.state())
@@ -156,34 +160,21 @@ class CompleteApp(PickApp):
             raise ValueError(f"click at least {FEWEST} landmarks, or none")
         made = self.made.get(self.scan.path)
         start = made.completion if made is not None and made.known == self.known and names and not anew else None
-        self.working = ("completing", 0, 1)
-        places = {name: self.scan.places[name] for name in names}
-        threading.Thread(target=self._complete, args=(self.scan, places, self.known, start, send), daemon=True).start()
+        scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in names}
 
-    def _complete(self, scan: Clicked, places: Mapping[str, np.ndarray], known: bool, start: Completion | None,
-                  send: Send) -> None:
-        """Complete beside the clicks that go on, and show what came out."""
-        def tell(done: int, total: int) -> None:
-            self.working = ("completing", done, total)
-            send(self.state())
-
-        try:
+        def work(tell: Callable[[int, int], None]) -> str:
             begin = time.perf_counter()
-            pairs = pairs_of(places, self.work.marks)
-            done = complete(self._body(known), list(self._views[scan.path].views), pairs, self.work.config, tell,
-                            start=start)
+            done = complete(self._body(known), list(self._views[scan.path].views), pairs_of(places, self.work.marks),
+                            self.work.config, tell, start=start)
             with self._lock:
                 self.made[scan.path] = Made(done, time.perf_counter() - begin, places, known)
                 self.saved.pop(scan.path, None)
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
-                self.note = "completed; move or add landmarks and complete again, or save"
             if scan is self.scan:
                 send(self.scene())
-        except ValueError as error:
-            self.note = f"this scan could not be completed: {error}"
-        finally:
-            self.working = None
-        send(self.state())
+            return "completed; move or add landmarks and complete again, or save"
+
+        self.beside("completing", work, send, "this scan could not be completed")
 
     def _body(self, known: bool) -> BodyModel | Subject:
         if not known:

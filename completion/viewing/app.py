@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from scanprep.pictures.scene import pack_scene
+from scanprep.viewer.app import Send
 from scanprep.viewer.messages import Message
-from scanprep.viewer.server import Send
 
 from .arrangement import over_each_other, side_by_side
 from .contents import Content

@@ -116,8 +116,8 @@ def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surf
                             "it; are both in the same unit?")
 
 
-def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int | Mapping[str, Any]], unit: str = "m"
-                    ) -> None:
+def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int | Mapping[str, Any]],
+                    unit: str | None = None) -> None:
     """Write named points, whole or not at all.
 
     Parameters
@@ -126,8 +126,9 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
         The ending tells the format, as for `read_landmarks`; an unknown one is JSON.
     landmarks : name to (3,) float, metres, or vertex, or {"face": f, "bary": [a, b, c]}
         The last two in JSON only.
-    unit : str
-        Unit of the coordinates in the file, where the format leaves it open.
+    unit : 'm', 'mm', 'cm' or 'in', optional
+        Unit of the coordinates in the file, as it will be given to `read_landmarks`; which expects metres without it,
+        in `.lnd` and `.mrk.json` millimetres.
 
     Raises
     ------
@@ -146,7 +147,7 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
     points = {name: value for name, value in out.items() if isinstance(value, np.ndarray)}
     data = as_bytes(Path(path).name, points, unit)
     if data is None:
-        storage.write_json(path, {name: (value / UNITS[unit]).tolist() if name in points else value
+        storage.write_json(path, {name: (value / UNITS[unit or "m"]).tolist() if name in points else value
                                   for name, value in out.items()})
     elif len(points) < len(out):
         raise ValueError(f"{path}: expected points; vertices and faces of a mesh can be written as JSON only")

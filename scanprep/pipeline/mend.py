@@ -4,7 +4,6 @@ Built on the clicking of landmarks: a third pane shows the template as it lies o
 """
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,8 +14,10 @@ import numpy as np
 
 from ..batch.opening import workspace
 from ..console import write_report
+from ..viewer.app import Send
+from ..viewer.clicked import Clicked
 from ..viewer.messages import Message
-from ..viewer.pick import Clicked, PickApp, Send
+from ..viewer.pick import PickApp
 from .again import Call
 from .cli import carried_out
 from .figures import Verdict
@@ -86,33 +87,29 @@ class MendApp(PickApp):
         """Register again what has changed."""
         if self.working is not None:
             return
-        self.working = (WORK[0], 0, 1)
         before, self.changed = self.changed, set()
-        threading.Thread(target=self._register, args=(before, send), daemon=True).start()
 
-    def _register(self, before: set[int], send: Send) -> None:
-        """Do again what `scape prep run` did, beside the clicks that go on."""
         def telling(what: str) -> Any:
             def tell(done: int, total: int) -> None:
                 self.working = (what, done, total)
                 send(self.state())
             return tell
 
-        try:
-            note = self._again([telling(what) for what in WORK])
+        def work(tell: Any) -> str:
+            try:
+                note = self._again([telling(what) for what in WORK])
+            except Exception:
+                with self._lock:
+                    self.changed |= before
+                raise
             verdicts = {verdict.name: verdict for verdict in judge_set(self.folder)}
             with self._lock:
-                self.verdicts, self.note = verdicts, note
-        except (ValueError, OSError) as error:
-            with self._lock:
-                self.changed |= before
-                self.note = f"nothing was registered: {error}"
-        finally:
-            self.working = None
-        with self._lock:
-            scene = self.scene()
-        send(scene)
-        send(self.state())
+                self.verdicts = verdicts
+                scene = self.scene()
+            send(scene)
+            return note
+
+        self.beside(WORK[0], work, send, "nothing was registered")
 
     def _again(self, tell: list[Any]) -> str:
         """The run itself; the set is open, and closed to other runs, only meanwhile."""

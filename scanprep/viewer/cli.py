@@ -11,8 +11,9 @@ from ..cli import MeshArg, Unit
 from ..console import Metric, Outcome, bar
 from ..pipeline.scans import find_scans
 from ..ranges import Range
+from .clicked import Clicked
 from .landmark_names import read_names
-from .pick import Clicked, PickApp
+from .pick import PickApp
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[SCAN ...]")]
 Port = Annotated[int, Range(0, 65535)]
@@ -34,14 +35,15 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
             a text file with one name in each line.
         format: Of new landmark files, which are written beside each scan with its name: json, pp (MeshLab),
             mrk.json (3D Slicer), lnd (CAESAR), txt. A file that is there keeps its format, and a copy of it as it was.
-        unit: Unit of the scans and of their landmarks.
+        unit: Unit of the scans and of their landmarks; of the mesh, if there are no scans.
         serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
             to reach it is printed.
     """
     ending = ".landmarks.json" if format == "json" else "." + format
     if (mesh / "set.json").exists():
         return _mended(mesh, scans, ending, names, unit, serve)
-    template, *others = [Clicked.found(path, ending, unit, file) for path, file in ((mesh, None), *_files(scans))]
+    template = Clicked.found(mesh, ending, None if scans else unit)      # as scape prep run reads it
+    others = [Clicked.found(path, ending, unit, file) for path, file in _files(scans)]
     with bar("reading") as progress:                      # a file that is no mesh is refused before a browser opens
         for number, one in enumerate(first := [template, *others[:1]]):
             progress(number, len(first))

@@ -7,27 +7,50 @@ import secrets
 import shutil
 import tempfile
 import traceback
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 from urllib.parse import quote
 
 from tornado.iostream import StreamClosedError
 from tornado.web import HTTPError, RequestHandler, stream_request_body
 from tornado.websocket import WebSocketHandler
 
-from .gate import file_name, inside, one_line
+from .app import App
+from .gate import Gate, file_name, inside, one_line
 from .messages import Message
 from .served_page import HEADERS, NOTHING, page, policy
-from .tabs import Tab
-
-if TYPE_CHECKING:
-    from .server import Server
+from .tabs import Tab, Tabs
 
 LARGEST_MESSAGE = 2**24              # bytes
 LARGEST_FILE = 2**30                 # bytes of a dropped file
 TOO_LARGE = f"a file of more than {LARGEST_FILE} bytes"
 PIECE = 2**20                        # bytes of a download at a time
 TAB = re.compile(r"[\w-]{8,64}", re.ASCII)
+
+
+class Serving(Protocol):
+    """What answers need of their server."""
+
+    app: App
+    gate: Gate
+    tabs: Tabs
+    say: Callable[[str], None]
+    script: str
+    style: str
+    dropped: Path
+
+    def tab_opened(self, name: str, tab: Tab) -> None:
+        """A tab opened or came back."""
+        ...
+
+    def take_in(self, name: str, message: Message) -> None:
+        """A message of a tab."""
+        ...
+
+    def file_dropped(self, name: str, path: Path) -> None:
+        """A file that was stored."""
+        ...
 
 
 class Refusal(HTTPError):
@@ -43,7 +66,7 @@ class Guarded(RequestHandler):
 
     acts = False
 
-    def initialize(self, server: Server) -> None:
+    def initialize(self, server: Serving) -> None:
         self.server = server
 
     def set_default_headers(self) -> None:

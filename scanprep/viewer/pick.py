@@ -5,109 +5,28 @@ page is sent the whole state, which is small. So a second tab, or one that was l
 """
 from __future__ import annotations
 
-import contextlib
-import shutil
 import threading
+import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..geometry.files import read_scan
-from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
+from ..console import say
 from ..geometry.mesh import Mesh
 from ..geometry.sides import other_side
-from ..geometry.surface import Surface
-from ..pictures.camera import Camera, upright
-from ..pictures.scene import Pane, pack_scene
-from ..pictures.shading import CLAY, Dots, Shape, Solid
-from ..pictures.thinning import thinned
+from ..pictures.scene import pack_scene
+from .app import Send
+from .clicked import Clicked, Places, predict_landmarks
 from .landmark_names import next_name
 from .messages import Message
-from .surface_clicks import Clickable
+from .worker import Stopped
 
 TEMPLATE, SCAN = 0, 1                # panes
 ENOUGH = 4                           # landmarks from which the others can be predicted
-MOST_DOTS = 150_000                  # of a cloud
 SLIDES = -1                          # movements by key are one as long as they follow each other
-KEPT = ".before"                     # ending of the copy of a landmark file as it was found
-
-Send = Callable[[Message], None]
-Places = dict[str, np.ndarray]
-
-
-@dataclass(eq=False)
-class Clicked:
-    """A mesh or cloud with the landmarks that are on it and the file that they are saved to."""
-
-    path: Path
-    file: Path
-    unit: str | None = None
-    places: Places = field(default_factory=dict)
-    predicted: Places = field(default_factory=dict)
-    surface: Clickable | None = None
-    _shown: Shape | None = None
-
-    @classmethod
-    def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
-        """With the landmarks of its file, or of that of its name beside it; else one of this ending will be written."""
-        file = file or landmarks_beside(path)
-        one = cls(path, file or path.with_name(path.name.split(".")[0] + ending), unit)
-        if file is not None:
-            one.places = one._read(file)
-        return one
-
-    def _read(self, file: Path) -> Places:
-        """The landmarks of a file; the mesh is read for them only if they need it, as a folder may be large."""
-        if not file.name.endswith(".mrk.json"):                  # which may be in another frame: the mesh tells
-            with contextlib.suppress(ValueError):
-                return read_landmarks(file, None, self.unit)
-        shape = self.body.shape
-        places = read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit)
-        self.forget()
-        return places
-
-    @property
-    def body(self) -> Clickable:
-        """What is clicked on; read when it is first shown."""
-        if self.surface is None:
-            self.surface = Clickable(read_scan(self.path, self.unit))
-        return self.surface
-
-    def forget(self) -> None:
-        """Let go of the surface, not of the landmarks; it is read again when it is shown."""
-        self.surface = self._shown = None
-
-    def save(self) -> None:
-        """Write all landmarks; a file that was there before is kept beside it, once."""
-        if not self.places and not self.file.exists():
-            return
-        kept = self.file.with_name(self.file.name + KEPT)
-        if self.file.exists() and not kept.exists():
-            shutil.copyfile(self.file, kept)
-        write_landmarks(self.file, self.places, self.unit or "m")
-
-    def pane(self, label: str) -> Pane:
-        """Its surface as the browser gets it."""
-        return Pane([self.shown], camera_of(self.body.shape), label)
-
-    @property
-    def shown(self) -> Shape:
-        """What is drawn of it: no more triangles or points than one can see."""
-        if self._shown is None:
-            shape, points = self.body.shape, self.body.points
-            self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
-                Dots(points[::max(1, len(points) // MOST_DOTS)], CLAY, 0.004)
-        return self._shown
-
-
-def camera_of(shape: Mesh | np.ndarray) -> Camera:
-    """A view of a body from its front, as far as that can be seen from its outline."""
-    body = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
-    up, front = upright(body)
-    return Camera.around(body.vertices, front, up=up)
 
 
 @dataclass(frozen=True)
@@ -353,49 +272,46 @@ class PickApp:
             raise ValueError(f"click {ENOUGH} landmarks that the template has too, then the others can be predicted")
         if self.working is not None or not isinstance(template, Mesh):
             return
-        self.working = ("looking for the other landmarks", 0, 1)
-        threading.Thread(target=self._predicted, args=(one, dict(self.template.places), dict(one.places), template,
-                                                       one.body, send), daemon=True).start()
+        on_template, on_scan, body = dict(self.template.places), dict(one.places), one.body
 
-    def _predicted(self, one: Clicked, on_template: Places, on_scan: Places, template: Mesh, body: Clickable,
-                   send: Send) -> None:
-        """Register the template to the scan and see where its landmarks come to lie; beside the clicks that go on."""
-        def tell(done: int, total: int) -> None:
-            self.working = ("looking for the other landmarks", done, total)
-            send(self.state())
-
-        try:
+        def work(tell: Callable[[int, int], None]) -> str:
             found = predict_landmarks(template, on_template, body, on_scan, tell)
             with self._lock:
                 one.predicted = found
-                self.note = f"{sum(name not in one.places for name in found)} landmarks predicted: confirm or correct"
-        except ValueError as error:
-            self.note = f"the other landmarks could not be predicted: {error}"
-        finally:
-            self.working = None
-        send(self.state())
+                return f"{sum(name not in one.places for name in found)} landmarks predicted: confirm or correct"
 
+        self.beside("looking for the other landmarks", work, send, "the other landmarks could not be predicted")
 
-def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], body: Clickable,
-                      on_scan: Mapping[str, np.ndarray], progress: Callable[[int, int], None] | None = None) -> Places:
-    """Where all landmarks of a template should be on a body of which some are known: by registration.
+    # work beside the clicks that go on
 
-    Points (3,), metres. ValueError for fewer than three in common.
-    """
-    from ..registration.nonrigid import register
-    from ..registration.schedule import RegistrationConfig
+    def beside(self, what: str, work: Callable[[Callable[[int, int], None]], str], send: Send, failed: str) -> None:
+        """Do some work in a thread of its own while clicks go on; the page sees its progress, and how it ended.
 
-    common = [name for name in on_template if name in on_scan]
-    nearest = Surface(template).closest(np.array(list(on_template.values())))
-    corners = template.faces[nearest.faces]
-    vertices = corners[np.arange(len(corners)), nearest.bary.argmax(axis=1)]
-    of_name = dict(zip(on_template, vertices.tolist(), strict=True))
-    config = RegistrationConfig()              # without its last steps: half the time, and 5 mm instead of 4
-    config = replace(config, graph=config.graph[:-1], final_fit=None)
-    fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
-                                          np.array([on_scan[name] for name in common])), config, progress)
-    moved = nearest.transferred(fit.mesh.vertices, template.faces)
-    return {name: body.nearest(place) for name, place in zip(on_template, moved, strict=True)}
+        `work` gets the callback of its progress and returns what to say at the end. Whatever it raises is told after
+        `failed`, and does not leave the page waiting.
+        """
+        self.working = (what, 0, 1)
+
+        def tell(done: int, total: int) -> None:
+            self.working = (what, done, total)
+            send(self.state())
+
+        def run() -> None:
+            try:
+                try:
+                    note = work(tell)
+                except (ValueError, OSError) as error:
+                    note = f"{failed}: {error}"
+                except Exception as error:                       # which nobody foresaw
+                    note = f"{failed}: unexpected {type(error).__name__}: {error}"
+                    say(traceback.format_exc())
+                with self._lock:
+                    self.working, self.note = None, note
+                send(self.state())
+            except Stopped:                                      # the server ended meanwhile
+                return
+
+        threading.Thread(target=run, daemon=True).start()
 
 
 def _lists(places: Places) -> dict[str, list[float]]:

@@ -13,9 +13,8 @@ import threading
 import time
 import traceback
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
 
 from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
@@ -23,6 +22,7 @@ from tornado.web import Application
 
 from .. import console
 from . import handlers
+from .app import App, Send
 from .gate import Gate, one_line
 from .messages import Message
 from .tabs import Tab, Tabs
@@ -30,39 +30,10 @@ from .worker import Stopped, Worker
 
 __all__ = ["App", "Message", "Send", "Server", "Stopped", "serve"]
 
-Send = Callable[[Message], None]
 ADDRESS = "127.0.0.1"
 GRACE = 0.5                          # seconds that work gets to end
 LARGEST_REQUEST = 2**20              # bytes of a request that is no file
 HERE = Path(__file__).parent
-
-
-class App(Protocol):
-    """What a command puts into the browser: one user, several tabs that show the same state.
-
-    `handle` and `receive` run one at a time, in one thread. `greet` runs in another, also while they work, so that a
-    page can be loaded again meanwhile: it is quick and only reads. Change the state first, then send what changed.
-    """
-
-    title: str
-    name: str                        # front end of the bundle: "view", "pick", "complete"
-    folders: Sequence[Path]          # from which files may be downloaded
-
-    def greet(self) -> list[Message]:
-        """What a tab that opens, or returns, needs to show the present state."""
-        ...
-
-    def handle(self, message: Message, send: Send) -> None:
-        """A message of a tab; `send` goes to all tabs and raises Stopped when the server has ended."""
-        ...
-
-    def receive(self, name: str, path: Path, send: Send) -> None:
-        """A file dropped on the page; it is removed afterwards. ValueError for one that is not wanted."""
-        ...
-
-    def close(self) -> None:
-        """The server ended; a job that does not call `send` may still run."""
-        ...
 
 
 class Server:

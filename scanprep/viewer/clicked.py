@@ -1,0 +1,122 @@
+"""A body whose landmarks are clicked: its surface, its landmarks, and the file that they are saved to."""
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..geometry.files import read_scan
+from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
+from ..geometry.mesh import Mesh
+from ..geometry.surface import Surface
+from ..pictures.camera import Camera, upright
+from ..pictures.scene import Pane
+from ..pictures.shading import CLAY, Dots, Shape, Solid
+from ..pictures.thinning import thinned
+from .surface_clicks import Clickable
+
+MOST_DOTS = 150_000                  # of a cloud
+KEPT = ".before"                     # ending of the copy of a landmark file as it was found
+
+Places = dict[str, np.ndarray]
+
+
+@dataclass(eq=False)
+class Clicked:
+    """A mesh or cloud with the landmarks that are on it and the file that they are saved to."""
+
+    path: Path
+    file: Path
+    unit: str | None = None
+    places: Places = field(default_factory=dict)
+    predicted: Places = field(default_factory=dict)
+    surface: Clickable | None = None
+    _shown: Shape | None = None
+    _saved: bool = False                 # by now
+
+    @classmethod
+    def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
+        """With the landmarks of its file, or of that of its name beside it; else one of this ending will be written."""
+        file = file or landmarks_beside(path)
+        one = cls(path, file or path.with_name(path.name.split(".")[0] + ending), unit)
+        if file is not None:
+            one.places = one._read(file)
+        return one
+
+    def _read(self, file: Path) -> Places:
+        """The landmarks of a file; the mesh is read for them only if they need it, as a folder may be large."""
+        if not file.name.endswith(".mrk.json"):                  # which may be in another frame: the mesh tells
+            with contextlib.suppress(ValueError):
+                return read_landmarks(file, None, self.unit)
+        shape = self.body.shape
+        places = read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit)
+        self.forget()
+        return places
+
+    @property
+    def body(self) -> Clickable:
+        """What is clicked on; read when it is first shown."""
+        if self.surface is None:
+            self.surface = Clickable(read_scan(self.path, self.unit))
+        return self.surface
+
+    def forget(self) -> None:
+        """Let go of the surface, not of the landmarks; it is read again when it is shown."""
+        self.surface = self._shown = None
+
+    def save(self) -> None:
+        """Write all landmarks, or remove the file when there are none; what was found in its place is kept, once."""
+        kept = self.file.with_name(self.file.name + KEPT)
+        if self.file.exists() and not self._saved and not kept.exists():
+            shutil.copyfile(self.file, kept)
+        self._saved = True
+        if self.places:
+            write_landmarks(self.file, self.places, self.unit)
+        else:                                                    # no reader takes a file without landmarks
+            self.file.unlink(missing_ok=True)
+
+    def pane(self, label: str) -> Pane:
+        """Its surface as the browser gets it."""
+        return Pane([self.shown], camera_of(self.body.shape), label)
+
+    @property
+    def shown(self) -> Shape:
+        """What is drawn of it: no more triangles or points than one can see."""
+        if self._shown is None:
+            shape, points = self.body.shape, self.body.points
+            self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
+                Dots(points[::max(1, len(points) // MOST_DOTS)], CLAY, 0.004)
+        return self._shown
+
+
+def camera_of(shape: Mesh | np.ndarray) -> Camera:
+    """A view of a body from its front, as far as that can be seen from its outline."""
+    body = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
+    up, front = upright(body)
+    return Camera.around(body.vertices, front, up=up)
+
+
+def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], body: Clickable,
+                      on_scan: Mapping[str, np.ndarray], progress: Callable[[int, int], None] | None = None) -> Places:
+    """Where all landmarks of a template should be on a body of which some are known: by registration.
+
+    Points (3,), metres. ValueError for fewer than three in common.
+    """
+    from ..registration.nonrigid import register
+    from ..registration.schedule import RegistrationConfig
+
+    common = [name for name in on_template if name in on_scan]
+    nearest = Surface(template).closest(np.array(list(on_template.values())))
+    corners = template.faces[nearest.faces]
+    vertices = corners[np.arange(len(corners)), nearest.bary.argmax(axis=1)]
+    of_name = dict(zip(on_template, vertices.tolist(), strict=True))
+    config = RegistrationConfig()              # without its last steps: half the time, and 5 mm instead of 4
+    config = replace(config, graph=config.graph[:-1], final_fit=None)
+    fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
+                                          np.array([on_scan[name] for name in common])), config, progress)
+    moved = nearest.transferred(fit.mesh.vertices, template.faces)
+    return {name: body.nearest(place) for name, place in zip(on_template, moved, strict=True)}
