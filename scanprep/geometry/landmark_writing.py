@@ -61,5 +61,5 @@ def _one_line(name: str) -> str:
     return name
 
 
-_WRITERS: dict[str, Callable[[Points, str | None], str]] = {".mrk.json": _slicer, ".pp": _picked_points, ".lnd": _caesar,
-                                                     ".txt": _rows}
+_WRITERS: dict[str, Callable[[Points, str | None], str]] = {
+    ".mrk.json": _slicer, ".pp": _picked_points, ".lnd": _caesar, ".txt": _rows}

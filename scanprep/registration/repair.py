@@ -14,6 +14,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from ..correspondence.correspondences import Correspondences
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..judgement import size
 from ..threads import one_thread
 from .deformation_graph import DeformationGraph, build_graph
 from .graph_fit import GraphFit, NodeMotion, deform, followed
@@ -82,11 +83,10 @@ def _silent(steps: int) -> None:
 
 def better(template: Mesh, parts: PersonParts, trial: Registration, fit: Registration) -> bool:
     """Whether less is to be doubted in a registration than in another, on the scan as well and no more stretched."""
-    size = np.sqrt(template.face_areas.sum())
     return (gravity(limb_doubts(template, parts, trial.mesh.vertices)) + LESS_DOUBTED
             < gravity(limb_doubts(template, parts, fit.mesh.vertices))
             and trial.uncovered <= fit.uncovered + LESS_COVERED
-            and not trial.landmark_rms > fit.landmark_rms + LESS_COVERED * size
+            and not trial.landmark_rms > fit.landmark_rms + LESS_COVERED * size(template)
             and strain(template, trial.mesh) <= strain(template, fit.mesh))
 
 
