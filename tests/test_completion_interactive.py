@@ -115,6 +115,21 @@ def test_a_dropped_scan_is_completed_beside_the_others(case, tmp_path):
     assert len(app.scans) == 2
 
 
+def test_a_scan_dropped_again_takes_its_place_and_keeps_its_landmarks(case, tmp_path):
+    body, points, seen, app = case
+    write_points(tmp_path / "drop.ply", PointCloud(points))
+    for _ in range(2):
+        app.receive("drop.ply", tmp_path / "drop.ply", lambda message: None)
+        marked(app, body, seen, 3)
+        app.scan.save()
+        assert len(app.scans) == 2 and app.current == 1
+    assert len(read_landmarks(app.output / "drop.landmarks.json")) == 3 == len(app.scan.places)
+    again = CompleteApp(app.model, app.work, [], app.output)                # another session
+    again.receive("drop.ply", tmp_path / "drop.ply", lambda message: None)
+    assert set(again.scan.places) == set(app.scan.places)
+    again.close()
+
+
 def test_from_a_half_view_to_a_saved_body_by_mouse_alone(case, new_page, tmp_path):
     body, _, seen, app = case
     app.known = True

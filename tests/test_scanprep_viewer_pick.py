@@ -13,6 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import sphere
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import Person
+from scanprep.viewer.cli import pick_landmarks
 from scanprep.viewer.clicked import KEPT, Clicked, predict_landmarks
 from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
 from scanprep.viewer.messages import Message
@@ -173,6 +174,17 @@ def test_a_unit_that_was_told_is_that_of_the_file(folder, person, ending, unit):
     app = PickApp(Clicked.found(folder / "template.ply", ending), [ben], TEN)
     click(app, place, "top of head")
     np.testing.assert_allclose(read_landmarks(ben.file, None, unit)["top of head"][2], place[2], atol=1e-3)
+
+
+def test_the_unit_is_that_of_the_scans_and_of_a_mesh_alone(folder, person, monkeypatch):
+    """The template of scans is in metres, as `scape prep run` reads it."""
+    shown = []
+    monkeypatch.setattr("scanprep.viewer.server.serve", lambda app, *_given: shown.append(app))
+    write_mesh(folder / "ben.ply", person.mesh.with_vertices(1000 * person.mesh.vertices))
+    pick_landmarks(folder / "template.ply", (folder / "ben.ply",), unit="mm")
+    pick_landmarks(folder / "ben.ply", unit="mm")
+    tall = [np.ptp(one.body.points[:, 2]) for app in shown for one in (app.template, *app.scans)]
+    np.testing.assert_allclose(tall, [np.ptp(person.mesh.vertices[:, 2])] * 3, rtol=1e-6)
 
 
 def test_work_that_fails_does_not_leave_the_page_waiting(folder, capsys):
