@@ -35,8 +35,6 @@ from .report import completion_page, completion_panes, picture_completion
 from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
 
-_STYLE = """.scan { display: grid; grid-template-columns: minmax(9rem, 1fr) 3fr; gap: 1rem; margin: 1.4rem 0; }
-.scan img { width: 100%; } .scan p { margin: .2rem 0; }"""
 MEANS = ("distance of the scan to the completed mesh, RMS", "scan points explained", "vertices with data")
 
 
@@ -258,6 +256,6 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
         shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
             page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        page.markup(f'<div class="scan"><div><a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>{told}</div>'
-                    f"{shown}</div>", _STYLE)
+        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
+        page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
     return page

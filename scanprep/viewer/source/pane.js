@@ -217,7 +217,7 @@ function drawLabels(pane, layer, taken) {
     const point = new Vector3().fromArray(layer.positions, 3 * i), at = pane.project(point);
     if (!at || (!layer.described.on_top && pane.covers(point))) return;
     const wide = context.measureText(text).width, high = 7 * scale, right = (at.x + 8) * scale, y = at.y * scale;
-    const x = right + wide <= pane.canvas.width ? right : (at.x - 8) * scale - wide;
+    const left = (at.x - 8) * scale - wide, x = right + wide <= pane.canvas.width ? right : Math.max(left, 0);
     if (taken.some((box) => x < box.right && x + wide > box.left && y - high < box.bottom && y + high > box.top)) return;
     taken.push({ text, left: x, right: x + wide, top: y - high, bottom: y + high });
     context.strokeText(text, x, y);
