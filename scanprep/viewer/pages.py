@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,7 +14,7 @@ from .messages import Message
 class Home(App, Protocol):
     """An app that has pages inside."""
 
-    def enter(self, send: Send, **wanted: Any) -> App:
+    def enter(self, send: Send, wanted: Mapping[str, Any]) -> App:
         """The app of a page that is asked for, the same for the same page; ValueError where it cannot be opened."""
         ...
 
@@ -34,28 +34,19 @@ class Pages:
     def __init__(self, home: Home) -> None:
         self.home = home
         self._opened: list[App] = []
-        self._shown: tuple[int, App] = 0, home                   # its number, which grows with every turn
+        self._show(0, home)
         self._lock = threading.Lock()
+
+    def _show(self, number: int, app: App) -> None:
+        self._shown = number, app                                # the number grows with every turn
+        self.name: str = app.name
+        self.title: str = app.title
+        self.folders: Sequence[Path] = app.folders
 
     @property
     def app(self) -> App:
         """The app that is shown."""
         return self._shown[1]
-
-    @property
-    def name(self) -> str:
-        """Its front end."""
-        return self.app.name
-
-    @property
-    def title(self) -> str:
-        """Its title."""
-        return self.app.title
-
-    @property
-    def folders(self) -> Sequence[Path]:
-        """From which it offers files."""
-        return self.app.folders
 
     def greet(self) -> list[Message]:
         """Which page it is, and its greeting."""
@@ -69,7 +60,7 @@ class Pages:
         if fields.pop("page", number) != number:
             return
         if message.kind == "enter" and app is self.home:
-            self._turn_to(self.home.enter(self._sender(app, send), **fields), send)
+            self._turn_to(self.home.enter(self._sender(app, send), fields), send)
         elif message.kind == "leave" and app is not self.home:
             try:
                 self.home.returned(app)
@@ -91,7 +82,7 @@ class Pages:
         if app is not self.home and app not in self._opened:
             self._opened.append(app)
         with self._lock:
-            self._shown = self._shown[0] + 1, app
+            self._show(self._shown[0] + 1, app)
             send(self._page(*self._shown))
         for message in app.greet():
             self._sender(app, send)(message)
