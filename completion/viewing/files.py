@@ -106,8 +106,9 @@ class Files:
 
     @property
     def models(self) -> list[Path]:
-        """Those that are known."""
-        return list(dict.fromkeys([*([self.model] if self.model else []), *self._found]))
+        """Those among the files, and last the one that was named for motions."""
+        named = [] if self.model is None else [self.model]
+        return list(dict.fromkeys([*(path for path in self._found if path not in named), *named]))
 
     def read_model(self, path: Path) -> BodyModel:
         """Each model is read once."""

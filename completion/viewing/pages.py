@@ -89,8 +89,8 @@ class Inside:
         return {"folders": [{"page": page, "folder": str(folder), "label": f"{one.label} {folder.resolve().name}"}
                             for folder in folders for page, one in FOLDER_PAGES.items() if _has(folder, one.files)],
                 "scans": [i for i, entry in enumerate(entries) if entry.kind in SCANS],
-                "models": [*({"path": str(path), "name": path.name} for path in self.files.models),
-                           {"path": "", "name": PEOPLE}]}
+                "models": [{"path": "", "name": PEOPLE},
+                           *({"path": str(path), "name": path.name} for path in self.files.models)]}
 
     def folder_page(self, page: str, name: str, entries: Sequence[Entry]) -> App:
         """A page of the folder of this name that entries are of."""

@@ -10,7 +10,7 @@ const FIRST = 10;                    // sliders of the shape that are there befo
 const STILL = 4;                     // pixels that a hand moves while it clicks
 const NEAR = 12;                     // pixels from a marker that tell of it
 const DEGREE = Math.PI / 180;
-const EMPTY = [["Drop files here", "or choose them with the button “drop files here, or choose”."],
+const EMPTY = [["To begin", "drop files anywhere on this page, or choose them with the button “drop files here, or choose”."],
   ["To look", "meshes (PLY, OBJ, STL, OFF, GLB), point clouds (PLY, XYZ, PCD), models and motions (.npz), markers (C3D, TRC, CSV); landmarks after their mesh."],
   ["To complete a scan", "drop it: a mesh, a cloud, or a depth picture (16-bit PNG) with its camera (NAME.camera.json). Without a model of your own that of the synthetic people is taken."]];
 const KEYS = [["d", "drag bodies, or turn the view"], ["b, p", "random body, pose"], ["r", "reset"], ["space", "play, pause"],
@@ -63,7 +63,7 @@ export class View extends Program {
   // What can be opened: a choice is kept for as long as it is there, and a new scan is chosen.
   offer({ folders, scans, models }) {
     this.completion.hidden = !scans.length;
-    renew(this.scan, scans.map((i) => [i, this.entries[i].name]), true);
+    renew(this.scan, scans.map((i) => [i, this.entries[i].name]));
     renew(this.model, models.map(({ path, name }) => [path, `with ${name}`]));
     this.folders.replaceChildren(...folders.map(({ page, folder, label }) =>
       button(label, folder, () => this.send("enter", { what: page, folder }))));
@@ -292,14 +292,14 @@ export class View extends Program {
   }
 }
 
-// Other options of a list, [value, text]; `newest`: the last of them is chosen when it was not there before.
-function renew(select, options, newest = false) {
-  const before = [...select.options].map((option) => [option.value, option.text]), chosen = select.value;
+// Other options of a list, [value, text]: the last that is new is chosen, else what was.
+function renew(select, options) {
+  const before = [...select.options].map((option) => [option.value, option.text]);
   if (String(before) === String(options)) return;
+  const known = before.map(([, text]) => text), chosen = known[select.selectedIndex];
+  const fresh = options.findLastIndex(([, text]) => !known.includes(text));
   select.replaceChildren(...options.map(([value, text]) => make("option", { value }, text)));
-  const known = before.some(([, text]) => text === options.at(-1)?.[1]);
-  const kept = options.findIndex(([, text]) => text === before.find(([value]) => value === chosen)?.[1]);
-  select.selectedIndex = newest && !known ? options.length - 1 : Math.max(0, kept);
+  select.selectedIndex = fresh >= 0 ? fresh : Math.max(0, options.findIndex(([, text]) => text === chosen));
 }
 
 function middle({ positions, count, hidden }) {
