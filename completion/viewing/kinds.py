@@ -49,11 +49,10 @@ def reported_model(path: Path) -> Path | None:
 
 def worst_first(whole: RegisteredSet) -> list[tuple[str, str]]:
     """Names and what is to be said of them; in the order of the set where there are no figures."""
-    from scanprep.pipeline.figures import read_figures, review
+    from scanprep.pipeline.page import judge_set
 
     try:
-        verdicts = review(read_figures(whole.folder), {}, float(np.ptp(whole.template.vertices, axis=0).max()),
-                          len(whole.template.faces))
+        verdicts = judge_set(whole.folder)
     except (OSError, ValueError):
         return [(name, "") for name in whole.names]
     judged = {verdict.name: next(iter(verdict.reasons), "") for verdict in verdicts if verdict.name in whole.names}

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -22,17 +23,22 @@ class Dropped:
 
     @contextlib.contextmanager
     def keeping(self, name: str, path: Path) -> Iterator[Path]:
-        """A copy of a file in place of the one of its name, which comes back if the block raises."""
+        """A copy of a file in place of the one of its name, which comes back if the block raises.
+
+        What a ValueError says of it, it says by its name alone.
+        """
         kept, earlier = self.folder / name, self.folder / f".{name}.earlier"
         if kept.exists():
             kept.replace(earlier)
         try:
             shutil.copyfile(path, kept)
             yield kept
-        except BaseException:
+        except BaseException as problem:
             kept.unlink(missing_ok=True)
             if earlier.exists():
                 earlier.replace(kept)
+            if isinstance(problem, ValueError):
+                raise ValueError(str(problem).replace(f"{self.folder}{os.sep}", "")) from problem
             raise
         earlier.unlink(missing_ok=True)
 
