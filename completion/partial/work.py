@@ -19,7 +19,7 @@ from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.format_common import UNITS
-from scanprep.geometry.landmarks import match_landmarks, read_landmarks
+from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.page import Page
@@ -103,9 +103,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     if depth is not None:
         if inputs.masks:
             raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
-        marks = np.zeros((0, 3)) if landmarks is None else landmarks[1]
-        person = prepare_picture(depth, size(work.body.template), marks)
-        files = ScanFiles((PointCloud(person.points, person.normals),), (None,))
+        files = person_in(depth, work.body.template, landmarks)
     scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
@@ -206,6 +204,22 @@ def read_picture(paths: Sequence[Path], unit: str | None = None) -> DepthPicture
     if len(paths) > 1:
         raise ValueError(f"SCAN: expected one depth picture alone, got {len(paths)} files")
     return read_depth(pictures[0], UNITS[unit or "mm"])
+
+
+def person_in(picture: DepthPicture, template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None) -> ScanFiles:
+    """The person in a depth picture, as a view; `landmarks` are those of `complete`."""
+    person = prepare_picture(picture, size(template), np.zeros((0, 3)) if landmarks is None else landmarks[1])
+    return ScanFiles((PointCloud(person.points, person.normals),), (None,))
+
+
+def marks_of_template(model: BodyModel, given: Path | None, name: str) -> dict[str, int]:
+    """Vertices of a model's template by name, from a file or the model itself; `name` is the model's."""
+    if given is not None:
+        return read_landmark_vertices(given, model.template)
+    kept = model.info.get("landmarks")
+    if not kept:
+        raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
+    return {name: int(vertex) for name, vertex in kept.items()}
 
 
 def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
