@@ -13,7 +13,7 @@ export class Complete extends Pick {
     this.keep = button("save", "write the body, its pose and a report", () => this.send("save"));
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
     this.markers = make("p", { class: "sk-file" });
-    this.added.placeholder = "another name, or a marker set: cmu41";
+    this.added.placeholder = "a name, or a marker set: cmu41";
     this.scans.before(this.drop());
     this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict, this.markers);
     this.buttons.predict.remove();
