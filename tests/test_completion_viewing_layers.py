@@ -1,4 +1,5 @@
 """`scape view` of what has layers: statues posed by sliders, motions with and without their soft tissue."""
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -6,13 +7,15 @@ import pytest
 from browser import wait_until
 from conformance_bodies import KINDS
 
+from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion import Motion
 from completion.viewing import statues
 from completion.viewing.app import ViewApp
 from completion.viewing.files import Files
+from completion.viewing.motions import of_motion
 from completion.viewing.notebook import view
-from completion.viewing.soft import soft_columns
+from completion.viewing.soft import soft_columns, with_soft_tissue
 from model.files import load_model
 from model.statue.control.files import humanoid
 from model.statue.control.model import FOLDED, MEASURED, DisplacementMap, Statue
@@ -102,6 +105,18 @@ def test_a_motion_is_shown_with_its_soft_tissue(place, name):
         ("fixed shape", False), ("with soft tissue", True)]
     assert content.shapes[1].columns[1].shape[0] == len(place.soft.changes)
     assert "soft tissue" in content.shapes[1].shape.shades
+
+
+def test_markers_are_compared_with_the_body_that_is_seen(place):
+    labels, soft, model = ("A", "B", "C"), place.soft, place.model
+    bodies = soft.vertices(model)
+    markers = MarkerSequence(bodies[:, [10, 100, 300]], labels, 30.0)
+    residuals = np.random.default_rng(0).uniform(0, 0.02, (len(bodies), 3))
+    soft = SoftTissue(replace(soft.motion, residuals=residuals, labels=labels), soft.changes)
+    content = with_soft_tissue(of_motion("walk", soft.motion, model.subject(OWN, np.float32)), soft, model, markers)
+    assert [shape.shape.name for shape in content.shapes] == ["fixed shape", "with soft tissue", "markers"]
+    assert content.markers.shape == 2 and np.array_equal(content.markers.residuals, residuals)
+    assert "with soft tissue" in content.notes[0]
 
 
 def test_a_motion_without_soft_tissue_is_as_before(place, tmp_path):

@@ -183,9 +183,11 @@ class Files:
         if betas is not None and len(betas) > model.n_betas:
             raise ValueError(f"{path}: expected at most the {model.n_betas} betas of the model, found {len(betas)}; "
                              "name its own model with -m")
-        content = of_motion(name, motion, model.subject(betas, np.float32), self._markers_of(path, motion))
+        subject, markers = model.subject(betas, np.float32), self._markers_of(path, motion)
         soft = soft_tissue_of(path, motion)
-        return content if soft is None else with_soft_tissue(content, soft, model)
+        if soft is None:
+            return of_motion(name, motion, subject, markers)
+        return with_soft_tissue(of_motion(name, motion, subject), soft, model, markers)
 
     def _markers_of(self, path: Path, motion: Motion) -> MarkerSequence | None:
         """What was measured: the mended recording beside the motion, or one among the files that is laid over it."""

@@ -13,10 +13,11 @@ from scanprep.pictures.colors import Heat
 from scanprep.pictures.low_rank import low_rank
 from scanprep.pictures.shading import Moving, Shape, Solid
 
+from ..mocap.files.markers import MarkerSequence
 from ..mocap.soft_tissue.soft_tissue import SoftTissue
 from ..motion import Motion, spread_frames
 from .contents import Content
-from .motions import AT_ONCE, MADE, of_motion
+from .motions import AT_ONCE, MADE, of_motion, with_markers
 
 SOFT = (0.55, 0.66, 0.80)
 LEAST = 0.003                        # standard deviations: a direction in which the shape changes less is left out
@@ -36,8 +37,9 @@ def soft_tissue_of(path: Path, motion: Motion) -> SoftTissue | None:
     return None
 
 
-def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel) -> Content:
-    """A motion, which is hidden at first, and with it the body whose shape changes.
+def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel, markers: MarkerSequence | None = None
+                     ) -> Content:
+    """A motion, whose body is hidden at first, and with it the body whose shape changes, and what was measured.
 
     Where the skin is soft is one of its colours: how far the change moves it, the root of the mean square over time.
     """
@@ -48,7 +50,11 @@ def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel) -> Co
     shade = Heat(moved, 0.0, max(float(np.quantile(moved, 0.995)), 1e-3), "moved by soft tissue")
     body = Solid(model.template.with_vertices(frames[0]), SOFT, shades={"soft tissue": shade}, name="with soft tissue")
     changing = Moving(body, frames[:1].astype(np.float32), soft.motion.rate, (basis, coefficients))
-    return replace(content, shapes=[*_without(content.shapes), changing])
+    content = replace(content, shapes=[*_without(content.shapes), changing])
+    if markers is None:
+        return content
+    note = f"{content.name}: markers are coloured by their distance from the body with soft tissue"
+    return replace(with_markers(content, soft.motion, markers), notes=(*content.notes, note))
 
 
 def _without(shapes: Sequence[Shape | Moving]) -> list[Shape | Moving]:
