@@ -157,6 +157,8 @@ class PickApp:
         if not after:
             raise ValueError("no landmark of the scan names a side")
         self._change(self._number(SCAN), {**after, **gone})
+        one = self._of(self._number(SCAN))
+        one.predicted = {other_side(name) or name: place for name, place in one.predicted.items()}
 
     def on_choose(self, send: Send, name: str) -> None:
         """The landmark that the next click sets; a new name joins the list."""
@@ -187,6 +189,7 @@ class PickApp:
         if wanted:
             self._change(self._number(SCAN), wanted)
             self.choose_next(None)
+            self.note = f"{len(wanted)} predicted landmarks taken; undo takes them back"
 
     def on_predict(self, send: Send) -> None:
         """Where the other landmarks of the template should be on the scan."""

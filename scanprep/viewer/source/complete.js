@@ -1,7 +1,7 @@
 // `scape complete --interactive`: landmarks as in `scape pick`, then a button, the whole body, and what it is worth.
 import { dropZone } from "./drop.js";
 import { make } from "./figure.js";
-import { button, Pick } from "./pick.js";
+import { button, OFF, Pick } from "./pick.js";
 
 const WHOLE = "Boxes and the list of colours under the bodies lay completed body, predicted body and scan over each other.";
 
@@ -9,7 +9,7 @@ export class Complete extends Pick {
   build() {
     super.build();
     this.known = make("input", { type: "checkbox", onchange: () => this.send("known", { known: this.known.checked }) });
-    this.knownLabel = make("label", { title: "the person whose poses the model was learned from; else the shape is found too" }, this.known, "the model's own person");
+    this.knownLabel = make("label", { title: "the person whose poses the model was learned from; else the shape is found too" }, this.known, "this is the person of the model's poses");
     this.go = button("complete", "the whole body from the scan and the landmarks", () => this.send("complete"));
     this.go.classList.add("sk-main-button");
     this.anew = button("search anew", "forget the body that there is and search again", () => this.send("complete", { anew: true }));
@@ -29,8 +29,9 @@ export class Complete extends Pick {
     this.knownLabel.hidden = !free;
     const clicked = Object.keys(state.panes[1]?.places ?? {}).length - state.markers;
     this.markers.textContent = state.markers ? `${state.markers} marker${state.markers > 1 ? "s" : ""}: “save” writes where on the model to layout.json` : "";
-    this.go.disabled = Boolean(working) || state.panes.length < 2;
-    this.go.textContent = completed ? "complete again" : clicked ? `complete with ${clicked} landmarks` : "complete without landmarks";
+    const few = clicked > 0 && clicked < state.fewest ? state.fewest - clicked : 0;
+    this.go.disabled = Boolean(working) || state.panes.length < 2 || few > 0;
+    this.go.textContent = few ? `click ${few} more, or none` : completed ? "complete again" : clicked ? `complete with ${clicked} landmarks` : "complete without landmarks";
     this.anew.hidden = !completed;
     this.anew.disabled = Boolean(working);
     this.keep.disabled = !completed || Boolean(working);
@@ -39,18 +40,21 @@ export class Complete extends Pick {
   }
 
   judge({ verdict, reasons, rows, outdated, helpful, saved }) {
+    const off = outdated ? [] : Object.keys(this.state.panes[1].places).filter((name) => this.off(name) > OFF);
+    const link = (name, text) => make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("choose", { name }); } }, text);
+    const list = (names, text) => names.flatMap((name, i) => [i ? ", " : "", link(name, text(name))]);
     const words = { good: "good", check: "look at it", failed: "failed" };
-    this.verdict.dataset.verdict = verdict;
-    this.verdict.replaceChildren(make("strong", {}, outdated ? "landmarks changed since: complete again" : words[verdict] ?? verdict),
+    this.verdict.dataset.verdict = outdated ? "check" : verdict;
+    this.verdict.replaceChildren(make("strong", {}, outdated ? "changed since: complete again" : words[verdict] ?? verdict),
       make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))),
-      helpful.length ? make("p", {}, "A landmark would help at: ", ...helpful.flatMap((name, i) => [i ? ", " : "",
-        make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("choose", { name }); } }, name)])) : "",
+      off.length ? make("p", {}, "Not where the body has them: ", ...list(off, (name) => `${name}, ${(1000 * this.off(name)).toFixed(0)} mm`)) : "",
+      helpful.length ? make("p", {}, "A landmark would help at: ", ...list(helpful, (name) => name)) : "",
       make("details", {}, make("summary", {}, "figures"), make("table", {}, ...rows.map((row) => make("tr", {}, ...row.map((cell) => make("td", {}, cell)))))),
-      saved ? make("p", {}, `saved in ${saved}`) : "");
+      saved && !outdated ? make("p", {}, `saved: ${saved}`) : "");
   }
 
   hint() {
     if (this.state.panes.length < 2) return "Drop a scan on the page.";
-    return this.state.completed ? WHOLE : `${super.hint()} Three to ten landmarks help most; then press “complete”.`;
+    return this.state.completed ? `${super.hint()} ${WHOLE}` : `${super.hint()} Three to ten landmarks help most; then press “complete”.`;
   }
 }

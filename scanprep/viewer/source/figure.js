@@ -24,10 +24,11 @@ export function choice(label, names, onChoose, chosen = 0) {
 }
 
 export class Figure {
-  constructor(element, scene, linked = true) {
+  constructor(element, scene, linked = true, alike = Infinity) {
     this.element = element;
     this.scene = scene;
     this.linked = linked;
+    this.alike = alike;                                 // number of the pane from which on they always turn together
     this.frame = 0;
     this.row = make("div", { class: "sk-panes" });
     this.panes = scene.panes.map((described) => this.addPane(described));
@@ -48,6 +49,7 @@ export class Figure {
     const moves = pane.layers.some((layer) => layer.motion);
     pane.names = pane.layers.reduce((sum, layer) => sum + layer.labels.length, 0) <= FEW_NAMES[moves ? 1 : 0];
     pane.onTurn = () => this.turned(pane);
+    pane.onHand = () => { this.side.selectedIndex = 0; };
     pane.canvas.addEventListener("pointermove", (event) => this.tell(pane, event));
     pane.canvas.addEventListener("pointerleave", () => { pane.tip.hidden = true; });
     return pane;
@@ -58,7 +60,9 @@ export class Figure {
   // Buttons, legend and timeline for what is in the panes now.
   fill() {
     const { tools } = this;
-    tools.replaceChildren(choice("side", Object.keys(SIDES), (i) => this.look(...Object.values(SIDES)[i])),
+    this.side = choice("side", Object.keys(SIDES), () => this.look(...SIDES[this.side.value]));
+    this.side.prepend(make("option", { hidden: true }, "turned"));
+    tools.replaceChildren(this.side,
       choice("surface", SURFACES, (i) => this.each((layer) => layer.setSurface(SURFACES[i]))));
     const many = this.layers.filter((layer) => layer.shades.length > 1);
     if (many.length) {
@@ -129,8 +133,8 @@ export class Figure {
   }
 
   turned(pane) {
-    if (!this.linked) return;
-    for (const other of this.panes) if (other !== pane) other.follow(pane);
+    const together = this.linked ? this.panes : this.panes.slice(this.alike);
+    if (together.includes(pane)) for (const other of together) if (other !== pane) other.follow(pane);
   }
 
   tell(pane, event) {

@@ -200,8 +200,14 @@ function makeMesh(layer) {
 }
 
 function makeDots(layer) {
-  const points = new Points(layer.geometry, dotMaterial(layer.described.radius, layer.described.on_top));
+  const { radius, on_top: onTop, faint } = layer.described;
+  const points = new Points(layer.geometry, dotMaterial(radius, onTop));
   points.frustumCulled = false;
+  if (faint) {                                        // and through surfaces, but faintly
+    points.ghost = new Points(layer.geometry, dotMaterial(radius, true, 0.3));
+    points.ghost.frustumCulled = false;
+    points.add(points.ghost);
+  }
   points.moved = () => {                              // those that nothing is known of are far away
     for (const v of layer.hidden) layer.positions.fill(1e6, 3 * v, 3 * v + 3);
   };
@@ -209,7 +215,7 @@ function makeDots(layer) {
 }
 
 // Balls of a size in metres: squares that face the camera, shaded as balls.
-function dotMaterial(radius, onTop) {
+function dotMaterial(radius, onTop, opacity = onTop ? 0.85 : 1) {
   return new ShaderMaterial({
     uniforms: { radius: { value: radius }, pixels: { value: 500 } },
     vertexColors: true, depthTest: !onTop, depthWrite: !onTop, transparent: onTop,
@@ -229,7 +235,7 @@ function dotMaterial(radius, onTop) {
         if (r > 1.0) discard;
         vec3 normal = vec3(p.x, -p.y, sqrt(1.0 - r));
         float light = 0.45 + 0.65 * max(0.0, dot(normal, normalize(vec3(-0.4, 0.6, 0.8))));
-        gl_FragColor = vec4(shade * light, ${onTop ? "0.85" : "1.0"});
+        gl_FragColor = vec4(shade * light, ${opacity.toFixed(2)});
         #include <colorspace_fragment>
       }`,
   });

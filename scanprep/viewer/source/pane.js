@@ -4,6 +4,8 @@ import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { Layer } from "./layer.js";
 
 const STEP = Math.PI / 18;           // by which an arrow key turns
+const FULL = 0.97;                   // of half the picture, that bodies reach at most when they are looked at from a side
+const SAMPLED = 5000;                // points by which that is measured
 
 let renderer = null;
 const waiting = new Set();
@@ -49,7 +51,10 @@ export class Pane {
     this.lights();
     this.reset();
     this.controls.addEventListener("change", () => { this.redraw(); this.onTurn?.(this); });
-    this.canvas.addEventListener("wheel", (event) => { if (!this.canvas.matches(":focus")) event.stopImmediatePropagation(); }, true);
+    this.canvas.addEventListener("wheel", (event) => {  // a page that scrolls goes on doing so until the body was touched
+      if (!this.canvas.matches(":focus") && document.documentElement.scrollHeight > innerHeight + 1) event.stopImmediatePropagation();
+    }, true);
+    this.controls.addEventListener("start", () => this.onHand?.());
     this.canvas.addEventListener("pointerdown", () => this.canvas.focus({ preventScroll: true }));
     this.canvas.addEventListener("keydown", (event) => this.turnBy(event));
     this.overlays = [];                                 // functions (context, pane) that draw over the picture
@@ -79,7 +84,27 @@ export class Pane {
     this.camera.position.copy(this.controls.target).addScaledVector(back, this.home.distance);
     this.lens();
     this.controls.update();
+    const far = this.reach() / FULL;
+    if (far > 1) {                                      // wider from this side: a step back, so that nothing is cut off
+      this.camera.position.copy(this.controls.target).addScaledVector(back, this.home.distance * far);
+      this.controls.update();
+    }
     this.redraw();
+  }
+
+  // How far what is shown reaches from the middle of the picture; 1 is its border.
+  reach() {
+    this.camera.updateMatrixWorld();
+    let most = 0;
+    const point = new Vector3();
+    for (const { count, positions, hidden } of this.layers.filter((layer) => layer.object.visible)) {
+      for (let i = 0, step = Math.ceil(count / SAMPLED); i < count; i += step) {
+        if (hidden.has(i)) continue;
+        point.fromArray(positions, 3 * i).project(this.camera);
+        for (const far of [Math.abs(point.x), Math.abs(point.y)]) if (far > most && point.z < 1) most = far;
+      }
+    }
+    return most;
   }
 
   // Arrow keys turn the body, as a drag does.
@@ -87,6 +112,7 @@ export class Pane {
     const [aside, upward] = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key] ?? [0, 0];
     if (!(aside || upward) || !this.controls.enabled) return;
     event.preventDefault();
+    this.onHand?.();
     const up = this.camera.up.clone().normalize(), back = this.camera.position.clone().sub(this.controls.target);
     const angle = back.angleTo(up) - upward * STEP;
     if (upward && angle > STEP && angle < Math.PI - STEP) back.applyAxisAngle(up.clone().cross(back).normalize(), -upward * STEP);
@@ -136,7 +162,7 @@ export class Pane {
     if (old) this.remove(old);
     if (!points.length) return;
     const steps = Float32Array.from(points.flat(), (value, i) => value - this.origin.getComponent(i % 3));
-    const layer = new Layer({ kind: "dots", name: "", labels, radius: 0.012, on_top: true, hidden: [],
+    const layer = new Layer({ kind: "dots", name: "", labels, radius: 0.012, on_top: false, faint: true, hidden: [],
       positions: { column: 0, low: [0, 0, 0], step: 1 }, shades: [{ name: "", palette: color.slice(1) }] }, [steps]);
     layer.group = group;
     this.add(layer);
@@ -161,7 +187,7 @@ export class Pane {
     if (size.x < width || size.y < height) renderer.setSize(Math.max(size.x, width), Math.max(size.y, height), false);
     const tall = renderer.getSize(new Vector2()).y;
     for (const layer of this.layers) {
-      for (const material of [layer.object.material, layer.object.cloud?.material]) {
+      for (const material of [layer.object.material, layer.object.cloud?.material, layer.object.ghost?.material]) {
         if (material?.uniforms?.pixels) material.uniforms.pixels.value = height;
       }
     }
@@ -230,7 +256,8 @@ function drawLabels(pane, layer, taken) {
   layer.labels.forEach((text, i) => {
     if (!text || layer.hidden.has(i)) return;
     const point = new Vector3().fromArray(layer.positions, 3 * i), at = pane.project(point);
-    if (!at || (!layer.described.on_top && pane.covers(point))) return;
+    if (!at || at.x < 0 || at.y < 0 || at.x > pane.canvas.clientWidth || at.y > pane.canvas.clientHeight) return;
+    if (!layer.described.on_top && pane.covers(point)) return;
     const wide = context.measureText(text).width, high = 7 * scale, right = (at.x + 8) * scale, y = at.y * scale;
     const left = (at.x - 8) * scale - wide, x = right + wide <= pane.canvas.width ? right : Math.max(left, 0);
     if (taken.some((box) => x < box.right && x + wide > box.left && y - high < box.bottom && y + high > box.top)) return;

@@ -5,15 +5,18 @@ import { Program } from "./program.js";
 
 const NEAR = 12;                     // pixels from a landmark that still take hold of it
 const STILL = 4;                     // pixels that a hand moves while it clicks
+const BESIDE = [3, 6, 9];            // pixels beside a surface that a click still means it: finger tips are at ragged borders
+export const OFF = 0.03;                    // metres from where a landmark is predicted, from which on it is to be looked at
 const COLORS = { set: "#d5392f", chosen: "#f0a400", predicted: "#3b82c4" };
 export const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete", "take the landmark away"],
-  ["Enter", "confirm the predicted ones"], ["[ and ]", "previous, next scan"], ["+ and -", "move it along the view, into the body"],
-  ["i", "click inside the body: joints"]];
+  ["c", "confirm the predicted ones"], ["[ and ]", "previous, next scan"], ["+ and -", "move it along the view, into the body"],
+  ["i", "click inside the body: joints"], ["drag, arrow keys", "turn the body"], ["wheel", "zoom"], ["right button", "shift the body"]];
 
 export class Pick extends Program {
   constructor(connection, page) {
     super(connection, page);
-    this.linked = false;                                // template and scan stand differently
+    this.linked = false;                                // template and scan stand differently,
+    this.alike = 1;                                     // what is made of the scan stands as the scan
     this.drags = Date.now() % 1e9;                      // of other tabs' numbers too
     this.inside = false;
     this.state = null;
@@ -34,17 +37,30 @@ export class Pick extends Program {
       redo: button("redo", "make it again (y)", () => this.send("redo")),
       swap: button("swap left and right", "exchange the two sides of the scan's landmarks", () => this.send("swap")),
       predict: button("predict the others", "register the template to the scan and see where the other landmarks should be", () => this.send("predict")),
-      confirm: button("confirm all", "take all predicted landmarks as they are (Enter)", () => this.confirm()),
+      confirm: button("confirm all", "take all predicted landmarks as they are (c)", () => this.confirm()),
+      next: button("skip", "go to the next name, as when the scan does not show this one (n)", () => this.step(1)),
+      there: button("move it there", "to where the ring is: where it is predicted", () => this.send("confirm", { names: [this.state.chosen] })),
     };
     this.insideBox = make("input", { type: "checkbox", onchange: () => { this.inside = this.insideBox.checked; } });
     this.measure = make("p", { class: "sk-measure" });
     this.file = make("p", { class: "sk-file" });
     this.panel.append(this.scans, this.list, this.added, make("div", { class: "sk-buttons" }, ...Object.values(this.buttons)),
       make("label", {}, this.insideBox, "inside the body (joints)"), this.measure, this.file,
-      make("details", {}, make("summary", {}, "keys"), make("dl", {}, ...KEYS.flatMap(([key, what]) => [make("dt", {}, key), make("dd", {}, what)]))));
+      make("details", {}, make("summary", {}, "mouse and keys"), make("dl", {}, ...KEYS.flatMap(([key, what]) => [make("dt", {}, key), make("dd", {}, what)]))));
   }
 
   confirm() { this.send("confirm", { names: Object.keys(this.waiting()) }); }
+
+  step(by) {
+    const { names, chosen } = this.state;
+    this.send("choose", { name: names[(names.indexOf(chosen) + by + names.length) % names.length] });
+  }
+
+  // How far a landmark of the scan is from where it is predicted, in metres; null where one of the two is missing.
+  off(name) {
+    const { places = {}, predicted = {} } = this.state.panes[1] ?? {};
+    return name in places && name in predicted ? distance(places[name], predicted[name]) : null;
+  }
 
   // Predicted landmarks that nobody has clicked yet.
   waiting() {
@@ -63,6 +79,8 @@ export class Pick extends Program {
     this.buttons.confirm.textContent = waiting ? `confirm ${waiting}` : "confirm all";
     const common = Object.keys(state.panes[0].places).filter((name) => name in (state.panes[1]?.places ?? {}));
     this.buttons.predict.disabled = common.length < state.enough || Boolean(state.working);
+    this.buttons.next.disabled = state.names.length < 2;
+    this.buttons.there.hidden = !(this.off(state.chosen) > OFF);
     this.buttons.swap.hidden = this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
     this.names();
     this.tellFile();
@@ -85,11 +103,11 @@ export class Pick extends Program {
     this.list.replaceChildren(...names.map((name) => {
       const marks = panes.map((pane) => make("span", { class: name in pane.places ? "sk-on" : name in pane.predicted ? "sk-guess" : "sk-off",
         title: name in pane.places ? "set" : name in pane.predicted ? "predicted" : "not set" }));
-      const far = panes[1] && name in panes[1].places && name in panes[1].predicted ? distance(panes[1].places[name], panes[1].predicted[name]) : null;
+      const far = this.off(name);
       const item = make("li", { "aria-current": name === chosen ? "true" : null, tabindex: 0, onclick: (event) => this.choose(name, event),
         onkeydown: (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); event.stopPropagation(); this.choose(name, event); } } },
         make("span", { class: "sk-dots" }, ...marks), make("span", {}, name),
-        far === null ? "" : make("small", { title: "from where it was predicted" }, `${(1000 * far).toFixed(0)} mm`));
+        far === null ? "" : make("small", { title: "from where it is predicted", class: far > OFF ? "sk-bad" : null }, `${(1000 * far).toFixed(0)} mm off`));
       return item;
     }));
     this.list.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
@@ -109,6 +127,7 @@ export class Pick extends Program {
   // Landmarks as dots with names, in every pane.
   paint() {
     if (!this.figure || !this.state) return;
+    if (this.figure.panes[1]) this.figure.panes[1].overlays = [(context, pane) => this.drawOff(context, pane)];
     this.figure.panes.slice(0, 2).forEach((pane, i) => {
       const marks = this.state.panes[i];
       if (!marks) return;
@@ -118,6 +137,24 @@ export class Pick extends Program {
         pane.setDots(group, Object.values(places), Object.keys(places), COLORS[group], i);
       }
     });
+  }
+
+  // A line from each landmark that is far off to a ring where it is predicted.
+  drawOff(context, pane) {
+    const { places, predicted } = this.state.panes[1] ?? { places: {} };
+    const scale = pane.canvas.width / Math.max(pane.canvas.clientWidth, 1);
+    context.strokeStyle = COLORS.predicted;
+    context.lineWidth = 2 * scale;
+    for (const name of Object.keys(places).filter((one) => this.off(one) > OFF)) {
+      const [from, to] = [places[name], predicted[name]].map((place) => pane.project(new Vector3().fromArray(place).sub(pane.origin)));
+      if (!from || !to) continue;
+      context.beginPath();
+      context.moveTo(from.x * scale, from.y * scale);
+      context.lineTo(to.x * scale, to.y * scale);
+      context.moveTo((to.x + 6) * scale, to.y * scale);
+      context.arc(to.x * scale, to.y * scale, 6 * scale, 0, 2 * Math.PI);
+      context.stroke();
+    }
   }
 
   shown(figure) {
@@ -151,22 +188,22 @@ export class Pick extends Program {
     });
   }
 
-  // The landmark under the pointer.
+  // The landmark under the pointer; one behind the body only where joints are clicked, which are inside.
   near(pane, number, event) {
     const box = pane.canvas.getBoundingClientRect();
     const marks = { ...(number === 1 ? this.waiting() : {}), ...this.state.panes[number].places };
     let best = null, least = NEAR;
     for (const [name, place] of Object.entries(marks)) {
-      const at = pane.project(new Vector3().fromArray(place).sub(pane.origin));
+      const point = new Vector3().fromArray(place).sub(pane.origin), at = pane.project(point);
       const away = at ? Math.hypot(at.x - (event.clientX - box.left), at.y - (event.clientY - box.top)) : Infinity;
-      if (away < least) { best = name; least = away; }
+      if (away < least && (this.inside || !pane.covers(point))) { best = name; least = away; }
     }
     return best;
   }
 
   place(pane, number, name, event, drag) {
     if (!name) { this.say("Name the landmark first: choose one from the list, or type another name.", "bad"); return; }
-    const { raycaster } = pane.ray(event), hit = pane.hit(event);
+    const aimed = aim(pane, event), { raycaster } = pane.ray(aimed), hit = pane.hit(aimed);
     const fields = { pane: number, name, inside: this.inside, drag, origin: raycaster.ray.origin.clone().add(pane.origin).toArray(),
       direction: raycaster.ray.direction.toArray(), seen: hit ? hit.point.clone().add(pane.origin).toArray() : null };
     this.send("place", fields, drag ? `drag ${drag}` : "");
@@ -174,8 +211,7 @@ export class Pick extends Program {
 
   key(event) {
     if (!this.state || event.target.matches("input:not([type=checkbox]), select, textarea")) return;
-    const { names, chosen, scan, scans, panes } = this.state;
-    const step = (by) => this.send("choose", { name: names[(names.indexOf(chosen) + by + names.length) % names.length] });
+    const { chosen, scan, scans, panes } = this.state;
     const pane = panes.length > 1 && chosen in panes[1].places ? 1 : 0;
     const slide = (by) => {
       if (!(chosen in panes[pane].places)) return;
@@ -183,19 +219,31 @@ export class Pick extends Program {
       this.send("slide", { pane, name: chosen, direction: direction.toArray(), by });
     };
     const actions = {
-      n: () => step(1), p: () => step(-1), z: () => this.send(event.shiftKey ? "redo" : "undo"), Z: () => this.send("redo"), y: () => this.send("redo"),
+      n: () => this.step(1), p: () => this.step(-1), z: () => this.send(event.shiftKey ? "redo" : "undo"), Z: () => this.send("redo"), y: () => this.send("redo"),
       Delete: () => this.send("remove", { pane, name: chosen }), Backspace: () => this.send("remove", { pane, name: chosen }),
-      Enter: () => this.confirm(), "[": () => scan > 0 && this.send("open", { scan: scan - 1 }),
+      c: () => this.confirm(), "[": () => scan > 0 && this.send("open", { scan: scan - 1 }),
       "]": () => scan < scans.length - 1 && this.send("open", { scan: scan + 1 }),
       "+": () => slide(0.002), "-": () => slide(-0.002), i: () => this.insideBox.click(),
     };
-    if (event.target.matches("button") && event.key === "Enter") return;
+    if (event.altKey || ((event.ctrlKey || event.metaKey) && !"zZy".includes(event.key))) return;
     if (actions[event.key]) { event.preventDefault(); actions[event.key](); }
   }
 }
 
 export function button(text, title, onclick) {
   return make("button", { type: "button", title, onclick }, text);
+}
+
+// The event itself, or the nearest place beside it where the pointer would be on a surface.
+function aim(pane, event) {
+  if (pane.hit(event)) return event;
+  for (const away of BESIDE) {
+    for (let k = 0; k < 8; k++) {
+      const beside = { clientX: event.clientX + away * Math.cos(k * Math.PI / 4), clientY: event.clientY + away * Math.sin(k * Math.PI / 4) };
+      if (pane.hit(beside)) return beside;
+    }
+  }
+  return event;
 }
 
 function distance(a, b) { return Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]); }

@@ -83,11 +83,13 @@ export class Program {
     const scene = await this.unpack(data, fields);
     if (this.ending.signal.aborted) return;
     const before = this.figure?.panes.map((pane) => pane.view()), choices = this.figure?.choices();
-    this.figure = new Figure(this.stage, scene, this.linked ?? true);
-    if (before?.length === scene.panes.length) {
-      this.figure.panes.forEach((pane, i) => pane.restore(before[i]));
+    this.figure = new Figure(this.stage, scene, this.linked ?? true, this.alike);
+    if (before && (this.alike || before.length === scene.panes.length)) {
+      this.figure.panes.slice(0, before.length).forEach((pane, i) => pane.restore(before[i]));
       this.figure.choose(choices);
     }
+    const [first, ...others] = this.figure.panes.slice(this.alike ?? Infinity);
+    for (const pane of others) pane.follow(first);
     this.shown?.(this.figure);
   }
 
@@ -112,6 +114,6 @@ export class Program {
     const [what, done, total] = working;
     this.progress.max = total;
     this.progress.value = done;
-    this.say(`${what} (${done} of ${total})`);
+    this.say(total > 1 ? `${what}: step ${done} of ${total}` : what);
   }
 }
