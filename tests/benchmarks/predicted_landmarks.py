@@ -43,9 +43,9 @@ def measure(data: RealData, kind: str, index: int, marks: str, full: bool) -> di
     every = np.array(list(apart.values()))
     whole = {} if not full else registered(data, item, marks)
     return {**whole, "scan": item.name, "kind": kind, "median_mm": float(np.median(every)),
-            "mean_mm": float(every.mean()), "nine_of_ten_mm": float(np.quantile(every, 0.9)), "worst_mm": float(every.max()),
-            "worst": max(apart, key=lambda name: apart[name]), "within_10": float((every <= 10).mean()),
-            "cpu_s": cpu, "wall_s": wall, "apart_mm": apart}
+            "mean_mm": float(every.mean()), "nine_of_ten_mm": float(np.quantile(every, 0.9)),
+            "worst_mm": float(every.max()), "worst": max(apart, key=lambda name: apart[name]),
+            "within_10": float((every <= 10).mean()), "cpu_s": cpu, "wall_s": wall, "apart_mm": apart}
 
 
 def main() -> None:
