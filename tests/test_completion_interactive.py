@@ -63,6 +63,21 @@ def marked(app, body, seen, count=4):
             app.scan.places[name] = app.scan.body.nearest(body.vertices[vertex])
 
 
+def clicked_on_the_scan(page, app, body, seen, toward, count=4):
+    """Click landmarks in a page whose second pane is turned to where the camera stood."""
+    wait_until(page, "program.figure.panes.every((pane) => pane.drawn > 1)")
+    page.evaluate("""(back) => { const pane = program.figure.panes[1]; Object.assign(pane.home,
+        { back, width: 2 * pane.home.width, height: 2 * pane.home.height }); pane.reset(); }""",
+                  (toward / np.linalg.norm(toward)).tolist())
+    for name, vertex in zip(NAMES, MARKS, strict=True):
+        if not seen[vertex] or len(app.scan.places) == count:
+            continue
+        page.locator(".sk-names li").filter(has_text=name).first.click()
+        wait_until(page, f"program.state.chosen === {json.dumps(name)}")
+        page.mouse.click(*page.evaluate(PLACED, [1, body.vertices[vertex].tolist()]))
+        wait_until(page, f"{json.dumps(name)} in program.state.panes[1].places")
+
+
 def test_a_completion_goes_on_from_the_one_before(case):
     body, _, seen, app = case
     marked(app, body, seen)
@@ -137,18 +152,7 @@ def test_from_a_half_view_to_a_saved_body_by_mouse_alone(case, new_page, tmp_pat
         page = new_page(viewport={"width": 1300, "height": 800})
         page.goto(server.opening())
         wait_until(page, "Boolean(window.program?.figure && program.state)")
-        wait_until(page, "program.figure.panes.every((pane) => pane.drawn > 1)")
-        toward = np.array([0.3, -1, 0.5]) / np.linalg.norm([0.3, -1, 0.5])
-        page.evaluate("""(back) => { const pane = program.figure.panes[1]; Object.assign(pane.home,
-            { back, width: 2 * pane.home.width, height: 2 * pane.home.height }); pane.reset(); }""",
-                      toward.tolist())                                  # as if turned, to where the camera stood
-        for name, vertex in zip(NAMES, MARKS, strict=True):
-            if not seen[vertex] or len(app.scan.places) == 4:
-                continue
-            page.locator(".sk-names li").filter(has_text=name).first.click()
-            wait_until(page, f"program.state.chosen === {json.dumps(name)}")
-            page.mouse.click(*page.evaluate(PLACED, [1, body.vertices[vertex].tolist()]))
-            wait_until(page, f"{json.dumps(name)} in program.state.panes[1].places")
+        clicked_on_the_scan(page, app, body, seen, np.array([0.3, -1, 0.5]))
         page.get_by_role("button", name="complete with 4 landmarks").click()
         wait_until(page, "Boolean(program.state.completed) && !program.state.working", 60)
         wait_until(page, "program.figure.panes.length === 3 && program.figure.panes[2].drawn > 0")

@@ -14,13 +14,13 @@ from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, say
-from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
+from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.pipeline.scans import find_scans
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig
 from .settings import CompletionConfig
-from .work import Inputs, Work, folder_inputs, folder_page, summary
+from .work import Inputs, Work, folder_inputs, folder_page, marks_of_template, summary
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN [SCAN ...]")]
 AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
@@ -77,7 +77,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     body = _body(loaded, subject, unit)
     inputs = Inputs(scans, landmarks or landmarks_beside(scans[0]), mask)
     wanted = any(one.landmarks for one in found.values()) if folder else inputs.landmarks is not None
-    marks = _template_landmarks(loaded, template_landmarks, name) if wanted else {}
+    marks = marks_of_template(loaded, template_landmarks, name) if wanted else {}
     work = Work(body, name, marks, config, unit, ColorConfig(fill=config.fill_colors))
     settings = {"complete": config, "model": name}
     if folder is None:
@@ -103,7 +103,7 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
     from .worn import is_recording, labels_of
 
     loaded, name = read_model(model)
-    marks = _template_landmarks(loaded, template_landmarks, name)
+    marks = marks_of_template(loaded, template_landmarks, name)
     labels = [label for path in scans for label in labels_of(path)]
     scans = tuple(path for path in scans if not is_recording(path))
     files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]
@@ -127,12 +127,3 @@ def _only(masks: tuple[Path, ...]) -> Path | None:
     if len(masks) > 1:
         raise ValueError(f"--mask: expected one folder of masks for a folder of scans, got {len(masks)}")
     return masks[0] if masks else None
-
-
-def _template_landmarks(model: BodyModel, given: Path | None, name: str) -> dict[str, int]:
-    if given is not None:
-        return read_landmark_vertices(given, model.template)
-    kept = model.info.get("landmarks")
-    if not kept:
-        raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
-    return {name: int(vertex) for name, vertex in kept.items()}

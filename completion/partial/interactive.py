@@ -4,8 +4,6 @@ Built on `scape pick`: the template is the model's, with its landmarks, and a th
 """
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,10 +16,12 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.opening import workspace
 from scanprep.console import Metric, Outcome, write_report
+from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.scene import Pane, pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
+from scanprep.viewer.dropped import Dropped, with_camera
 from scanprep.viewer.landmark_names import next_name
 from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
@@ -29,9 +29,10 @@ from scanprep.viewer.surface_clicks import Clickable
 
 from .completion import Completion, complete
 from .report import completion_panes
-from .work import Inputs, ScanFiles, Work, figures, read_views, write_results
+from .work import Inputs, ScanFiles, Work, figures, person_in, read_picture, read_views, write_results
 from .worn import labels_of, worn_markers, write_worn
 
+ENDING = ".landmarks.json"           # of landmark files
 FEWEST = 3                           # landmarks that say where a body is
 HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
@@ -41,6 +42,7 @@ class Made:
     """A completion and what it was made from."""
 
     completion: Completion
+    files: ScanFiles
     seconds: float                       # that it took
     places: Mapping[str, np.ndarray]     # of the landmarks
     known: bool                          # whether the person's shape was
@@ -56,16 +58,17 @@ class CompleteApp(PickApp):
         Settings, and the landmarks of the model's template; its body is what a person of known shape is.
     scans : paths
     output : folder that results are saved in, one for each scan where there are several
+    dropped : where scans that are dropped are kept, for as long as the app, unless it is somebody else's
     labels : of markers that the person wears, to be clicked too
     """
 
     name, title = "complete", "Complete a scan"
 
-    def __init__(self, model: BodyModel, work: Work, scans: Sequence[Path], output: Path, labels: Sequence[str] = ()
-                 ) -> None:
+    def __init__(self, model: BodyModel, work: Work, scans: Sequence[Path], output: Path,
+                 labels: Sequence[str] = (), dropped: Dropped | None = None) -> None:
         self.model, self.work, self.output = model, work, output
-        self._dropped = Path(tempfile.mkdtemp(prefix="scapekit-"))
-        self._views: dict[Path, ScanFiles] = {}
+        self.dropped = dropped or Dropped()
+        self._read: dict[Path, ScanFiles | DepthPicture] = {}
         self.made: dict[Path, Made] = {}
         self.saved: dict[Path, Path] = {}
         self.known = isinstance(work.body, Subject)
@@ -74,11 +77,15 @@ class CompleteApp(PickApp):
         marks = {name: model.template.vertices[vertex] for name, vertex in work.marks.items()}
         super().__init__(template, [self._clicked(path) for path in scans], labels, fixed=marks)
 
-    def _clicked(self, path: Path, file: Path | None = None) -> Clicked:
-        one = Clicked.found(path, ".landmarks.json", self.work.unit, file)
-        self._views[path] = read_views([path], self.work.unit)
-        view = self._views[path].views[0]
-        one.surface = Clickable(view if isinstance(view, Mesh) else view.points)
+    def _clicked(self, path: Path) -> Clicked:
+        """A scan; of one that was dropped the landmarks are saved with the results."""
+        file = self.output / (path.name.split(".")[0] + ENDING) if self.dropped.holds(path) else None
+        one = Clicked.found(path, ENDING, self.work.unit, file if file and file.exists() else None)
+        one.file = file or one.file
+        read = self._read[path] = read_picture([path], self.work.unit) or read_views([path], self.work.unit)
+        if isinstance(read, ScanFiles):
+            view = read.views[0]
+            one.surface = Clickable(view if isinstance(view, Mesh) else view.points)
         return one
 
     # what the page is sent
@@ -94,10 +101,9 @@ class CompleteApp(PickApp):
 
     def _result_pane(self) -> Pane | None:
         made = self.made.get(self.scan.path) if self.scan else None
-        if made is None or self.scan is None:
+        if made is None:
             return None
-        views = list(self._views[self.scan.path].views)
-        return completion_panes(views, made.completion, self.model.template)[-1]
+        return completion_panes(list(made.files.views), made.completion, self.model.template)[-1]
 
     def more(self) -> dict[str, Any]:
         """What the completion says of itself, and what would help it."""
@@ -157,23 +163,27 @@ class CompleteApp(PickApp):
 
         Of a recording the labels of its markers, which are clicked on the scan then.
         """
-        kept = self._dropped / name
-        shutil.copyfile(path, kept)
-        if labels := labels_of(kept):
-            self._join(labels)
-            send(self.state())
-            return
-        file = self.output / f"{name.split('.')[0]}.landmarks.json"
-        one = self._clicked(kept, file if file.exists() else None)
-        one.file = file
-        with self._lock:
-            known = [i for i, other in enumerate(self.scans) if other.path == kept]
-            self.current = known[0] if known else len(self.scans)
-            self.scans[self.current:self.current + 1] = [one]        # dropped again it takes its own place
-            self.made.pop(kept, None)
-            self.choose_next(None)
-        send(self.scene())
+        with self.dropped.keeping(name, path) as kept:
+            labels = labels_of(kept)
+            scan, lacks = (kept, "") if labels else with_camera(kept)
+            if labels:
+                self._join(labels)
+            elif not lacks:
+                self.take(scan)
+                send(self.scene())
+        self.note = lacks
         send(self.state())
+
+    def take(self, path: Path) -> None:
+        """Show one more scan, or the same anew in its place."""
+        one = self._clicked(path)
+        _ = one.shown                                            # what cannot be shown is refused
+        with self._lock:
+            known = [i for i, other in enumerate(self.scans) if other.path == path]
+            self.current = known[0] if known else len(self.scans)
+            self.scans[self.current:self.current + 1] = [one]
+            self.made.pop(path, None)
+            self.choose_next(None)
 
     def _predict_if_time(self, send: Send, pane: int) -> None:
         """Here the completion tells where landmarks are."""
@@ -194,13 +204,15 @@ class CompleteApp(PickApp):
         made = self.made.get(self.scan.path)
         start = made.completion if made is not None and made.known == self.known and names and not anew else None
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in names}
+        read = self._read[scan.path]
 
         def work(tell: Callable[[int, int], None]) -> str:
-            begin = time.perf_counter()
-            done = complete(self._body(known), list(self._views[scan.path].views), pairs_of(places, self.work.marks),
+            begin, body, given, pairs = time.perf_counter(), self._body(known), read, pairs_of(places, self.work.marks)
+            files = given if isinstance(given, ScanFiles) else person_in(given, self.model.template, pairs)
+            done = complete(body, list(given.views) if isinstance(given, ScanFiles) else given, pairs,
                             self.work.config, tell, start=start)
             with self._lock:
-                self.made[scan.path] = Made(done, time.perf_counter() - begin, places, known)
+                self.made[scan.path] = Made(done, files, time.perf_counter() - begin, places, known)
                 self.saved.pop(scan.path, None)
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
             if scan is self.scan:
@@ -221,11 +233,10 @@ class CompleteApp(PickApp):
         made = self.made.get(self.scan.path) if self.scan else None
         if made is None or self.scan is None:
             raise ValueError("complete the scan first")
-        scan = self.scan
-        folder = self.output if len(self.scans) == 1 else self.output / scan.path.name.split(".")[0]
+        scan, folder = self.scan, self.folder_of(self.scan)
         with workspace(folder) as space, space.staging("completion") as staged:
             rows = write_results(replace(self.work, body=self._body(made.known)), Inputs((scan.path,), scan.file),
-                                 self._views[scan.path], made.completion, pairs_of(made.places, self.work.marks), None,
+                                 made.files, made.completion, pairs_of(made.places, self.work.marks), None,
                                  staged.folder)
             rows += write_worn(staged.folder, made.completion, worn_markers(scan.places, self.work.marks))
             write_report(Outcome(staged.folder, rows, {"complete": self.work.config}),
@@ -233,9 +244,13 @@ class CompleteApp(PickApp):
         self.saved[scan.path] = folder
         self.note = f"saved in {folder}"
 
+    def folder_of(self, scan: Clicked) -> Path:
+        """Where the body of a scan is saved."""
+        return self.output if len(self.scans) == 1 else self.output / scan.path.name.split(".")[0]
+
     def close(self) -> None:
         """Forget files that were dropped."""
-        shutil.rmtree(self._dropped, ignore_errors=True)
+        self.dropped.close()
 
 
 def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray] | None:

@@ -26,6 +26,8 @@ PREDICTED = (0.62, 0.74, 0.62)
 CLOTHING, MARK = (0.62, 0.48, 0.66), (0.80, 0.12, 0.10)
 HEIGHT = 520
 WIDEST = 2.0                         # times as wide as high a picture of one side may be
+ERROR, OFF = "expected error", "distance of the scan to the {} body"
+OF_PREDICTED = (ERROR, OFF.format("predicted"))
 FEW = 9000                           # points of a bare cloud that a picture shows
 ONE_SIDED = 0.05                     # of the surface: its mean normal from which on a scan is one from a side
 
@@ -101,9 +103,10 @@ def completion_panes(scan: View | Sequence[View], completion: Completion, templa
         marks = [Dots(completion.scale * np.asarray(landmarks[1]), MARK, 0.010, True, name="landmarks", labels=labels)]
     over = [replace(shape, name="scan over it", visible=False) for shape in given]
     body = completion.completed
-    whole = Solid(Mesh(body.vertices, body.faces), _two_colors(completion), name="completed body",
-                  shades=_shades(scan, completion, masked))
-    predicted = Solid(completion.predicted, PREDICTED, name="predicted body", visible=False)
+    shades = _shades(scan, completion, masked)
+    whole = Solid(Mesh(body.vertices, body.faces), _two_colors(completion), name="completed body", shades=shades)
+    predicted = Solid(completion.predicted, PREDICTED, name="predicted body", visible=False,
+                      shades={title: heat for title, heat in shades.items() if title in OF_PREDICTED})
     return [Pane([*given, *marks], camera, "scan"), Pane([whole, *over, predicted, *marks], camera, "completed")]
 
 
@@ -117,11 +120,11 @@ def _shades(scan: View | Sequence[View], completion: Completion, masked: np.ndar
     points = points if masked is None else points[~masked]
     for mesh, high, which in ((body, 0.005, "completed"), (completion.predicted, 0.015, "predicted")):
         far = scan_distances(points, mesh, body, completion.seen)
-        title = f"distance of the scan to the {which} body"
+        title = OFF.format(which)
         shades[title] = Heat(far, 0.0, high, title)
     if completion.expected_error is not None:
         high = float(np.ceil(200 * np.nanquantile(completion.expected_error, 0.98)) / 200)
-        shades["expected error"] = Heat(completion.expected_error, 0.0, max(high, 0.005), "expected error")
+        shades[ERROR] = Heat(completion.expected_error, 0.0, max(high, 0.005), ERROR)
     return shades
 
 

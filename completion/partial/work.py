@@ -19,7 +19,7 @@ from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.format_common import UNITS
-from scanprep.geometry.landmarks import match_landmarks, read_landmarks
+from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.page import Page
@@ -36,8 +36,6 @@ from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
 from .worn import worn_markers, write_worn
 
-_STYLE = """.scan { display: grid; grid-template-columns: minmax(9rem, 1fr) 3fr; gap: 1rem; margin: 1.4rem 0; }
-.scan img { width: 100%; } .scan p { margin: .2rem 0; }"""
 MEANS = ("distance of the scan to the completed mesh, RMS", "scan points explained", "vertices with data")
 
 
@@ -107,9 +105,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     if depth is not None:
         if inputs.masks:
             raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
-        marks = np.zeros((0, 3)) if landmarks is None else landmarks[1]
-        person = prepare_picture(depth, size(work.body.template), marks)
-        files = ScanFiles((PointCloud(person.points, person.normals),), (None,))
+        files = person_in(depth, work.body.template, landmarks)
     scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
@@ -212,6 +208,22 @@ def read_picture(paths: Sequence[Path], unit: str | None = None) -> DepthPicture
     return read_depth(pictures[0], UNITS[unit or "mm"])
 
 
+def person_in(picture: DepthPicture, template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None) -> ScanFiles:
+    """The person in a depth picture, as a view; `landmarks` are those of `complete`."""
+    person = prepare_picture(picture, size(template), np.zeros((0, 3)) if landmarks is None else landmarks[1])
+    return ScanFiles((PointCloud(person.points, person.normals),), (None,))
+
+
+def marks_of_template(model: BodyModel, given: Path | None, name: str) -> dict[str, int]:
+    """Vertices of a model's template by name, from a file or the model itself; `name` is the model's."""
+    if given is not None:
+        return read_landmark_vertices(given, model.template)
+    kept = model.info.get("landmarks")
+    if not kept:
+        raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
+    return {name: int(vertex) for name, vertex in kept.items()}
+
+
 def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
     """A mesh, or the points of a file without triangles with the normals and colours that it has."""
     if path.suffix.lower() in POINT_ENDINGS:
@@ -260,6 +272,6 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
         shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
             page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        page.markup(f'<div class="scan"><div><a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>{told}</div>'
-                    f"{shown}</div>", _STYLE)
+        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
+        page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
     return page

@@ -5,7 +5,7 @@ and with where all sliders stand. Older answers that still wait give way to newe
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from scanprep.pictures.scene import pack_scene
-from scanprep.viewer.app import Send
+from scanprep.viewer.app import App, Send
+from scanprep.viewer.dropped import Dropped, with_camera
 from scanprep.viewer.messages import Message
 
 from .arrangement import over_each_other, side_by_side
 from .contents import Content
 from .controls import Controls, Shown
-from .files import Entry
+from .files import Entry, Files
 from .movable import MovableBody
+from .pages import Inside
 from .saving import save_bodies, save_poses
 from .statues import movable
 
@@ -28,36 +30,46 @@ MOST = 12                            # panes
 
 
 class ViewApp:
-    """Contents side by side, or over each other; ValueError where none of them can be read.
+    """Contents side by side, or over each other; ValueError where there are some and none can be read.
 
     Parameters
     ----------
     entries : sequence of Entry
+        None at first where files will be dropped.
     over : bool
         All in one pane.
     output : Path
         Folder for what is saved.
+    files : Files, optional
+        Those that the entries are from, which tell what other files are.
     """
 
     name, title = "view", "View"
     folders: Sequence[Path] = ()
 
-    def __init__(self, entries: Sequence[Entry], over: bool = False, output: Path = Path()) -> None:
+    def __init__(self, entries: Sequence[Entry] = (), over: bool = False, output: Path = Path(),
+                 files: Files | None = None) -> None:
         self.entries, self.over, self.output = list(entries), over, output
         self.controls, self.rng = Controls(), np.random.default_rng()
+        self.files, self.dropped = files or Files(), Dropped()
+        self.inside = Inside(self.files, output, self.dropped)
         self.written: list[Path] = []                     # what was saved
+        self.note = ""
+        self.working: tuple[str, int, int] | None = None
         self.problems: dict[int, str] = {}
         self.contents: dict[int, Content] = {}
         self.bodies: dict[int, MovableBody] = {}
+        self.shown: list[int] = []
         self.number = 0                                   # of the scene, which positions name
         self._scene: list[Message] = []                   # and what belongs to it
         self._notes: tuple[str, ...] = ()
         self._about: dict[int, str] = {}
         self._positions: dict[tuple[int, int], Message] = {}
-        first = [i for i, entry in enumerate(self.entries) if entry.first] or [0]
-        self.show(first if len(first) <= MOST else first[:1])
-        if not self.shown:
-            raise ValueError(next(iter(self.problems.values()), "FILES: nothing to show"))
+        if self.entries:
+            first = [i for i, entry in enumerate(self.entries) if entry.first] or [0]
+            self.show(first if len(first) <= MOST else first[:1])
+            if not self.shown:
+                raise ValueError(next(iter(self.problems.values()), "FILES: nothing to show"))
 
     # what the page is sent
 
@@ -72,7 +84,8 @@ class ViewApp:
             "entries": [{"name": entry.name, "shown": i in self.shown, "problem": self.problems.get(i, ""),
                          "about": self._about.get(i, "")} for i, entry in enumerate(self.entries)],
             "notes": list(self._notes), "problems": list(self.problems.values()),
-            "saved": [str(path) for path in self.written],
+            "saved": [str(path) for path in self.written], "note": self.note, "working": self.working,
+            "pages": self.inside.offered(self.entries),
             "parts": list(sliders.turns), "models": [{"pane": one.pane, "layer": one.layer, "name": one.name}
                                                      for one in sliders.shown],
             **self._where()}, latest="state")
@@ -96,6 +109,10 @@ class ViewApp:
 
     def show(self, wanted: Sequence[int]) -> None:
         """Read these entries and make their scene; those that cannot be read tell why."""
+        self._arrange(self._read(wanted))
+
+    def _read(self, wanted: Sequence[int]) -> list[int]:
+        """Those of some entries that can be read."""
         if len(wanted) > MOST:
             raise ValueError(f"at most {MOST} can be shown at a time")
         read: list[int] = []
@@ -114,11 +131,58 @@ class ViewApp:
             else:
                 self.problems.pop(i, None)
                 read.append(i)
+        return read
+
+    def _arrange(self, read: list[int]) -> None:
         self.shown = read
         self.contents = {i: self.contents[i] for i in read}
         self.bodies = {i: body for i, body in self.bodies.items() if i in read}
         if read:
             self._make_scene()
+
+    def join(self, path: Path) -> None:
+        """Show the things of one more file or folder with the others; ValueError, and all as before, where none can be.
+
+        What is known of things that stay is kept; those that were shown and were read anew are shown again.
+        """
+        before = vars(self).copy()
+        old, self.entries = self.entries, self.files.with_another(self.entries, path)
+        fresh = [i for i, entry in enumerate(self.entries) if entry not in old]
+        place = {i: self.entries.index(entry) for i, entry in enumerate(old) if entry in self.entries}
+        for name in ("problems", "contents", "bodies", "_about"):
+            setattr(self, name, {place[i]: one for i, one in getattr(self, name).items() if i in place})
+        again = {old[i].path for i in self.shown if i not in place}
+        new = [i for i in fresh if self.entries[i].path in again] or [i for i in fresh if self.entries[i].first]
+        read = self._read(sorted([*(place[i] for i in self.shown if i in place), *new][-MOST:]))
+        if not set(new) & set(read):
+            problem = self.problems[new[0]]
+            vars(self).update(before)
+            raise ValueError(problem)
+        self._arrange(read)
+
+    # pages inside
+
+    def enter(self, send: Send, wanted: Mapping[str, Any]) -> App:
+        """The page of a folder, or the completion of one of the scans by one of the models."""
+        self.note = ""
+        if wanted["what"] != "complete":
+            return self.inside.folder_page(wanted["what"], wanted["folder"], self.entries)
+
+        def progress(done: int, total: int) -> None:
+            self.working = ("building the synthetic people", done, total)
+            send(self.state())
+
+        try:
+            return self.inside.completion(self.entries[int(wanted["scan"])], wanted["model"], progress)
+        finally:
+            self.working = None
+
+    def returned(self, app: App) -> None:
+        """What a page has written joins the things that are shown."""
+        for folder in self.inside.written(app):
+            if folder not in self.written:
+                self.written.append(folder)
+            self.join(folder)
 
     def _places(self) -> list[tuple[int, int, int]]:
         """Entry, pane and first layer of everything that is shown."""
@@ -161,11 +225,20 @@ class ViewApp:
         action(send, **message.fields)
 
     def receive(self, name: str, path: Path, send: Send) -> None:
-        """Files are named on the command line."""
-        raise ValueError("name files on the command line: scape view FILES")
+        """A file dropped on the page joins the things and is shown; ValueError for one that cannot be."""
+        with self.dropped.keeping(name, path) as kept:
+            whole, self.note = with_camera(kept)
+            if not self.note:
+                self.join(whole)
+        self._tell_all(send)
 
     def close(self) -> None:
-        """All that was wanted was saved."""
+        """Forget what was dropped; all else that was wanted was saved."""
+        self.dropped.close()
+
+    def _tell_all(self, send: Send) -> None:
+        for message in self.greet():
+            send(message)
 
     def _tell(self, send: Send) -> None:
         for one in self.controls.shown:

@@ -12,38 +12,40 @@ from scanprep.viewer.cli import Port
 
 from ..cli import ModelOrNone
 
-FilesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE [FILE ...]")]
+FilesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[FILE ...]")]
 
 
-def view_files(files: FilesArg, model: ModelOrNone = None, over: bool = False, unit: Unit | None = None,
+def view_files(files: FilesArg = (), model: ModelOrNone = None, over: bool = False, unit: Unit | None = None,
                serve: Port | None = None, save_in: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path()) -> Outcome:
     """Look at meshes, scans, models, motions and results in the browser, and move models by sliders.
 
     Example: scape view scan.ply completed -m model.npz
 
-    What a file is, is told by what is in it. A model has sliders for its shape and its joints; with --over things that
-    belong together are laid over each other, as a recording over the motion that was made of it.
+    What a file is, is told by what is in it; files can be dropped on the page too. A model has sliders for its shape
+    and its joints; with --over things that belong together are laid over each other, as a recording over the motion
+    that was made of it. On the page scans are completed and registered sets mended.
 
     Args:
-        files: Meshes, point clouds, models, motions and recordings of markers (C3D, TRC, CSV); registered sets and the
-            folders of scape complete, mosh, animate and track; landmarks and marker layouts after their mesh.
+        files: Meshes, point clouds, depth pictures (PNG), models, motions and recordings of markers (C3D, TRC, CSV);
+            registered sets and the folders of scape complete, mosh, animate and track; landmarks and marker layouts
+            after their mesh. Without any the page is empty, and waits for files that are dropped on it.
         model: Model of motions that do not tell theirs.
         over: Lay everything over each other instead of side by side.
         unit: Unit of meshes, points, landmarks and markers.
         serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
             to reach it is printed.
-        save_in: Folder for bodies and poses that are saved; files that are there stay.
+        save_in: Folder for bodies, poses and completions that are saved; files that are there stay.
     """
+    from scanprep.viewer.pages import Pages
     from scanprep.viewer.server import serve as show
 
     from .app import ViewApp
     from .files import Files
 
-    if not files:
-        raise ValueError("FILE: expected at least one file or folder")
-    app = ViewApp(Files(files, model, unit, over).entries(), over, save_in)
+    known = Files(files, model, unit, over)
+    app = ViewApp(known.entries(), over, save_in, known)
     for problem in app.problems.values():
         say(f"scape view: note: {problem}")
-    show(app, serve or None, serve is None)
+    show(Pages(app), serve or None, serve is None)
     return Outcome(None, [Metric("things", len(app.entries)), Metric("shown at last", len(app.shown)),
                           Metric("files saved", len(app.written))])

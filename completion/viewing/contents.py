@@ -31,11 +31,12 @@ AXES = {f"{sign}{axis}": s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)
 
 @dataclass(frozen=True, eq=False)
 class Stance:
-    """Where a thing is, and which way it stands: extent (n, 3) metres, the axis that is up and where the front is."""
+    """Where a thing is, and how it stands: extent (n, 3) metres, the axis that is up and where the front is."""
 
     extent: np.ndarray
     up: np.ndarray
     front: np.ndarray
+    straight: bool = False               # seen from the front itself, not from beside it
 
     @staticmethod
     def of(mesh: Mesh, poses: np.ndarray | None = None) -> Stance:
@@ -51,6 +52,8 @@ class Stance:
         up = self.up if up is None else up
         front = self.front if np.linalg.norm(np.cross(self.front, up)) > 0.1 else np.roll(up, 1)
         flat = front - (front @ up) * up
+        if self.straight:
+            return Camera.from_side(self.extent, flat, up, 0.0)
         side = np.cos(TURN) * flat + np.sin(TURN) * np.cross(up, flat)
         return Camera.from_side(self.extent, side, up, ELEVATION)
 
@@ -101,6 +104,12 @@ def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray
     few = len(shown.mesh.faces) < len(mesh.faces)
     notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * few
     return Content(name, [shown, *marks], stands, sizes(mesh), notes=notes)
+
+
+def from_camera(content: Content) -> Content:
+    """What a depth camera saw, from its side: it looks along z, with y down."""
+    stance = replace(content.stance, up=np.array([0.0, -1, 0]), front=np.array([0.0, 0, -1]), straight=True)
+    return replace(content, stance=stance)
 
 
 def sizes(mesh: Mesh) -> str:

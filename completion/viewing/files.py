@@ -1,7 +1,7 @@
 """What a file or folder is, told by what is in it, and how it is shown."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,16 +9,19 @@ import numpy as np
 
 from model.body import BodyModel
 from model.files import load_model
+from scanprep.cli import Unit
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry.files import read_mesh, read_scan
+from scanprep.depth_camera.picture import is_camera
+from scanprep.geometry.files import read_mesh
 from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import Dots
+from scanprep.viewer.clicked import read_surface
 
 from ..mocap.files.markers import MarkerSequence, read_markers
 from ..motion import Motion
 from ..partial.completion import load_completion
-from .contents import MARKER, Content, of_completion, of_mesh, of_model, told
+from .contents import MARKER, Content, from_camera, of_completion, of_mesh, of_model, told
 from .kinds import kind_of, layout_places, reported_model, worst_first
 from .motions import of_markers, of_motion
 from .soft import soft_tissue_of, with_soft_tissue
@@ -26,18 +29,25 @@ from .statues import is_statue, read_statue, statue_folder
 
 PLACES = (".pp", ".json", ".lnd", ".landmarks.txt")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
-SHOWN, TABLES = ("surface", "model", "motion", "markers"), (".csv", ".txt")     # of folders; tables may hold anything
+SHOWN, TABLES = ("surface", "picture", "model", "motion", "markers"), (".csv", ".txt")     # tables may hold anything
 ENOUGH = 3                           # labels that a recording and a motion have in common
 DEEP = 3                             # folders inside folders that are looked into
 
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A thing that can be shown, read when it is; `first`: among those that are shown at first."""
+    """A thing that can be shown, read when it is.
+
+    `first`: among those that are shown at first; `path`: what is read; `kind`: as `kind_of` tells it; `folder`: that a
+    command wrote and that it is of.
+    """
 
     name: str
     load: Callable[[], Content]
     first: bool = True
+    path: Path = Path()
+    kind: str = ""
+    folder: Path | None = None
 
 
 class Files:
@@ -54,7 +64,7 @@ class Files:
         Recordings of markers are shown with the motions that were made of them, not by themselves.
     """
 
-    def __init__(self, paths: tuple[Path, ...], model: Path | None = None, unit: str | None = None,
+    def __init__(self, paths: tuple[Path, ...] = (), model: Path | None = None, unit: Unit | None = None,
                  over: bool = False) -> None:
         self.paths, self.model, self.unit, self.over = paths, model, unit, over
         self._models: dict[Path, BodyModel] = {}
@@ -67,6 +77,8 @@ class Files:
         for path in self.paths:
             if not path.exists():
                 raise ValueError(f"{path}: no such file or folder")
+            if is_camera(path):                          # which is read with its picture
+                continue
             path = statue_folder(path)
             if path.name.lower().endswith(PLACES):
                 self._lay_on(found, path)
@@ -76,6 +88,30 @@ class Files:
         if len(found) > 1 and all(entry.name.startswith(shared) for entry in found):
             found = [replace(entry, name=entry.name.removeprefix(shared)) for entry in found]
         return found
+
+    def with_another(self, entries: Sequence[Entry], path: Path) -> list[Entry]:
+        """Entries and those of one more file or folder, in the place of those that it had; ValueError as `entries`."""
+        self._models.pop(path.resolve(), None)
+        if path.name.lower().endswith(PLACES):
+            found = list(entries)
+            beside = [i for i, entry in enumerate(found) if landmarks_beside(entry.path) == path]
+            if beside:
+                found[beside[0]] = self._of_file(found[beside[0]].path, found[beside[0]].name)
+            else:
+                self._lay_on(found, path)
+            return found
+        fresh = self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
+        old = [i for i, entry in enumerate(entries) if path in (entry.path, entry.folder)]
+        if old and len(fresh) > 1 and "/" not in entries[old[0]].name:
+            fresh = [replace(entry, name=entry.name.split("/", 1)[-1]) for entry in fresh]     # named as it was
+        place = old[0] if old else len(entries)
+        return [*entries[:place], *fresh, *(entry for i, entry in enumerate(entries) if i > place and i not in old)]
+
+    @property
+    def models(self) -> list[Path]:
+        """Those among the files, and last the one that was named for motions."""
+        named = [] if self.model is None else [self.model]
+        return list(dict.fromkeys([*(path for path in self._found if path not in named), *named]))
 
     def read_model(self, path: Path) -> BodyModel:
         """Each model is read once."""
@@ -88,23 +124,22 @@ class Files:
 
     def _of_file(self, path: Path, name: str) -> Entry:
         kind = kind_of(path)
-        if kind == "model":
-            self._found.append(path)
-            return Entry(name, lambda: of_model(name, self.read_model(path)))
-        if kind == "motion":
-            return Entry(name, lambda: told(lambda: self._motion(path, name)))
-        if kind == "completion":
-            return Entry(name, lambda: of_completion(name, load_completion(path.parent)))
-        if kind == "markers":
-            self._recordings.append(path)
-            return Entry(name, lambda: told(lambda: of_markers(name, read_markers(path, self.unit))), not self.over)
-        if kind == "surface":
-            return Entry(name, lambda: told(lambda: self._surface(path, name)))
-        raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks or a folder, "
-                         f"found {kind}")
+        loads: dict[str, Callable[[], Content]] = {
+            "model": lambda: of_model(name, self.read_model(path)),
+            "motion": lambda: told(lambda: self._motion(path, name)),
+            "completion": lambda: of_completion(name, load_completion(path.parent)),
+            "markers": lambda: told(lambda: of_markers(name, read_markers(path, self.unit))),
+            "surface": lambda: told(lambda: self._surface(path, name)),
+            "picture": lambda: from_camera(self._surface(path, name))}
+        if kind not in loads:
+            raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks, a depth picture "
+                             f"or a folder, found {kind}")
+        of_kind = {"model": self._found, "markers": self._recordings}.get(kind, [])
+        of_kind.append(path)
+        return Entry(name, loads[kind], kind != "markers" or not self.over, path, kind)
 
     def _surface(self, path: Path, name: str) -> Content:
-        shape, file = read_scan(path, self.unit), landmarks_beside(path)
+        shape, file = read_surface(path, self.unit), landmarks_beside(path)
         if file is None:
             return of_mesh(name, shape)
         try:
@@ -127,7 +162,7 @@ class Files:
             still = (f"{path.name}: shown on the body at rest, without sliders",) * (content.model is not None)
             return replace(content, shapes=[*content.shapes, dots], model=None, notes=(*content.notes, *still))
 
-        found.append(Entry(last.name, load, last.first))
+        found.append(replace(last, load=load))
 
     # folders
 
@@ -143,11 +178,13 @@ class Files:
         elif is_statue(folder):
             yield Entry(name, lambda: read_statue(name, folder))
         elif (folder / COMPLETION).is_file():
-            yield Entry(name, lambda: of_completion(name, load_completion(folder)))
+            yield Entry(name, lambda: of_completion(name, load_completion(folder)), True, folder, "completion", folder)
         elif (folder / MOTION).is_file():
-            yield Entry(name, lambda: told(lambda: self._motion(folder / MOTION, name)))
+            yield Entry(name, lambda: told(lambda: self._motion(folder / MOTION, name)), True, folder / MOTION,
+                        "motion", folder)
             if (folder / "onto.npz").is_file():
-                yield Entry(f"{name}, other person", lambda: told(lambda: self._motion(folder / "onto.npz", name)))
+                yield Entry(f"{name}, other person", lambda: told(lambda: self._motion(folder / "onto.npz", name)),
+                            True, folder / "onto.npz", "motion", folder)
         else:
             for path in sorted(folder.iterdir()):
                 if path.name.startswith("."):
@@ -167,8 +204,10 @@ class Files:
         for i, (scan, why) in enumerate(worst_first(whole)):
             path = folder / next(entry.file for entry in whole.entries if entry.name == scan)
             label = f"{name}/{scan}" + (f": {why}" if why else "")
-            yield Entry(label, lambda label=label, path=path: load(label, path), i == 0)       # type: ignore[misc]
-        yield Entry(f"{name}/template", lambda: load(f"{name}/template", folder / "template.ply"), False)
+            yield Entry(label, lambda label=label, path=path: load(label, path), i == 0, path,  # type: ignore[misc]
+                        "of a set", folder)
+        yield Entry(f"{name}/template", lambda: load(f"{name}/template", folder / "template.ply"), False,
+                    folder / "template.ply", "of a set", folder)
 
     # motions
 
@@ -209,5 +248,5 @@ class Files:
                 return self.read_model(name)
         fitting = [m for m in map(self.read_model, self._found) if len(m.skeleton.parents) == motion.poses.shape[1]]
         if not fitting:
-            raise ValueError(f"{path}: a motion needs its model; name it with -m")
+            raise ValueError(f"{path}: a motion needs its model; name it with -m, or drop it before")
         return fitting[0]

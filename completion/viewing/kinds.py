@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from scanprep.dataset import RegisteredSet
+from scanprep.depth_camera.picture import camera_file, is_picture
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 
@@ -19,7 +20,7 @@ CACHED = "cached at "                # in reports, before the file of the model 
 
 
 def kind_of(path: Path) -> str:
-    """What a file is: model, motion, completion, markers, surface, or words for what it is instead."""
+    """What a file is: model, motion, completion, markers, surface, picture, or words for what it is instead."""
     if zipfile.is_zipfile(path):
         with storage.taking_apart(path, "a model or a motion"), zipfile.ZipFile(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
@@ -31,6 +32,8 @@ def kind_of(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix in READERS:
         return "markers"
+    if is_picture(path):
+        return "picture" if camera_file(path).exists() else f"a picture without {camera_file(path).name} beside it"
     return "surface" if suffix in SURFACES else f"'{path.suffix or path.name}'"
 
 
@@ -46,11 +49,10 @@ def reported_model(path: Path) -> Path | None:
 
 def worst_first(whole: RegisteredSet) -> list[tuple[str, str]]:
     """Names and what is to be said of them; in the order of the set where there are no figures."""
-    from scanprep.pipeline.figures import read_figures, review
+    from scanprep.pipeline.page import judge_set
 
     try:
-        verdicts = review(read_figures(whole.folder), {}, float(np.ptp(whole.template.vertices, axis=0).max()),
-                          len(whole.template.faces))
+        verdicts = judge_set(whole.folder)
     except (OSError, ValueError):
         return [(name, "") for name in whole.names]
     judged = {verdict.name: next(iter(verdict.reasons), "") for verdict in verdicts if verdict.name in whole.names}

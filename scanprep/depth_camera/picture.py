@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
+from ..geometry.mesh import Mesh
+
 NOISE = 0.002                        # metres at one metre, growing with the square of the distance: what cameras have
 JUMP = 0.02                          # metres, and as much of the distance: neighbours farther apart are two surfaces
 SMOOTHED = 2                         # pixels around each from which its normal comes
+CAMERA = ".camera.json"              # ending of the file beside a picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +116,19 @@ class DepthPicture:
         out[enough] = n / np.maximum(np.linalg.norm(n, axis=1), 1e-12)[:, None]
         return out
 
+    def mesh(self) -> Mesh:
+        """Triangles between neighbouring pixels on one surface, turned to the camera; ValueError without any."""
+        number = np.arange(self.depth.size).reshape(self.depth.shape)
+        a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+        faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
+        depth = self.depth.ravel()[faces]
+        with np.errstate(invalid="ignore"):
+            faces = faces[np.ptp(depth, axis=1) < self.jump().ravel()[faces[:, 0]]]
+        if not len(faces):
+            raise ValueError("depth: no two neighbouring pixels are on one surface")
+        used, index = np.unique(faces, return_inverse=True)
+        return Mesh(self.points().reshape(-1, 3)[used], index.reshape(-1, 3))
+
     def halved(self) -> DepthPicture:
         """Every second pixel of every second row, means of those around on the same surface."""
         h, w = (n // 2 * 2 for n in self.depth.shape)
@@ -133,6 +149,21 @@ def pixels(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(row), np.asarray(column)
 
 
+def is_picture(path: Path) -> bool:
+    """Whether the name is that of a depth picture."""
+    return path.suffix.lower() == ".png"
+
+
+def is_camera(path: Path) -> bool:
+    """Whether the name is that of the camera of one."""
+    return path.name.lower().endswith(CAMERA)
+
+
+def camera_file(picture: Path) -> Path:
+    """Where the camera of a picture is told."""
+    return picture.with_name(picture.stem + CAMERA)
+
+
 def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
     """A picture from a PNG file of 16 bits, 0 where nothing was measured, `metres` long each unit.
 
@@ -149,7 +180,7 @@ def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
     if values.ndim != 2 or values.dtype == np.uint8:
         raise ValueError(f"{path}: expected distances, one channel of 16 bits, got {values.dtype} {values.shape}")
     try:
-        return DepthPicture.of(metres * values, read_camera(path.with_name(path.stem + ".camera.json")))
+        return DepthPicture.of(metres * values, read_camera(camera_file(path)))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.files import read_scan
+from ..depth_camera.picture import is_picture, read_depth
+from ..geometry.files import UNITS, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
@@ -61,7 +62,7 @@ class Clicked:
     def body(self) -> Clickable:
         """What is clicked on; read when it is first shown."""
         if self.surface is None:
-            self.surface = Clickable(read_scan(self.path, self.unit))
+            self.surface = Clickable(read_surface(self.path, self.unit))
         return self.surface
 
     def forget(self) -> None:
@@ -81,7 +82,8 @@ class Clicked:
 
     def pane(self, label: str) -> Pane:
         """Its surface as the browser gets it."""
-        return Pane([self.shown], camera_of(self.body.shape), label)
+        camera = camera_before(self.body.points) if is_picture(self.path) else camera_of(self.body.shape)
+        return Pane([self.shown], camera, label)
 
     @property
     def shown(self) -> Shape:
@@ -91,6 +93,22 @@ class Clicked:
             self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
                 Dots(points[::max(1, len(points) // MOST_DOTS)], CLAY, 0.004)
         return self._shown
+
+
+def read_surface(path: Path, unit: str | None = None) -> Mesh | np.ndarray:
+    """The mesh, or points (n, 3), metres, of a file; of a depth picture, in millimetres unless told, what it gives."""
+    if not is_picture(path):
+        return read_scan(path, unit)
+    picture = read_depth(path, UNITS[unit or "mm"])
+    try:
+        return picture.without_flying_pixels().mesh()
+    except ValueError as problem:
+        raise ValueError(f"{path}: {problem}") from None
+
+
+def camera_before(points: np.ndarray) -> Camera:
+    """A view of points (n, 3) from the side of the depth camera that they come from, as it saw them."""
+    return Camera.from_side(points, np.array([0.0, 0, -1]), np.array([0.0, -1, 0]), 0.0)
 
 
 def camera_of(shape: Mesh | np.ndarray) -> Camera:

@@ -1,6 +1,9 @@
 // `scape complete --interactive`: landmarks as in `scape pick`, then a button, the whole body, and what it is worth.
+import { dropZone } from "./drop.js";
 import { make } from "./figure.js";
 import { button, Pick } from "./pick.js";
+
+const WHOLE = "Boxes and the list of colours under the bodies lay completed body, predicted body and scan over each other.";
 
 export class Complete extends Pick {
   build() {
@@ -14,21 +17,9 @@ export class Complete extends Pick {
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
     this.markers = make("p", { class: "sk-file" });
     this.added.placeholder = "a name, or a marker set: cmu41";
-    this.scans.before(this.drop());
+    this.scans.before(dropZone(this, "drop a scan here, or a recording whose markers to click, or choose a file"));
     this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict, this.markers);
     this.buttons.predict.remove();
-  }
-
-  drop() {
-    const input = make("input", { type: "file", hidden: true, onchange: () => { if (input.files[0]) this.upload(input.files[0]); } });
-    addEventListener("dragover", (event) => event.preventDefault());
-    addEventListener("drop", (event) => { event.preventDefault(); if (event.dataTransfer.files[0]) this.upload(event.dataTransfer.files[0]); });
-    return make("label", { class: "sk-drop", tabindex: 0, onkeydown: (event) => { if (event.key === "Enter") input.click(); } }, input, "drop a scan here, or a recording whose markers to click, or choose a file");
-  }
-
-  upload(file) {
-    this.say(`reading ${file.name}`);
-    this.connection.upload(file).catch((error) => this.say(String(error.message ?? error), "bad"));
   }
 
   update(state) {
@@ -60,6 +51,6 @@ export class Complete extends Pick {
 
   hint() {
     if (this.state.panes.length < 2) return "Drop a scan on the page.";
-    return this.state.completed ? "" : `${super.hint()} Three to ten landmarks help most; then press “complete”.`;
+    return this.state.completed ? WHOLE : `${super.hint()} Three to ten landmarks help most; then press “complete”.`;
   }
 }

@@ -96,7 +96,17 @@ export class Figure {
     for (const pane of this.panes) pane.reset(azimuth, elevation);
   }
 
+  // What is seen and in which colours, to be chosen again in a figure of the same things.
+  choices() { return { visible: new Map(this.layers.map((layer) => [layer.name, layer.object.visible])), color: this.colored }; }
+
+  choose({ visible, color }) {
+    this.each((layer) => { if (layer.name) layer.object.visible = visible.get(layer.name) ?? layer.object.visible; });
+    if (color !== undefined) this.color(color);
+    this.fill();
+  }
+
   color(name) {
+    this.colored = name;
     this.each((layer) => {
       const index = layer.shades.findIndex((shade) => shade.name === name);
       if (index >= 0) layer.setShade(index);

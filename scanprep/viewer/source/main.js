@@ -2,6 +2,7 @@
 import { Complete } from "./complete.js";
 import { Figure } from "./figure.js";
 import { Mend } from "./mend.js";
+import { run } from "./pages.js";
 import { hasWebGL } from "./pane.js";
 import { Pick } from "./pick.js";
 import { fromBase64, unpackScene } from "./unpack.js";
@@ -39,5 +40,5 @@ const PROGRAMS = { complete: Complete, mend: Mend, pick: Pick, view: View };
 
 export function start(name) {
   if (!name) startReport();
-  else window.program = new PROGRAMS[name]().start();
+  else run(PROGRAMS, name);
 }

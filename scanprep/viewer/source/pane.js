@@ -3,6 +3,8 @@ import { AmbientLight, DirectionalLight, HemisphereLight, PerspectiveCamera, Ray
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { Layer } from "./layer.js";
 
+const STEP = Math.PI / 18;           // by which an arrow key turns
+
 let renderer = null;
 const waiting = new Set();
 
@@ -49,6 +51,7 @@ export class Pane {
     this.controls.addEventListener("change", () => { this.redraw(); this.onTurn?.(this); });
     this.canvas.addEventListener("wheel", (event) => { if (!this.canvas.matches(":focus")) event.stopImmediatePropagation(); }, true);
     this.canvas.addEventListener("pointerdown", () => this.canvas.focus({ preventScroll: true }));
+    this.canvas.addEventListener("keydown", (event) => this.turnBy(event));
     this.overlays = [];                                 // functions (context, pane) that draw over the picture
     new ResizeObserver(() => this.resize()).observe(this.canvas);
   }
@@ -77,6 +80,18 @@ export class Pane {
     this.lens();
     this.controls.update();
     this.redraw();
+  }
+
+  // Arrow keys turn the body, as a drag does.
+  turnBy(event) {
+    const [aside, upward] = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key] ?? [0, 0];
+    if (!(aside || upward) || !this.controls.enabled) return;
+    event.preventDefault();
+    const up = this.camera.up.clone().normalize(), back = this.camera.position.clone().sub(this.controls.target);
+    const angle = back.angleTo(up) - upward * STEP;
+    if (upward && angle > STEP && angle < Math.PI - STEP) back.applyAxisAngle(up.clone().cross(back).normalize(), -upward * STEP);
+    this.camera.position.copy(this.controls.target).add(back.applyAxisAngle(up, aside * STEP));
+    this.controls.update();
   }
 
   lens() {
@@ -216,7 +231,8 @@ function drawLabels(pane, layer, taken) {
     if (!text || layer.hidden.has(i)) return;
     const point = new Vector3().fromArray(layer.positions, 3 * i), at = pane.project(point);
     if (!at || (!layer.described.on_top && pane.covers(point))) return;
-    const x = (at.x + 8) * scale, y = at.y * scale, wide = context.measureText(text).width, high = 7 * scale;
+    const wide = context.measureText(text).width, high = 7 * scale, right = (at.x + 8) * scale, y = at.y * scale;
+    const left = (at.x - 8) * scale - wide, x = right + wide <= pane.canvas.width ? right : Math.max(left, 0);
     if (taken.some((box) => x < box.right && x + wide > box.left && y - high < box.bottom && y + high > box.top)) return;
     taken.push({ text, left: x, right: x + wide, top: y - high, bottom: y + high });
     context.strokeText(text, x, y);

@@ -11,8 +11,8 @@ export const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["
   ["i", "click inside the body: joints"]];
 
 export class Pick extends Program {
-  constructor() {
-    super();
+  constructor(connection, page) {
+    super(connection, page);
     this.linked = false;                                // template and scan stand differently
     this.drags = Date.now() % 1e9;                      // of other tabs' numbers too
     this.inside = false;
@@ -20,7 +20,7 @@ export class Pick extends Program {
     this.measured = [];
     this.on("state", (fields) => this.update(fields));
     this.build();
-    addEventListener("keydown", (event) => this.key(event));
+    this.onWindow("keydown", (event) => this.key(event));
   }
 
   build() {
@@ -86,7 +86,8 @@ export class Pick extends Program {
       const marks = panes.map((pane) => make("span", { class: name in pane.places ? "sk-on" : name in pane.predicted ? "sk-guess" : "sk-off",
         title: name in pane.places ? "set" : name in pane.predicted ? "predicted" : "not set" }));
       const far = panes[1] && name in panes[1].places && name in panes[1].predicted ? distance(panes[1].places[name], panes[1].predicted[name]) : null;
-      const item = make("li", { "aria-current": name === chosen ? "true" : null, tabindex: 0, onclick: (event) => this.choose(name, event) },
+      const item = make("li", { "aria-current": name === chosen ? "true" : null, tabindex: 0, onclick: (event) => this.choose(name, event),
+        onkeydown: (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); event.stopPropagation(); this.choose(name, event); } } },
         make("span", { class: "sk-dots" }, ...marks), make("span", {}, name),
         far === null ? "" : make("small", { title: "from where it was predicted" }, `${(1000 * far).toFixed(0)} mm`));
       return item;

@@ -1,26 +1,33 @@
 // What programs share: a panel beside the figure, the connection to Python, notes and progress.
-import { connect } from "./connection.js";
 import { Figure, make } from "./figure.js";
 import { unpackScene } from "./unpack.js";
 import { hasWebGL } from "./pane.js";
 
 export class Program {
-  constructor() {
-    document.body.classList.add("sk-program");
+  constructor(connection, page) {
+    this.connection = connection;
+    this.page = page;                                   // its number, where there are several, and the one to go back to
+    this.ending = new AbortController();
+    document.body.className = "sk-program";
     this.panel = make("aside", { class: "sk-panel" });
     this.stage = make("div", { class: "sk-stage" });
     this.status = make("p", { class: "sk-status", role: "status" });
     this.progress = make("progress", { hidden: true });
-    document.body.append(make("main", { class: "sk-main" }, this.panel,
-      make("section", { class: "sk-view" }, this.stage, make("footer", {}, this.progress, this.status))));
+    this.main = make("main", { class: "sk-main" }, this.panel,
+      make("section", { class: "sk-view" }, this.stage, make("footer", {}, this.progress, this.status)));
+    document.body.append(this.main);
     this.answers = {};
     this.theme();
     if (!hasWebGL()) this.say("This browser has no WebGL, so that bodies cannot be shown. Another browser, or its settings, may help.", "bad");
   }
 
-  start() {
-    this.connection = connect((message) => this.received(message), (state) => this.connected(state));
-    return this;
+  // Listen to the whole window until another program takes this one's place.
+  onWindow(kind, answer) { addEventListener(kind, answer, { signal: this.ending.signal }); }
+
+  end() {
+    this.ending.abort();
+    if (this.figure) this.figure.playing = false;
+    this.main.remove();
   }
 
   theme() {
@@ -31,12 +38,20 @@ export class Program {
         document.documentElement.dataset.theme = now === "dark" ? "light" : "dark";
         this.figure?.panes.forEach((pane) => pane.redraw());
       } }, "◐");
-    this.panel.append(make("header", {}, make("h1", {}, document.title), button));
+    this.panel.append(make("header", {}, make("h1", {}, this.page.title), button));
+    if (this.page.back) {
+      this.panel.append(make("button", { type: "button", class: "sk-back", title: `back to “${this.page.back}”`,
+        onclick: () => this.send("leave") }, `← ${this.page.back}`));
+    }
   }
 
   on(kind, answer) { this.answers[kind] = answer; }
 
-  send(kind, fields = {}, latest = "", data = undefined) { this.connection.send(kind, fields, data, latest); }
+  // Python drops what is for a page that was left meanwhile.
+  send(kind, fields = {}, latest = "", data = undefined) {
+    const { number } = this.page;
+    this.connection.send(kind, number === undefined ? fields : { ...fields, page: number }, data, latest);
+  }
 
   // Messages one after the other: a scene takes a moment to unpack, and what comes after belongs to it.
   received(message) {
@@ -45,6 +60,7 @@ export class Program {
   }
 
   async answer(message) {
+    if (this.ending.signal.aborted) return;
     if (message.kind === "scene") await this.show(message.data, message.fields);
     else if (message.kind === "positions") this.move(message);
     else if (message.kind === "error") this.say(message.fields.text, "bad");
@@ -65,9 +81,13 @@ export class Program {
 
   async show(data, fields) {
     const scene = await this.unpack(data, fields);
-    const before = this.figure?.panes.map((pane) => pane.view());
+    if (this.ending.signal.aborted) return;
+    const before = this.figure?.panes.map((pane) => pane.view()), choices = this.figure?.choices();
     this.figure = new Figure(this.stage, scene, this.linked ?? true);
-    if (before?.length === scene.panes.length) this.figure.panes.forEach((pane, i) => pane.restore(before[i]));
+    if (before?.length === scene.panes.length) {
+      this.figure.panes.forEach((pane, i) => pane.restore(before[i]));
+      this.figure.choose(choices);
+    }
     this.shown?.(this.figure);
   }
 

@@ -1,5 +1,6 @@
 // `scape view`: what was named, side by side or laid over each other; models with sliders, motions with their markers.
 import { Plane, Vector3 } from "three";
+import { dropZone } from "./drop.js";
 import { choice, make } from "./figure.js";
 import { millimetres } from "./layer.js";
 import { button } from "./pick.js";
@@ -9,19 +10,22 @@ const FIRST = 10;                    // sliders of the shape that are there befo
 const STILL = 4;                     // pixels that a hand moves while it clicks
 const NEAR = 12;                     // pixels from a marker that tell of it
 const DEGREE = Math.PI / 180;
+const EMPTY = [["To begin", "drop files anywhere on this page, or choose them with the button “drop files here, or choose”."],
+  ["To look", "meshes (PLY, OBJ, STL, OFF, GLB), point clouds (PLY, XYZ, PCD), models and motions (.npz), markers (C3D, TRC, CSV); landmarks after their mesh."],
+  ["To complete a scan", "drop it: a mesh, a cloud, or a depth picture (16-bit PNG) with its camera (NAME.camera.json). Without a model of your own that of the synthetic people is taken."]];
 const KEYS = [["d", "drag bodies, or turn the view"], ["b, p", "random body, pose"], ["r", "reset"], ["space", "play, pause"],
   [", and .", "a frame back, forward"], ["arrows", "move the slider that has the focus"]];
 
 export class View extends Program {
-  constructor() {
-    super();
+  constructor(connection, page) {
+    super(connection, page);
     document.body.classList.add("sk-looking");
     this.markers = [];
     this.count = FIRST;
     this.on("state", (fields) => this.update(fields));
     this.on("residuals", (fields, data) => this.addMarkers({ ...fields, values: new Float32Array(data.slice().buffer) }));
     this.build();
-    addEventListener("keydown", (event) => this.key(event));
+    this.onWindow("keydown", (event) => this.key(event));
   }
 
   answer(message) {
@@ -45,10 +49,34 @@ export class View extends Program {
       button("save body", "write the mesh, beside what is there", () => this.send("save_body")),
       button("save pose", "write the pose as a motion file of one frame", () => this.send("save_pose")));
     this.notes = make("div", { class: "sk-notes" });
+    this.scan = choice("scan", [], () => {});
+    this.model = choice("model", [], () => {});
+    this.completion = make("fieldset", { class: "sk-sliders", hidden: true }, make("legend", {}, "the whole body from a scan"), this.scan, this.model,
+      button("complete this scan", "click a few landmarks on it and find the whole body", () => this.complete()));
+    this.folders = make("div", { class: "sk-buttons" });
     this.saved = make("p", { class: "sk-file" });
     this.models = make("div", { class: "sk-models", hidden: true }, this.shape, this.pose, this.buttons);
-    this.panel.append(this.list, this.notes, this.models, this.saved,
+    this.panel.append(dropZone(this, "drop files here, or choose"), this.list, this.notes, this.completion, this.folders, this.models, this.saved,
       make("details", {}, make("summary", {}, "keys"), make("dl", {}, ...KEYS.flatMap(([key, what]) => [make("dt", {}, key), make("dd", {}, what)]))));
+  }
+
+  // What can be opened: a choice is kept for as long as it is there, and a new scan is chosen.
+  offer({ folders, scans, models }) {
+    this.completion.hidden = !scans.length;
+    renew(this.scan, scans.map((i) => [i, this.entries[i].name]));
+    renew(this.model, models.map(({ path, name }) => [path, `with ${name}`]));
+    this.folders.replaceChildren(...folders.map(({ page, folder, label }) =>
+      button(label, folder, () => this.send("enter", { what: page, folder }))));
+  }
+
+  complete() {
+    this.say("opening the scan");
+    this.send("enter", { what: "complete", scan: Number(this.scan.value), model: this.model.value });
+  }
+
+  // What a page says that has nothing to show yet.
+  tellEmpty() {
+    this.stage.replaceChildren(make("div", { class: "sk-empty" }, ...EMPTY.map(([what, how]) => make("p", {}, make("strong", {}, `${what}: `), how))));
   }
 
   // A labelled slider from minus to plus a limit, with its number.
@@ -87,6 +115,11 @@ export class View extends Program {
   update(state) {
     const { entries, notes, problems, saved, parts, models } = state;
     this.entries = entries;
+    this.list.hidden = !entries.length;
+    if (!entries.length) this.tellEmpty();
+    this.offer(state.pages);
+    this.work(state.working);
+    if (!state.working && (state.note || this.status.dataset.kind !== "bad")) this.say(state.note);
     this.list.replaceChildren(...entries.map((entry, i) => this.entry(entry, i)));
     this.notes.replaceChildren(...problems.map((text) => make("p", { class: "sk-bad" }, text)),
       ...notes.map((text) => make("p", {}, text)));
@@ -257,6 +290,16 @@ export class View extends Program {
     const action = this.shownModels?.length && actions[event.key] || time && !event.target.matches("[type=checkbox]") && moving[event.key];
     if (action) { event.preventDefault(); action(); }
   }
+}
+
+// Other options of a list, [value, text]: the last that is new is chosen, else what was.
+function renew(select, options) {
+  const before = [...select.options].map((option) => [option.value, option.text]);
+  if (String(before) === String(options)) return;
+  const known = before.map(([, text]) => text), chosen = known[select.selectedIndex];
+  const fresh = options.findLastIndex(([, text]) => !known.includes(text));
+  select.replaceChildren(...options.map(([value, text]) => make("option", { value }, text)));
+  select.selectedIndex = fresh >= 0 ? fresh : Math.max(0, options.findIndex(([, text]) => text === chosen));
 }
 
 function middle({ positions, count, hidden }) {

@@ -1,0 +1,177 @@
+"""`scape view`: what files are, what cannot be shown, the same in a notebook."""
+import json
+import warnings
+
+import numpy as np
+import pytest
+from browser import wait_until
+from completion_bodies import worm_with_prior
+from viewing_apps import a_motion, app_of, ask, write_files
+
+from completion.__main__ import main
+from completion.partial.completion import Completion, save_completion
+from completion.viewing.contents import Stance
+from completion.viewing.notebook import view
+from scanprep import RegisteredSet, write_mesh
+from scanprep.geometry.mesh import Mesh
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_with_prior()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, model):
+    return write_files(tmp_path_factory.mktemp("view"), model)
+
+
+def test_kinds_are_told_by_content(files, tmp_path, model):
+    (tmp_path / "walk.model").write_bytes((files / "worm.npz").read_bytes())
+    (tmp_path / "old").write_bytes((files / "wave.npz").read_bytes())
+    app = app_of(tmp_path, "walk.model", "old")
+    assert [one.name for one in app.controls.shown] == ["walk.model"]
+    assert len(app.shown) == 2 and not app.problems
+
+
+def test_landmarks_beside_a_mesh_are_shown_with_it(files):
+    app = app_of(files, "body.ply", "cloud.xyz")
+    mesh, cloud = app.contents[0], app.contents[1]
+    assert [shape.name for shape in mesh.shapes] == ["", "landmarks"]
+    assert mesh.shapes[1].labels == ("head", "tail")
+    assert len(cloud.shapes[0].points) == len(mesh.shapes[0].mesh.vertices)
+
+
+def test_a_file_beside_that_has_no_landmarks_hides_nothing(files, tmp_path):
+    (tmp_path / "body.ply").write_bytes((files / "body.ply").read_bytes())
+    (tmp_path / "body.json").write_text('{"kind": "statue"}')
+    content = app_of(tmp_path, "body.ply").contents[0]
+    assert len(content.shapes) == 1 and "body.json" in content.notes[0]
+
+
+def test_landmarks_and_layouts_are_laid_on_what_was_named_before(files, tmp_path, model):
+    layout = {"markersets": [{"type": "body", "distance_from_skin": 0.01, "indices": {"A": 3, "B": 40}}]}
+    (tmp_path / "layout.json").write_text(json.dumps(layout))
+    (tmp_path / "body.ply").write_bytes((files / "body.ply").read_bytes())
+    app = app_of(tmp_path, "body.ply", "layout.json")
+    dots = app.contents[0].shapes[1]
+    assert dots.labels == ("A", "B")
+    assert np.allclose(np.linalg.norm(dots.points - model.template.vertices[[3, 40]], axis=1), 0.01, atol=1e-9)
+    with pytest.raises(ValueError, match=r"layout.json: landmarks and layouts"):
+        app_of(tmp_path, "layout.json")
+
+
+def test_a_registered_set_is_a_list_with_the_first_shown(model, tmp_path):
+    made = RegisteredSet.create(tmp_path / "set", model.template)
+    for i in range(3):
+        made = made.add(f"scan{i}", model.template.vertices + i)
+    app = app_of(tmp_path, "set")
+    assert [entry.name for entry in app.entries] == ["scan0", "scan1", "scan2", "template"]
+    assert app.shown == [0]
+    told = ask(app, "show", entries=[1, 2])
+    assert [message.kind for message in told] == ["scene", "state"] and app.shown == [1, 2]
+
+
+def test_more_than_twelve_files_are_a_list(model, tmp_path):
+    for i in range(14):
+        write_mesh(tmp_path / f"m{i:02}.ply", model.template)
+    app = app_of(tmp_path, ".")
+    assert len(app.entries) == 14 and app.shown == [0]
+    with pytest.raises(ValueError, match="at most 12"):
+        ask(app, "show", entries=list(range(14)))
+
+
+def test_a_completion_has_its_errors_as_heat(model, tmp_path):
+    mesh, N = model.template, len(model.template.vertices)
+    done = Completion(mesh, mesh, np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.arange(N) < 50, rms=0.0, explained=1.0,
+                      landmark_rms=0.0, converged=True, iterations=3, energies={}, scale=1.0,
+                      expected_error=np.linspace(0, 0.05, N), confidence=np.ones(N))
+    (tmp_path / "done").mkdir()
+    save_completion(tmp_path / "done", done)
+    content = app_of(tmp_path, "done").contents[0]
+    assert set(content.shapes[0].shades) == {"seen", "expected error"}
+    assert [shape.visible for shape in content.shapes] == [True, False]
+
+
+REFUSED = {
+    "nothing.ply": (None, "nothing.ply: no such file"),
+    "empty.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\n"
+                  b"end_header\n", "empty.ply"),
+    "nan.obj": (b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "nan.obj"),
+    "notes.docx": (b"hello", "notes.docx: expected a mesh"),
+    "text.ply": (b"hello", "text.ply"),
+    "cut.npz": (b"PK\x03\x04broken", "cut.npz: expected"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_shown_is_refused_in_one_line(name, tmp_path, capsys):
+    data, line = REFUSED[name]
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    assert main(["view", str(tmp_path / name), "--serve", "0"]) == 1
+    told = capsys.readouterr().err
+    assert line in told and len(told.strip().splitlines()) == 1 and "unforeseen" not in told
+
+
+def test_a_bad_file_among_good_ones_is_told_of(files, tmp_path):
+    (tmp_path / "bad.ply").write_text("no mesh")
+    (tmp_path / "good.ply").write_bytes((files / "body.ply").read_bytes())
+    app = app_of(tmp_path, "bad.ply", "good.ply")
+    assert app.shown == [1] and "bad.ply" in app.problems[0]
+    assert "bad.ply" in app.state().fields["problems"][0]
+
+
+def test_a_scan_in_millimetres_is_noted(tmp_path, model):
+    write_mesh(tmp_path / "mm.ply", Mesh(1000 * model.template.vertices, model.template.faces))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        app = app_of(tmp_path, "mm.ply")
+    assert "unit='mm'" in app.state().fields["notes"][0] and "unit='mm'" in str(caught[0].message)
+    assert not app_of(tmp_path, "mm.ply", unit="mm").state().fields["notes"]
+
+
+def test_many_triangles_are_thinned(tmp_path):
+    n = 400
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 2, n), indexing="ij")
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([i, i + n, i + 1], 1), np.stack([i + 1, i + n, i + n + 1], 1)])
+    write_mesh(tmp_path / "many.ply", Mesh(np.stack([x, y, 0.1 * np.sin(9 * x)], -1).reshape(-1, 3), faces))
+    content = app_of(tmp_path, "many.ply").contents[0]
+    assert len(content.shapes[0].mesh.faces) < 200_000 < len(faces)
+    assert "fewer" in content.notes[0] and f"{len(faces):,} triangles" in content.about
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_bodies_stand_whatever_axis_is_up(model, axis, sign):
+    up = sign * np.eye(3)[axis]
+    stance = Stance(np.array([[0, 0, 0], [1.0, 2, 3]]), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
+    camera = stance.camera(up)
+    assert np.allclose(camera.axes @ camera.axes.T, np.eye(3)) and np.linalg.det(camera.axes) > 0
+    assert camera.axes[1] @ up > 0.9 and camera.axes[2] @ up > 0         # from a little above
+    assert np.allclose(camera.vertical, up)
+
+
+def test_a_notebook_shows_what_turns_without_a_network(model, new_page, tmp_path):
+    subject, motion = model.subject(np.array([0.5, -1.0])), a_motion(20)
+    shown = view(model.template, model.template.vertices, model, subject, (motion, subject))
+    assert len(shown._repr_html_()) < 2_000_000
+    (tmp_path / "notebook.html").write_text(f"<body>{shown._repr_html_()}</body>", encoding="utf-8")
+    page = new_page(offline=True)
+    page.goto((tmp_path / "notebook.html").as_uri())
+    frame = page.frames[-1]
+    wait_until(page, "Boolean(document.querySelector('iframe').contentDocument.querySelector('figure')?.sk)", 20)
+    assert frame.evaluate("document.querySelector('figure').sk.panes.length") == 5
+    assert not page.errors and all(url.startswith(("file:", "about:", "data:", "blob:")) for url in page.requests)
+
+
+def test_a_notebook_shows_files_and_refuses_the_rest(files):
+    assert [content.name for content in view(files / "body.ply", str(files / "worm.npz")).contents] == [
+        "body.ply", "worm.npz"]
+    with pytest.raises(ValueError, match="got dict"):
+        view({})
+    with pytest.raises(ValueError, match="got nothing"):
+        view()
+    with pytest.raises(ValueError, match="up: expected one of"):
+        view(files / "body.ply", up="w")
