@@ -176,7 +176,7 @@ class Files:
         if (folder / SET).is_file():
             yield from self._of_set(folder, name)
         elif is_statue(folder):
-            yield Entry(name, lambda: read_statue(name, folder))
+            yield Entry(name, lambda: read_statue(name, folder), True, folder, "statue", folder)
         elif (folder / COMPLETION).is_file():
             yield Entry(name, lambda: of_completion(name, load_completion(folder)), True, folder, "completion", folder)
         elif (folder / MOTION).is_file():

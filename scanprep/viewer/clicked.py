@@ -132,7 +132,7 @@ def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], bod
     corners = template.faces[nearest.faces]
     vertices = corners[np.arange(len(corners)), nearest.bary.argmax(axis=1)]
     of_name = dict(zip(on_template, vertices.tolist(), strict=True))
-    config = RegistrationConfig()              # without its last steps: half the time, and 5 mm instead of 4
+    config = RegistrationConfig()              # without its last steps: two thirds of the time, 7 mm instead of 6
     config = replace(config, graph=config.graph[:-1], final_fit=None)
     fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
                                           np.array([on_scan[name] for name in common])), config, progress)

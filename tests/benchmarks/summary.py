@@ -187,10 +187,13 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "predicted_landmarks": ("Landmarks predicted after four clicks",
                             "python tests/benchmarks/predicted_landmarks.py", predicted_landmarks,
                             "What `scape pick` offers when hands and toes were clicked, without error, on a virtual "
-                            "scan; the template is mesh000. Beside other work. PREDICTED_NOTE"),
+                            "scan; the template is mesh000. Beside other work. Where we lose: the deep squat "
+                            "of pose 7, where it means nothing, and men of another shape than the template's. With all "
+                            "steps of registration (`--full`) medians of seven of the poses are 6.2 mm instead of 7.2 "
+                            "on average, in 11.5 s instead of 7.7."),
     "fronts": ("The front of a body in pictures", "python tests/benchmarks/fronts.py", fronts,
-               "Against the direction square to hips, shoulders and waist. Where we lose: bodies that sit, squat or "
-               "kneel, whose feet are not below them."),
+               "Against the level direction square to hips, shoulders and waist. The last column numbers the poses "
+               "that are beyond 60 degrees."),
     "signatures": ("Where the skin belongs", "python tests/benchmarks/signatures.py", signatures,
                    "Mean curvature of the template and of the true posed surface at the places of its vertices; the "
                    "poses are those for tuning. Ours lie some 10 mm from the reference, and by this measure nearer to "

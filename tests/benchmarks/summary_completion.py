@@ -201,7 +201,14 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "worn_markers": (
         "Markers clicked on a scan of the person who wears them",
         "python tests/benchmarks/worn_markers.py", worn_markers,
-        "WORN_NOTE"),
+        "Seven landmarks, all clicks without error, `cmu41`. The SCAPE man as an unknown person shows how differently "
+        "two sets of scans were registered along the skin: the shapes of this model are SPRING men. `flagged`: scans "
+        "whose completion is not judged good. Registration instead (`--register`), all around, means of the poses 2, "
+        "17 and 22: the template, which is this very man, 7.0, 10.7 and 10.0 mm where the completion of the known man "
+        "has 7.8, 11.7 and 12.8 (all 41 markers); of three SPRING men 16.3, 16.7 and 15.0 mm where it has 8.8, 9.2 and "
+        "8.1. The body at rest that the completion found, registered: 9.3, 10.6 and 10.3 mm, and 7.9 and 8.5 for two "
+        "of the men, in two to three times the time. Where we lose: places on a limb that is rolled about its axis, "
+        "and the trunk of bent bodies. Beside other work on two cores."),
     "viewer_speed": (
         "Sliders of a model in the browser",
         "python tests/benchmarks/viewer_speed.py -m MODEL", viewer_speed,

@@ -165,8 +165,8 @@ def predicted_landmarks(report: dict) -> str:
     for kind in dict.fromkeys(r["kind"] for r in report["rows"]):
         mine = [r for r in report["rows"] if r["kind"] == kind]
         every = np.concatenate([list(r["apart_mm"].values()) for r in mine])
-        rows.append((f"all {kind}s", float(np.median(every)), float(np.quantile(every, 0.9)), float(every.max()), "",
-                     f"{(every <= 10).mean():.0%}", float(np.mean([r["cpu_s"] for r in mine]))))
+        rows.append((f"all scans of a {kind}", float(np.median(every)), float(np.quantile(every, 0.9)),
+                     float(every.max()), "", f"{(every <= 10).mean():.0%}", float(np.mean([r["cpu_s"] for r in mine]))))
     return table(("scan", "median (mm)", "nine of ten within (mm)", "worst (mm)", "the worst", "within 10 mm",
                   "time (s CPU)"), rows)
 

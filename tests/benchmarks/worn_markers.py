@@ -4,10 +4,10 @@
         [--register] [--json FILE]
 
 The 41 markers of `cmu41` are at vertices of a body, are clicked without error on a virtual scan of it (four views all
-around, or one half view), and carried to the model by completing the scan from seven landmarks. Of half views only the
-markers in sight count. Errors are distances on the model's template. Bodies: held-out poses of the SCAPE man as a known
-and as an unknown person, held-out SPRING men, whose own registration is good to about a centimetre along the skin,
-and synthetic people with the model of `scape complete`, whose every vertex is true.
+around, or one half view), and carried to the model by completing the scan from seven landmarks. Only markers in sight
+count. Errors are distances on the model's template. Bodies: held-out poses of the SCAPE man as a known and as an
+unknown person, held-out SPRING men, whose own registration is good to about a centimetre along the skin, and synthetic
+people with the model of `scape complete`, whose every vertex is true.
 
 Without a model it is learned first: 182 SPRING men and the SCAPE poses of the other folds. `--register` carries the
 markers by registration too: of the model's template, and of the body at rest that the completion found.
@@ -37,6 +37,8 @@ from scanprep.skeleton.find import find_skeleton
 from scanprep.synthetic.people import BodyShape, Person, random_pose
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
+CLICKABLE = 0.005                    # metres from the place of a marker to the scan
+
 
 class Case(NamedTuple):
     """A scan of somebody whose markers are known."""
@@ -56,10 +58,17 @@ def views_of(what: str, name: str, model: BodyModel, known: bool, layout: Marker
              landmarks: tuple[np.ndarray, np.ndarray], k: int, names: dict[str, int]) -> Iterator[Case]:
     """All around, and from one side."""
     yield Case(f"{what}, all around", name, model, known, layout, truth, whole, landmarks,
-               np.ones(len(layout.labels), dtype=bool))
+               in_sight(layout, truth, whole))
     half = half_view(truth, k, names, np.random.default_rng(k))
     yield Case(f"{what}, half view", name, model, known, layout, truth, half.points, half.landmarks,
                half.seen[layout.nearest])
+
+
+def in_sight(layout: MarkerLayout, truth: Mesh, scan: Mesh) -> np.ndarray:
+    """(L,) whether the scan shows the place of a marker, and not the skin of something that touches it."""
+    there = Surface(scan).closest(layout.skin_points(truth.vertices))
+    facing = np.einsum("ld,ld->l", scan.face_normals[there.faces], truth.vertex_normals[layout.nearest])
+    return (there.distances < CLICKABLE) & (facing > 0)
 
 
 def real_cases(data: RealData, model: BodyModel, kind: str, numbers: list[int]) -> Iterator[Case]:
