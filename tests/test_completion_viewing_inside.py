@@ -108,6 +108,10 @@ def test_dropped_files_join_the_things_and_take_each_others_place(app, files, tm
     with pytest.raises(ValueError, match=r"half\.ply"):
         drop(app, tmp_path / "half.ply")
     assert app.number == scene and len(app.contents[0].shapes[0].points) == 3 and app.shown == [0, 1]
+    (tmp_path / "worm.npz").write_bytes((files / "worm.npz").read_bytes()[:3000])
+    with pytest.raises(ValueError, match=r"^worm\.npz: expected"):
+        drop(app, tmp_path / "worm.npz")
+    assert [path.name for path in app.files.models] == ["worm.npz"] and app.controls.betas[0] == 1.5
     with pytest.raises(ValueError, match=r"notes\.docx: expected a mesh"):
         (tmp_path / "notes.docx").write_text("hello")
         drop(app, tmp_path / "notes.docx")

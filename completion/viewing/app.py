@@ -142,44 +142,47 @@ class ViewApp:
     def join(self, path: Path) -> None:
         """Show the things of one more file or folder with the others; ValueError, and all as before, where none can be.
 
-        What is known of things that stay is kept; those that were shown and were read anew are shown again.
+        What is known of things that stay is kept; those that were shown and have changed are shown again.
         """
-        before = vars(self).copy()
-        old, self.entries = self.entries, self.files.with_another(self.entries, path)
-        fresh = [i for i, entry in enumerate(self.entries) if entry not in old]
-        place = {i: self.entries.index(entry) for i, entry in enumerate(old) if entry in self.entries}
+        before = [(one, vars(one).copy()) for one in (self, self.files)]
+        try:
+            self._join(self.files.with_another(self.entries, path))
+        except (ValueError, OSError):
+            for one, kept in before:
+                vars(one).update(kept)
+            raise
+
+    def _join(self, entries: list[Entry]) -> None:
+        place = {i: entries.index(entry) for i, entry in enumerate(self.entries) if entry in entries}
+        fresh = [i for i in range(len(entries)) if i not in place.values()]
         for name in ("problems", "contents", "bodies", "_about"):
             setattr(self, name, {place[i]: one for i, one in getattr(self, name).items() if i in place})
-        again = {old[i].path for i in self.shown if i not in place}
-        new = [i for i in fresh if self.entries[i].path in again] or [i for i in fresh if self.entries[i].first]
+        changed = {self.entries[i].path for i in self.shown if i not in place}
+        new = [i for i in fresh if entries[i].path in changed] or [i for i in fresh if entries[i].first] or fresh[:1]
+        self.entries = entries
         read = self._read(sorted([*(place[i] for i in self.shown if i in place), *new][-MOST:]))
         if not set(new) & set(read):
-            problem = self.problems[new[0]]
-            vars(self).update(before)
-            raise ValueError(problem)
+            raise ValueError(self.problems[new[0]])
         self._arrange(read)
 
     # pages inside
 
     def enter(self, send: Send, wanted: Mapping[str, Any]) -> App:
-        """The page of a folder, or the completion of one of the scans by one of the models."""
-        self.note = ""
-        if wanted["what"] != "complete":
-            return self.inside.folder_page(wanted["what"], wanted["folder"], self.entries)
-
+        """The page that a button asks for."""
         def progress(done: int, total: int) -> None:
             self.working = ("building the synthetic people", done, total)
             send(self.state())
 
+        self.note = ""
         try:
-            return self.inside.completion(self.entries[int(wanted["scan"])], wanted["model"], progress)
+            return self.inside.enter(self.entries, wanted, progress)
         finally:
             self.working = None
 
     def returned(self, app: App) -> None:
         """What a page has written joins the things that are shown."""
         for folder in self.inside.written(app):
-            if folder not in self.written:
+            if folder not in [entry.folder for entry in self.entries]:
                 self.written.append(folder)
             self.join(folder)
 
@@ -235,6 +238,7 @@ class ViewApp:
 
     def close(self) -> None:
         """Forget what was dropped; all else that was wanted was saved."""
+        self.written += [folder for page in self.inside.completions for folder in self.inside.written(page)]
         self.dropped.close()
 
     def _tell_all(self, send: Send) -> None:

@@ -17,6 +17,7 @@ from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import Dots
 from scanprep.viewer.clicked import read_surface
+from scanprep.viewer.dropped import with_camera
 
 from ..mocap.files.markers import MarkerSequence, read_markers
 from ..motion import Motion
@@ -76,7 +77,12 @@ class Files:
             if not path.exists():
                 raise ValueError(f"{path}: no such file or folder")
             if is_camera(path):                          # which is read with its picture
-                continue
+                picture, lacks = with_camera(path)
+                if lacks:
+                    raise ValueError(f"{path}: expected its depth picture, {picture.name}, beside it; there is none")
+                if picture in self.paths:
+                    continue
+                path = picture
             if path.name.lower().endswith(PLACES):
                 self._lay_on(found, path)
             else:
@@ -89,6 +95,8 @@ class Files:
     def with_another(self, entries: Sequence[Entry], path: Path) -> list[Entry]:
         """Entries and those of one more file or folder, in the place of those that it had; ValueError as `entries`."""
         self._models.pop(path.resolve(), None)
+        self._found = [one for one in self._found if one != path]
+        self._recordings = [one for one in self._recordings if one != path]
         if path.name.lower().endswith(PLACES):
             found = list(entries)
             beside = [i for i, entry in enumerate(found) if landmarks_beside(entry.path) == path]
@@ -131,8 +139,8 @@ class Files:
         if kind not in loads:
             raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks, a depth picture "
                              f"or a folder, found {kind}")
-        of_kind = {"model": self._found, "markers": self._recordings}.get(kind, [])
-        of_kind.append(path)
+        self._found = [*self._found, *[path] * (kind == "model")]
+        self._recordings = [*self._recordings, *[path] * (kind == "markers")]
         return Entry(name, loads[kind], kind != "markers" or not self.over, path, kind)
 
     def _surface(self, path: Path, name: str) -> Content:

@@ -1,7 +1,7 @@
 """Pages that are reached from the view: which things offer which, and the apps that were opened."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from .files import SET, Entry, Files
 from .saving import free_name
 
 PEOPLE = "synthetic people"          # the model of those who have none
+Progress = Callable[[int, int], None]
 SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
 
@@ -92,17 +93,21 @@ class Inside:
                 "models": [{"path": "", "name": PEOPLE},
                            *({"path": str(path), "name": path.name} for path in self.files.models)]}
 
-    def folder_page(self, page: str, name: str, entries: Sequence[Entry]) -> App:
-        """A page of the folder of this name that entries are of."""
-        folder = next((entry.folder for entry in entries if str(entry.folder) == name), None)
-        if page not in FOLDER_PAGES or folder is None:
-            raise ValueError(f"page: expected one that the list of things offers, got {page} of {name}")
-        if (page, folder) not in self.opened:
-            self.opened[page, folder] = FOLDER_PAGES[page].make(folder)
-        return self.opened[page, folder]
+    def enter(self, entries: Sequence[Entry], wanted: Mapping[str, Any], progress: Progress) -> App:
+        """What was asked for of things: a page of a folder, or the completion of a scan.
 
-    def completion(self, scan: Entry, model: str, progress: Callable[[int, int], None]) -> App:
-        """Completion of a scan by the model in a file, or, where that is "", of the synthetic people."""
+        `wanted` has "what", the page, and either "folder", or "scan", its number, and "model", a file or "".
+        """
+        if wanted["what"] == "complete":
+            return self._completion(entries[int(wanted["scan"])], wanted["model"], progress)
+        what, folder = wanted["what"], next((e.folder for e in entries if str(e.folder) == wanted["folder"]), None)
+        if what not in FOLDER_PAGES or folder is None:
+            raise ValueError(f"page: expected one that the list of things offers, got {what} of {wanted['folder']}")
+        if (what, folder) not in self.opened:
+            self.opened[what, folder] = FOLDER_PAGES[what].make(folder)
+        return self.opened[what, folder]
+
+    def _completion(self, scan: Entry, model: str, progress: Progress) -> App:
         if scan.kind not in SCANS:
             raise ValueError(f"{scan.name}: expected a scan, found {scan.kind}")
         path = next((path for path in self.files.models if str(path) == model), None)
@@ -115,7 +120,7 @@ class Inside:
         page.open(scan)
         return page
 
-    def _complete_page(self, path: Path | None, progress: Callable[[int, int], None]) -> CompletePage:
+    def _complete_page(self, path: Path | None, progress: Progress) -> CompletePage:
         if path is None:
             from ..synthetic_people import synthetic_model
 
@@ -125,6 +130,11 @@ class Inside:
         body = model if model.n_betas else model.subject(None)
         work = Work(body, name, marks_of_template(model, None, name), CompletionConfig(), self.files.unit)
         return CompletePage(model, work, self.output, self.dropped)
+
+    @property
+    def completions(self) -> list[CompletePage]:
+        """Those that were opened."""
+        return [page for page in self.opened.values() if isinstance(page, CompletePage)]
 
     def written(self, app: App) -> list[Path]:
         """Folders that a page has written to since this was last asked."""
