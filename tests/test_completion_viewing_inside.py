@@ -133,7 +133,8 @@ def test_a_depth_picture_is_shown_from_its_camera_and_completed(app, files, mode
     state = drop(app, files / "one.camera.json", files / "worm.npz")
     assert [entry["name"] for entry in state["entries"]] == ["one.png", "worm.npz"] and not state["note"]
     camera = app.cameras[0]
-    assert np.allclose(camera.axes, np.diag([1.0, -1, -1])) and camera.position[2] < 0
+    assert np.allclose(camera.axes, np.diag([1.0, -1, -1])) and np.allclose(camera.position, 0)      # its own place
+    assert camera.distance == pytest.approx(AWAY, abs=0.3)                    # one turns about the body
     page = entered(app, what="complete", scan=0, model=str(app.files.models[0]))
     there = body.vertices - TRANS
     there = there - there.mean(axis=0) + [0, 0, AWAY]
@@ -243,10 +244,11 @@ def test_an_empty_page_fits_a_telephone_and_is_used_by_keyboard(app, files, new_
         page.goto(server.opening())
         wait_until(page, "Boolean(window.program?.entries)")
         assert page.evaluate("document.documentElement.scrollWidth") <= 420
+        page.evaluate("document.querySelector('input[type=file]').onclick = () => { window.asked = true; return false; }")
         page.locator(".sk-drop").focus()
-        with page.expect_file_chooser() as chosen:
-            page.keyboard.press("Enter")
-        chosen.value.set_files([files / "one.camera.json", files / "one.png"])          # the picture is sent first
+        page.keyboard.press("Enter")
+        wait_until(page, "window.asked")
+        page.locator("input[type=file]").set_input_files([files / "one.camera.json", files / "one.png"])
         wait_until(page, "program.entries.length === 1 && program.figure?.panes[0].drawn > 0")
         page.locator("canvas").focus()
         before = page.evaluate("program.figure.panes[0].camera.position.toArray()")
