@@ -244,7 +244,7 @@ def test_an_empty_page_fits_a_telephone_and_is_used_by_keyboard(app, files, new_
         page.goto(server.opening())
         wait_until(page, "Boolean(window.program?.entries)")
         assert page.evaluate("document.documentElement.scrollWidth") <= 420
-        page.evaluate("document.querySelector('input[type=file]').onclick = () => { window.asked = true; return false; }")
+        page.evaluate("document.querySelector('[type=file]').onclick = () => { window.asked = true; return false; }")
         page.locator(".sk-drop").focus()
         page.keyboard.press("Enter")
         wait_until(page, "window.asked")
