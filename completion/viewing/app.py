@@ -125,7 +125,7 @@ class ViewApp(Things):
     def returned(self, app: App) -> None:
         """What a page has written joins the things that are shown."""
         for folder in self.inside.written(app):
-            if folder not in [entry.folder for entry in self.entries]:
+            if folder not in self.files.folders(self.entries):
                 self.written.append(folder)
             self.join(folder)
 

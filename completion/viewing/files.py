@@ -106,11 +106,17 @@ class Files:
                 self._lay_on(found, path)
             return found
         fresh = self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
-        old = [i for i, entry in enumerate(entries) if path in (entry.path, entry.folder)]
-        if old and len(fresh) > 1 and "/" not in entries[old[0]].name:
-            fresh = [replace(entry, name=entry.name.split("/", 1)[-1]) for entry in fresh]     # named as it was
+        old = [i for i, entry in enumerate(entries) if path in (entry.path, *entry.path.parents)]
+        shared = f"{path.resolve().name}/"
+        if old and not entries[old[0]].name.startswith(shared):                               # named as they were
+            fresh = [replace(entry, name=entry.name.removeprefix(shared)) for entry in fresh]
         place = old[0] if old else len(entries)
         return [*entries[:place], *fresh, *(entry for i, entry in enumerate(entries) if i > place and i not in old)]
+
+    def folders(self, entries: Sequence[Entry]) -> list[Path]:
+        """Those that commands wrote and entries are of, and those that were named."""
+        of_commands = [entry.folder for entry in entries if entry.folder is not None]
+        return list(dict.fromkeys([*of_commands, *(path for path in self.paths if path.is_dir())]))
 
     @property
     def models(self) -> list[Path]:

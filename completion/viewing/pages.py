@@ -25,10 +25,10 @@ SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
 @dataclass(frozen=True)
 class FolderPage:
-    """A page that folders offer: what its button says, files that tell such a folder, and how its app is made."""
+    """A page that folders offer: what its button says, whether a folder is one of them, and how its app is made."""
 
     label: str
-    files: tuple[str, ...]
+    offered: Callable[[Path], bool]
     make: Callable[[Path], App]
 
 
@@ -38,7 +38,11 @@ def _mend(folder: Path) -> App:
     return MendApp(folder, ENDING)
 
 
-FOLDER_PAGES = {"mend": FolderPage("mend landmarks of", (SET, RUN), _mend)}
+def _has(*names: str) -> Callable[[Path], bool]:
+    return lambda folder: all((folder / name).is_file() for name in names)
+
+
+FOLDER_PAGES = {"mend": FolderPage("mend landmarks of", _has(SET, RUN), _mend)}
 
 
 class CompletePage(CompleteApp):
@@ -86,9 +90,10 @@ class Inside:
 
     def offered(self, entries: Sequence[Entry]) -> dict[str, Any]:
         """What the buttons are: pages of folders, and the scans and models of a completion, by number of the entry."""
-        folders = list(dict.fromkeys(entry.folder for entry in entries if entry.folder is not None))
+        folders = [(folder, page, one) for folder in self.files.folders(entries)
+                   for page, one in FOLDER_PAGES.items() if one.offered(folder)]
         return {"folders": [{"page": page, "folder": str(folder), "label": f"{one.label} {folder.resolve().name}"}
-                            for folder in folders for page, one in FOLDER_PAGES.items() if _has(folder, one.files)],
+                            for folder, page, one in folders],
                 "scans": [i for i, entry in enumerate(entries) if entry.kind in SCANS],
                 "models": [{"path": "", "name": PEOPLE},
                            *({"path": str(path), "name": path.name} for path in self.files.models)]}
@@ -100,7 +105,8 @@ class Inside:
         """
         if wanted["what"] == "complete":
             return self._completion(entries[int(wanted["scan"])], wanted["model"], progress)
-        what, folder = wanted["what"], next((e.folder for e in entries if str(e.folder) == wanted["folder"]), None)
+        what, known = wanted["what"], self.files.folders(entries)
+        folder = next((folder for folder in known if str(folder) == wanted["folder"]), None)
         if what not in FOLDER_PAGES or folder is None:
             raise ValueError(f"page: expected one that the list of things offers, got {what} of {wanted['folder']}")
         if (what, folder) not in self.opened:
@@ -142,7 +148,3 @@ class Inside:
             fresh, app.fresh = app.fresh, []
             return list(dict.fromkeys(fresh))
         return [folder for (_, folder), other in self.opened.items() if other is app and folder is not None]
-
-
-def _has(folder: Path, files: tuple[str, ...]) -> bool:
-    return all((folder / name).is_file() for name in files)
