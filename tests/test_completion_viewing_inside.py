@@ -222,6 +222,11 @@ def test_from_an_empty_page_to_a_saved_body_and_back_by_mouse(app, files, body, 
         wait_until(page, "!program.state.working && program.figure?.panes.length === 3")
         page.get_by_label("colour", exact=True).select_option("expected error")
         page.get_by_label("predicted body").check()
+        page.evaluate("window.before = program.figure")
+        server.send(inner.scene())                                            # as after another completion
+        wait_until(page, "program.figure !== before")
+        assert page.get_by_label("predicted body").is_checked()               # what was chosen stays
+        assert page.get_by_label("colour", exact=True).input_value() == "expected error"
         assert page.locator(".sk-legend").inner_text().split("\n")[0] == "expected error"
         assert "mm" in page.locator(".sk-legend").inner_text()
         page.get_by_role("button", name="save").click()
