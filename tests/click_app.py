@@ -4,6 +4,8 @@ import threading
 import time
 from pathlib import Path
 
+import pytest
+
 from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server, Stopped
 
@@ -83,3 +85,27 @@ def until(what, seconds=5.0):
     while not what():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.01)
+
+
+@pytest.fixture
+def app(tmp_path):
+    """An app of clicks that gives away a folder, beside which there is a secret."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "body.ply").write_bytes(b"ply of a body")
+    (tmp_path / "secret.txt").write_text("secret")
+    return Clicks(tmp_path / "out")
+
+
+@pytest.fixture
+def server(app):
+    """Its server."""
+    with clicking(app) as server:
+        yield server
+
+
+def refused_in_one_line(server, status, got):
+    """Whether a request was refused with this status, and the terminal told in one clean line without the token."""
+    until(lambda: server.told)
+    line, = server.told
+    return (got == status and line.startswith("refused: ") and line.isprintable() and server.gate.token not in line
+            and "Traceback" not in line)

@@ -12,6 +12,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not 
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from browser import browser, new_page, page  # noqa: F401 -- fixtures
+from click_app import app, server  # noqa: F401 -- fixtures
 
 from scanprep.command_line import run
 

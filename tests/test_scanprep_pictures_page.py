@@ -77,6 +77,10 @@ def test_missing_numbers_show_as_a_dash():
     assert "<td class=\"number\">–</td>" in Page("x").table([(float("nan"),)]).html()
 
 
+def test_a_long_path_may_break_at_its_folders():
+    assert "<td>/scans/<wbr>anna.ply</td>" in Page("x").table([("/scans/anna.ply",)]).html()
+
+
 def test_a_chart_gives_the_same_bytes_every_time():
     from matplotlib.figure import Figure
 

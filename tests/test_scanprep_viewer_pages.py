@@ -120,6 +120,20 @@ def test_names_are_of_what_is_in_sight(shown):
     wait_until(shown, f"!{told}.length")
 
 
+def test_a_name_that_would_leave_the_picture_stands_on_the_other_side(shown):
+    pane = "document.querySelector('figure').sk.panes[0]"
+    box = f"{pane}.told.find((label) => label.text.startsWith('hand'))"
+    longer = shown.evaluate(f"""() => {{
+      const pane = {pane}, layer = pane.layers.find((one) => one.name === "marks"), wide = pane.canvas.width;
+      const longer = "hand" + "x".repeat(Math.ceil((wide - {box}.right) / pane.context.measureText("x").width) + 1);
+      layer.labels[2] = longer;
+      pane.redraw();
+      return longer;
+    }}""")
+    wait_until(shown, f"{box}?.text === '{longer}'")
+    assert shown.evaluate(f"{box}.left >= 0 && {box}.right <= {pane}.canvas.width")
+
+
 def test_every_frame_is_where_it_was(shown, report):
     _, scene = scenes_of(report.read_text())
     body, dots = (scene.frames(scene.layer(name)) for name in ("body", "dots"))

@@ -44,10 +44,11 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         scans: Mesh or point cloud, the views of one body, or a folder of scans; or one depth picture, a 16-bit PNG in
             millimetres with its camera beside it in NAME.camera.json.
         output: Folder to write completed.ply, predicted.ply, completion.npz and report.html to; completed.glb for a
-            scan with a texture.
+            scan with a texture; layout.json where markers were clicked too.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         landmarks: 4 to 10 named points on the scan; else the file of the scan's name beside it. Without any the
-            search starts from typical poses. For a folder of scans, the folder of such files.
+            search starts from typical poses. For a folder of scans, the folder of such files. Names that are not the
+            model's landmarks are markers that the person wears.
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,
             or a mesh in the model's triangles. Without it the shape is found too.
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
@@ -58,7 +59,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         up: The axis of the scan that points up, where it is known: people mostly stand. Of a depth camera that stands
             upright it is -y, written --up=-y, of one upside down y.
         interactive: In the browser: click landmarks, complete, look at the body from all sides, correct, save. A scan
-            can also be dropped on the page.
+            can also be dropped on the page. A recording of markers, named or dropped, tells which ones to click.
         config: Settings.
         workers: Who completes the scans of a folder.
     """
@@ -99,11 +100,14 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
     from scanprep.viewer.server import serve
 
     from .interactive import CompleteApp
+    from .worn import is_recording, labels_of
 
     loaded, name = read_model(model)
     marks = marks_of_template(loaded, template_landmarks, name)
+    labels = [label for path in scans for label in labels_of(path)]
+    scans = tuple(path for path in scans if not is_recording(path))
     files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]
-    app = CompleteApp(loaded, Work(_body(loaded, subject, unit), name, marks, config, unit), files, output)
+    app = CompleteApp(loaded, Work(_body(loaded, subject, unit), name, marks, config, unit), files, output, labels)
     serve(app)
     if not app.saved:
         return Outcome(None, [Metric("bodies saved", 0)], {"complete": config, "model": name})

@@ -22,6 +22,7 @@ from scanprep.pictures.scene import Pane, pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.dropped import Dropped, with_camera
+from scanprep.viewer.landmark_names import next_name
 from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
 from scanprep.viewer.surface_clicks import Clickable
@@ -29,6 +30,7 @@ from scanprep.viewer.surface_clicks import Clickable
 from .completion import Completion, complete
 from .report import completion_panes
 from .work import Inputs, ScanFiles, Work, figures, person_in, read_picture, read_views, write_results
+from .worn import labels_of, worn_markers, write_worn
 
 ENDING = ".landmarks.json"           # of landmark files
 FEWEST = 3                           # landmarks that say where a body is
@@ -57,12 +59,13 @@ class CompleteApp(PickApp):
     scans : paths
     output : folder that results are saved in, one for each scan where there are several
     dropped : where scans that are dropped are kept, for as long as the app, unless it is somebody else's
+    labels : of markers that the person wears, to be clicked too
     """
 
     name, title = "complete", "Complete a scan"
 
     def __init__(self, model: BodyModel, work: Work, scans: Sequence[Path], output: Path,
-                 dropped: Dropped | None = None) -> None:
+                 labels: Sequence[str] = (), dropped: Dropped | None = None) -> None:
         self.model, self.work, self.output = model, work, output
         self.dropped = dropped or Dropped()
         self._read: dict[Path, ScanFiles | DepthPicture] = {}
@@ -72,7 +75,7 @@ class CompleteApp(PickApp):
         self.can_choose = model.n_betas > 0
         template = Clicked(Path(work.model), output / "template.landmarks.json", surface=Clickable(model.template))
         marks = {name: model.template.vertices[vertex] for name, vertex in work.marks.items()}
-        super().__init__(template, [self._clicked(path) for path in scans], (), fixed=marks)
+        super().__init__(template, [self._clicked(path) for path in scans], labels, fixed=marks)
 
     def _clicked(self, path: Path) -> Clicked:
         """A scan; of one that was dropped the landmarks are saved with the results."""
@@ -105,7 +108,9 @@ class CompleteApp(PickApp):
     def more(self) -> dict[str, Any]:
         """What the completion says of itself, and what would help it."""
         made = self.made.get(self.scan.path) if self.scan else None
-        out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None}
+        markers = worn_markers(self.scan.places, self.work.marks) if self.scan else {}
+        out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None,
+                               "markers": len(markers)}
         if made is None or self.scan is None:
             return out
         judgement = made.completion.judgement
@@ -131,13 +136,39 @@ class CompleteApp(PickApp):
     def _usable(self, scan: Clicked) -> list[str]:
         return [name for name in self.work.marks if name in scan.places]
 
+    # markers that the person wears
+
+    def choose_next(self, last: str | None, pane: int = 1) -> None:
+        """Offer the next name, a landmark of the model or a marker, that the scan lacks."""
+        done = set(self.scan.places) if self.scan else set()
+        self.chosen = next_name(self.names, done, last) or last or next(iter(self.names), None)
+
+    def on_choose(self, send: Send, name: str) -> None:
+        """A name, or all those of a marker set."""
+        labels = labels_of(" ".join(name.split()))
+        if labels:
+            self._join(labels)
+        else:
+            super().on_choose(send, name)
+
+    def _join(self, labels: Sequence[str]) -> None:
+        self.names = tuple(dict.fromkeys([*self.names, *labels]))
+        done = self.scan.places if self.scan else {}
+        self.chosen = next((label for label in labels if label not in done), self.chosen)
+
     # what the page sends
 
     def receive(self, name: str, path: Path, send: Send) -> None:
-        """A scan that was dropped on the page; it is completed beside the others, its landmarks saved with it."""
+        """A scan that was dropped on the page; it is completed beside the others, its landmarks saved with it.
+
+        Of a recording the labels of its markers, which are clicked on the scan then.
+        """
         with self.dropped.keeping(name, path) as kept:
-            scan, lacks = with_camera(kept)
-            if not lacks:
+            labels = labels_of(kept)
+            scan, lacks = (kept, "") if labels else with_camera(kept)
+            if labels:
+                self._join(labels)
+            elif not lacks:
                 self.take(scan)
                 send(self.scene())
         self.note = lacks
@@ -207,6 +238,7 @@ class CompleteApp(PickApp):
             rows = write_results(replace(self.work, body=self._body(made.known)), Inputs((scan.path,), scan.file),
                                  made.files, made.completion, pairs_of(made.places, self.work.marks), None,
                                  staged.folder)
+            rows += write_worn(staged.folder, made.completion, worn_markers(scan.places, self.work.marks))
             write_report(Outcome(staged.folder, rows, {"complete": self.work.config}),
                          "scape complete --interactive", made.seconds)
         self.saved[scan.path] = folder

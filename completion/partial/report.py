@@ -29,6 +29,7 @@ WIDEST = 2.0                         # times as wide as high a picture of one si
 ERROR, OFF = "expected error", "distance of the scan to the {} body"
 OF_PREDICTED = (ERROR, OFF.format("predicted"))
 FEW = 9000                           # points of a bare cloud that a picture shows
+ONE_SIDED = 0.05                     # of the surface: its mean normal from which on a scan is one from a side
 
 
 def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh,
@@ -50,12 +51,13 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
 
 
 def sides(completion: Completion, template: Mesh) -> list[Camera]:
-    """Cameras around the completed body, from the side that was seen and on by quarters."""
+    """Cameras around the completed body, from the side that was seen, else its front, and on by quarters."""
     body = completion.completed
     vertical, ahead = stance(template, rotations.exp(completion.pose[0]))
     towards = (body.vertex_areas * completion.seen) @ body.vertex_normals
     towards -= (towards @ vertical) * vertical
-    side = towards / np.linalg.norm(towards) if np.linalg.norm(towards) > 1e-9 else ahead
+    one_sided = np.linalg.norm(towards) > ONE_SIDED * body.vertex_areas.sum()
+    side = towards / np.linalg.norm(towards) if one_sided else ahead
     aside = np.cross(vertical, side)
     return [Camera.from_side(body, way, vertical) for way in (side, aside, -side, -aside)]
 

@@ -34,9 +34,8 @@ from .masks import read_mask
 from .report import completion_page, completion_panes, picture_completion
 from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
+from .worn import worn_markers, write_worn
 
-_STYLE = """.scan { display: grid; grid-template-columns: minmax(9rem, 1fr) 3fr; gap: 1rem; margin: 1.4rem 0; }
-.scan img { width: 100%; } .scan p { margin: .2rem 0; }"""
 MEANS = ("distance of the scan to the completed mesh, RMS", "scan points explained", "vertices with data")
 
 
@@ -100,7 +99,8 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
         depth = read_picture(inputs.scans, work.unit)
         files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
-        landmarks = _landmarks(work, inputs, files)
+        named = read_landmarks(inputs.landmarks, files.mesh, work.unit) if inputs.landmarks else {}
+        landmarks = _landmarks(work, inputs.landmarks, named)
         masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
@@ -109,7 +109,8 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
-    return write_results(work, inputs, files, done, landmarks, masked, room.folder)
+    return [*write_results(work, inputs, files, done, landmarks, masked, room.folder),
+            *write_worn(room.folder, done, worn_markers(named, work.marks))]
 
 
 def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion,
@@ -169,14 +170,13 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
                            for path, a, b in zip(paths, starts[:-1], starts[1:], strict=True)])
 
 
-def _landmarks(work: Work, inputs: Inputs, files: ScanFiles) -> tuple[np.ndarray, np.ndarray] | None:
-    if inputs.landmarks is None:
+def _landmarks(work: Work, file: Path | None, named: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+    if file is None:
         return None
-    found = read_landmarks(inputs.landmarks, files.mesh, work.unit)
     try:
-        _, vertices, points = match_landmarks(work.marks, found)
+        _, vertices, points = match_landmarks(work.marks, named)
     except ValueError as error:
-        raise ValueError(f"{inputs.landmarks}: {error}") from None
+        raise ValueError(f"{file}: {error}") from None
     return vertices, points
 
 
@@ -272,6 +272,6 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
         shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
             page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        page.markup(f'<div class="scan"><div><a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>{told}</div>'
-                    f"{shown}</div>", _STYLE)
+        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
+        page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
     return page

@@ -143,8 +143,8 @@ class ViewApp(Things):
         self.number += 1
         self._scene = [Message("scene", {"number": self.number}, pack_scene(panes, whole=True)), *self._residuals()]
         self._notes = tuple(note for content in shown for note in content.notes)
-        self.controls.take([Shown(self.bodies[i], self.contents[i].name, pane, layer)
-                            for i, pane, layer in self._places() if i in self.bodies])
+        self.controls.take([Shown(body, self.contents[i].name, pane, layer + k) for i, pane, layer in self._places()
+                            if i in self.bodies for k, body in enumerate(self.bodies[i].layers)])
         self._positions = {}
         for one in self.controls.shown:
             self._moved(one)
@@ -152,12 +152,10 @@ class ViewApp(Things):
     def _moved(self, one: Shown) -> Message:
         """Where the vertices of a body are now."""
         body = one.body
-        y = self.controls.vertices(body) + (body.origin - self.cameras[one.pane].target).astype(np.float32)
-        joint = None
-        if self.controls.chosen in body.parts:
-            joint = body.regressor[[body.parts.index(self.controls.chosen)]] @ y
+        y, shift = self.controls.vertices(body), (body.origin - self.cameras[one.pane].target).astype(np.float32)
+        joint = body.joint(self.controls.chosen, y) + shift if self.controls.chosen in body.parts else None
         fields = {"scene": self.number, "pane": one.pane, "layer": one.layer, "joint": joint, **self._where()}
-        message = Message("positions", fields, np.ascontiguousarray(y, dtype="<f4").tobytes(),
+        message = Message("positions", fields, np.ascontiguousarray(y + shift, dtype="<f4").tobytes(),
                           f"positions {one.pane} {one.layer}")
         self._positions[one.pane, one.layer] = message
         return message

@@ -10,6 +10,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.statue.control.model import Statue
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, stance
@@ -74,7 +75,7 @@ class MarkersTold:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """One thing, as it is shown: its first shape is a model's body where there is a model.
+    """One thing, as it is shown: its first shape is a model's body, or a statue's surface, where there is one.
 
     `start` is the stance in the first frame of a motion, for a view that goes along with it.
     """
@@ -85,6 +86,7 @@ class Content:
     about: str = ""
     start: Stance | None = None
     model: BodyModel | None = None
+    statue: Statue | None = None
     markers: MarkersTold | None = None
     notes: tuple[str, ...] = ()
 

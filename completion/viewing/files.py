@@ -25,6 +25,8 @@ from ..partial.completion import load_completion
 from .contents import MARKER, Content, from_camera, of_completion, of_mesh, of_model, told
 from .kinds import kind_of, layout_places, reported_model, worst_first
 from .motions import of_markers, of_motion
+from .soft import soft_tissue_of, with_soft_tissue
+from .statues import is_statue, read_statue, statue_folder
 
 PLACES = (".pp", ".json", ".lnd", ".landmarks.txt")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
@@ -83,6 +85,7 @@ class Files:
                 if picture in self.paths:
                     continue
                 path = picture
+            path = statue_folder(path)
             if path.name.lower().endswith(PLACES):
                 self._lay_on(found, path)
             else:
@@ -186,6 +189,8 @@ class Files:
     def _inside(self, folder: Path, name: str, deep: int) -> Iterator[Entry]:
         if (folder / SET).is_file():
             yield from self._of_set(folder, name)
+        elif is_statue(folder):
+            yield Entry(name, lambda: read_statue(name, folder), True, folder, "statue", folder)
         elif (folder / COMPLETION).is_file():
             yield Entry(name, lambda: of_completion(name, load_completion(folder)), True, folder, "completion", folder)
         elif (folder / MOTION).is_file():
@@ -231,7 +236,11 @@ class Files:
         if betas is not None and len(betas) > model.n_betas:
             raise ValueError(f"{path}: expected at most the {model.n_betas} betas of the model, found {len(betas)}; "
                              "name its own model with -m")
-        return of_motion(name, motion, model.subject(betas, np.float32), self._markers_of(path, motion))
+        subject, markers = model.subject(betas, np.float32), self._markers_of(path, motion)
+        soft = soft_tissue_of(path, motion)
+        if soft is None:
+            return of_motion(name, motion, subject, markers)
+        return with_soft_tissue(of_motion(name, motion, subject), soft, model, markers)
 
     def _markers_of(self, path: Path, motion: Motion) -> MarkerSequence | None:
         """What was measured: the mended recording beside the motion, or one among the files that is laid over it."""

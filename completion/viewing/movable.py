@@ -12,6 +12,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import PointOperator, posed_product
+from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.names import in_words
 
 FEW = 3                              # differences beside the basis at a new pose: for more it gets these betas itself
@@ -70,8 +71,25 @@ class MovableBody:
     def point(self, vertex: int, betas: np.ndarray | None) -> PointOperator:
         """One vertex of the body with these betas, as a function of the pose."""
         self._settle(betas)
-        column = self.basis[:, vertex].astype(np.float64).reshape(-1, 1, 3)
+        column = self._column(vertex).astype(np.float64).reshape(-1, 1, 3)
         return PointOperator(self.model.terms, column, self.origin)
+
+    def _column(self, vertex: int) -> np.ndarray:
+        """(3M,) of the basis."""
+        return self.basis[:, vertex]
+
+    @property
+    def layers(self) -> tuple[MovableBody, ...]:
+        """The bodies that move with the sliders: this one."""
+        return (self,)
+
+    def joint(self, part: str, y: np.ndarray) -> np.ndarray:
+        """(1, 3) where a part's joint is in a body of vertices `y`, the ones that were made last."""
+        return np.asarray(self.regressor[[self.parts.index(part)]] @ y)
+
+    def mesh(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray) -> Mesh:
+        """The body, made the exact way."""
+        return self.model.template.with_vertices(self.model.vertices(pose, betas, trans))
 
     def _changed(self, betas: np.ndarray | None) -> np.ndarray | None:
         """Which betas are not those of the basis; None where it has to be made again."""

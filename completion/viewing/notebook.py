@@ -12,15 +12,19 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.statue.control.model import Statue
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.page import Page
 
+from ..mocap.soft_tissue.soft_tissue import SoftTissue
 from ..motion import Motion
 from ..partial.completion import Completion
 from .arrangement import over_each_other, side_by_side
 from .contents import AXES, Content, of_completion, of_mesh, of_model, of_subject
 from .files import Files
 from .motions import of_motion
+from .soft import of_soft_tissue
+from .statues import of_statue
 
 HEIGHT = 460                         # pixels of the bodies; buttons and legend stand below
 
@@ -58,8 +62,8 @@ def view(*things: Any, over: bool = False, up: str | None = None) -> Viewed:
     Parameters
     ----------
     things
-        Meshes, points (n, 3), models, subjects, completions, pairs of a motion and its subject, and files or folders as
-        `scape view` takes them.
+        Meshes, points (n, 3), models, subjects, completions, statues, pairs of a motion and its subject or of soft
+        tissue and its model, and files or folders as `scape view` takes them.
     over : bool
         Laid over each other instead of side by side.
     up : str, optional
@@ -91,11 +95,17 @@ def _contents(thing: Any, name: str) -> list[Content]:
         return [of_model(name, thing)]
     if isinstance(thing, Subject):
         return [of_subject(name, thing)]
+    if isinstance(thing, Statue):
+        return [of_statue(name, thing)]
     if isinstance(thing, Completion):
         return [of_completion(name, thing)]
     if isinstance(thing, tuple) and [type(part) for part in thing] == [Motion, Subject]:
         return [of_motion(name, *thing)]
+    if isinstance(thing, tuple) and len(thing) == 2 and isinstance(thing[0], SoftTissue) and isinstance(
+            thing[1], BodyModel):
+        return [of_soft_tissue(name, *thing)]
     if isinstance(thing, str | Path):
         return [entry.load() for entry in Files((Path(thing),)).entries() if entry.first]
-    raise ValueError(f"things: expected meshes, points, models, subjects, completions, (motion, subject) or files, "
+    raise ValueError(f"things: expected meshes, points, models, subjects, completions, statues, (motion, subject), "
+                     f"(soft tissue, model) or files, "
                      f"got {type(thing).__name__}")

@@ -49,7 +49,7 @@ class CompletePage(CompleteApp):
     """Completion inside of the view: each body that is saved gets a folder of its own beside what is there."""
 
     def __init__(self, model: BodyModel, work: Work, output: Path, dropped: Dropped) -> None:
-        super().__init__(model, work, (), output, dropped)
+        super().__init__(model, work, (), output, dropped=dropped)
         self.entries: dict[Path, Entry] = {}
         self._folders: dict[Path, Path] = {}
         self.fresh: list[Path] = []                       # folders written since the view was last shown

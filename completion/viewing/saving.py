@@ -8,16 +8,15 @@ import numpy as np
 from scanprep.geometry.files import write_mesh
 
 from ..motion import Motion
-from .controls import Controls
+from .controls import Controls, Shown
 
 
 def save_bodies(controls: Controls, folder: Path) -> list[Path]:
     """Every body that is shown as `NAME_body.ply`, made the exact way."""
     written = []
-    for one in controls.shown:
-        model, path = one.body.model, free_name(folder / f"{Path(one.name).stem}_body.ply")
-        write_mesh(path, model.template.with_vertices(
-            model.vertices(controls.pose_of(one.body), controls.betas_of(one.body), controls.trans)))
+    for one in whole(controls):
+        path = free_name(folder / f"{Path(one.name).stem}_body.ply")
+        write_mesh(path, one.body.mesh(controls.betas_of(one.body), controls.pose_of(one.body), controls.trans))
         written.append(path)
     return written
 
@@ -25,12 +24,17 @@ def save_bodies(controls: Controls, folder: Path) -> list[Path]:
 def save_poses(controls: Controls, folder: Path) -> list[Path]:
     """Pose, place and shape of every body as `NAME_pose.npz`, a motion of one frame."""
     written = []
-    for one in controls.shown:
+    for one in whole(controls):
         path = free_name(folder / f"{Path(one.name).stem}_pose.npz")
         Motion(controls.pose_of(one.body)[None], controls.trans[None], controls.betas_of(one.body), 1.0,
                np.zeros((1, 0))).save(path)
         written.append(path)
     return written
+
+
+def whole(controls: Controls) -> list[Shown]:
+    """The bodies without those that lie below one."""
+    return [one for one in controls.shown if not any(one.body in other.body.layers[1:] for other in controls.shown)]
 
 
 def free_name(path: Path) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 from .contents import Content
 from .files import Entry, Files
 from .movable import MovableBody
+from .statues import movable
 
 MOST = 12                            # that are shown at a time
 
@@ -47,7 +48,7 @@ class Things:
                     self.about[i] = content.about
                 model = self.contents[i].model
                 if model is not None and i not in self.bodies:
-                    self.bodies[i] = MovableBody(model)
+                    self.bodies[i] = movable(model, self.contents[i].statue)
             except (ValueError, OSError) as problem:
                 self.problems[i] = str(problem)
             else:

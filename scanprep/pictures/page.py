@@ -5,6 +5,7 @@ import base64
 import functools
 import gzip
 import io
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
@@ -27,6 +28,7 @@ script.textContent = text;
 document.head.append(script);
 scapekit.start();
 })().catch((error) => { document.body.classList.add("sk-pictures-only"); throw error; });"""
+BETWEEN_FOLDERS = re.compile(r"(?<=\w)/(?=\w)")     # a long path may break here on a narrow page
 
 
 class Page:
@@ -165,4 +167,4 @@ def _cell(value: Any) -> str:
     if isinstance(value, float | np.floating):
         shown = "–" if np.isnan(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
         return f'<td class="number">{shown}</td>'
-    return f"<td>{escape(str(value))}</td>"
+    return f"<td>{BETWEEN_FOLDERS.sub('/<wbr>', escape(str(value)))}</td>"

@@ -21,9 +21,11 @@ from summary_scans import (
     correspondences,
     decimated_set,
     decimation,
+    fronts,
     holes,
     merging,
     peers,
+    predicted_landmarks,
     registration,
     rolled_limbs,
     signatures,
@@ -182,6 +184,13 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "registration_front": ("Registration, one view from the front",
                            "python tests/benchmarks/registration.py --set held --marks 10 --front", registration,
                            "Ten landmarks, of which some lie where there are no data."),
+    "predicted_landmarks": ("Landmarks predicted after four clicks",
+                            "python tests/benchmarks/predicted_landmarks.py", predicted_landmarks,
+                            "What `scape pick` offers when hands and toes were clicked, without error, on a virtual "
+                            "scan; the template is mesh000. Beside other work. PREDICTED_NOTE"),
+    "fronts": ("The front of a body in pictures", "python tests/benchmarks/fronts.py", fronts,
+               "Against the direction square to hips, shoulders and waist. Where we lose: bodies that sit, squat or "
+               "kneel, whose feet are not below them."),
     "signatures": ("Where the skin belongs", "python tests/benchmarks/signatures.py", signatures,
                    "Mean curvature of the template and of the true posed surface at the places of its vertices; the "
                    "poses are those for tuning. Ours lie some 10 mm from the reference, and by this measure nearer to "

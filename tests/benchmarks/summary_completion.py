@@ -113,6 +113,15 @@ def depth_camera(report: dict) -> str:
                   "right but flagged", "time (s CPU)"), rows)
 
 
+def worn_markers(report: dict) -> str:
+    """Kinds of scans, by the way that markers were carried to the model."""
+    names = ("what", "way", "scans", "markers", "mean_mm", "median_mm", "nine_of_ten_mm", "worst_mm", "flagged",
+             "cpu_s")
+    return table(("scan", "carried by", "scans", "markers", "mean (mm)", "median (mm)", "nine of ten within (mm)",
+                  "worst (mm)", "flagged scans", "completion (s CPU)"),
+                 [tuple(r[n] for n in names) for r in report["means"]])
+
+
 def viewer_speed(report: dict) -> str:
     """Round trips of sliders."""
     rows: Rows = [(kind, report[kind]["a_second"], report[kind]["median_ms"], report[kind]["p95_ms"])
@@ -189,6 +198,10 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "A walk of 120 frames at 30 Hz of a synthetic person who is not in the model of the synthetic people, two "
         "depth cameras with 5 mm noise, no landmarks. The run was stopped before its last two rows, frames that show "
         "nothing and frames that show half. `surface`: the model's vertices to the true surface of the whole body."),
+    "worn_markers": (
+        "Markers clicked on a scan of the person who wears them",
+        "python tests/benchmarks/worn_markers.py", worn_markers,
+        "WORN_NOTE"),
     "viewer_speed": (
         "Sliders of a model in the browser",
         "python tests/benchmarks/viewer_speed.py -m MODEL", viewer_speed,

@@ -151,6 +151,26 @@ def merging(report: dict) -> str:
                   "back from where data, mean (mm)", "95% (mm)", "time (s CPU)"), rows)
 
 
+def fronts(report: dict) -> str:
+    """How often pictures are not of the front."""
+    rows: Rows = [(r["bodies"], r["given"], r["count"], r["median"], r["beyond_30"], r["beyond_60"],
+                   ", ".join(map(str, r["which"])) or "none") for r in report["rows"]]
+    return table(("bodies", "given as", "count", "off, median (degrees)", "beyond 30", "beyond 60", "which"), rows)
+
+
+def predicted_landmarks(report: dict) -> str:
+    """Every scan, and the median of all landmarks."""
+    rows: Rows = [(r["scan"], *(r[n] for n in ("median_mm", "nine_of_ten_mm", "worst_mm", "worst")),
+                   f"{r['within_10']:.0%}", r["cpu_s"]) for r in report["rows"]]
+    for kind in dict.fromkeys(r["kind"] for r in report["rows"]):
+        mine = [r for r in report["rows"] if r["kind"] == kind]
+        every = np.concatenate([list(r["apart_mm"].values()) for r in mine])
+        rows.append((f"all {kind}s", float(np.median(every)), float(np.quantile(every, 0.9)), float(every.max()), "",
+                     f"{(every <= 10).mean():.0%}", float(np.mean([r["cpu_s"] for r in mine]))))
+    return table(("scan", "median (mm)", "nine of ten within (mm)", "worst (mm)", "the worst", "within 10 mm",
+                  "time (s CPU)"), rows)
+
+
 def signatures(report: dict) -> str:
     """Means over the poses of the correlation at every scale."""
     names = {"reference": "published registration", "slid": "the same, slid 4 mm at random", "ours": "ours"}

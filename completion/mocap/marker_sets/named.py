@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -34,6 +34,12 @@ def faces_digest(faces: np.ndarray) -> str:
 def layout_names() -> tuple[str, ...]:
     """The marker sets that come along."""
     return tuple(sorted({tree["name"] for _, tree in _files()}))
+
+
+def set_labels(name: str) -> tuple[str, ...]:
+    """The labels of a marker set that comes along."""
+    tree = next(tree for _, tree in _files() if tree["name"] == name)
+    return tuple(label for markers in tree["markersets"] for label in markers["indices"])
 
 
 def layout_summaries() -> list[tuple[str, int, str, str]]:
@@ -128,13 +134,26 @@ def clicked_layout(path: Path, template: Mesh) -> MarkerLayout:
 
     [SCAPE] §8
     """
-    places = read_landmarks(path, template)
-    found = Surface(template).closest(np.array(list(places.values())))
-    far = found.distances.argmax()
-    if found.distances[far] > OFF * size(template):
-        raise MarkerFileError(f"{path}: expected places on the model's template, '{list(places)[far]}' is "
-                              f"{1000 * found.distances[far]:.0f} mm off it; click them on the template")
-    return MarkerLayout(tuple(places), template.faces[found.faces], weights=found.bary)
+    layout, distances = layout_on(template, read_landmarks(path, template))
+    far = distances.argmax()
+    if distances[far] > OFF * size(template):
+        raise MarkerFileError(f"{path}: expected places on the model's template, '{layout.labels[far]}' is "
+                              f"{1000 * distances[far]:.0f} mm off it; click them on the template")
+    return layout
+
+
+def layout_on(body: Mesh, places: Mapping[str, np.ndarray]) -> tuple[MarkerLayout, np.ndarray]:
+    """Markers on the skin of a body where it is nearest to places (3,), metres, and how far (L,) it is from them.
+
+    A body in the model's triangles, completed from a scan of the person who wears the markers, thereby tells where
+    they sit on the model.
+
+    [SCAPE] §8
+    """
+    found = Surface(body).closest(np.array(list(places.values())))
+    inside = np.clip(found.bary, 0.0, 1.0)                        # without the last digits outside of the triangle
+    weights = inside / inside.sum(axis=1, keepdims=True)
+    return MarkerLayout(tuple(places), body.faces[found.faces], weights=weights), found.distances
 
 
 def _is_clicked(path: Path) -> bool:

@@ -31,8 +31,6 @@ PICTURE = "picture.png"
 SOME = 56                            # frames that changes of the body are measured in
 COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
           "green for held-out markers, which no stage has seen.")
-_STYLE = """.entry { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
-.entry img { width: 100%; } .entry p { margin: .2rem 0; }"""
 
 
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
@@ -144,7 +142,7 @@ def add_entry(page: Page, name: str, lines: Iterable[str]) -> None:
     """A person, or a sequence, leading to its own page."""
     link, told = escape(name), "".join(f"<p>{escape(line)}</p>" for line in lines)
     page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{link}</b></a>{told}</div>'
-                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>', _STYLE)
+                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>')
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:

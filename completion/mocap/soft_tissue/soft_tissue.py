@@ -24,6 +24,7 @@ from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_move
 
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
+CHANGES = "shape_changes"            # in a motion file
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
 
 
@@ -101,14 +102,19 @@ class SoftTissue:
 
     def save(self, path: str | Path) -> None:
         """Write a motion file (see `Motion.save`) that also holds the changes, as `shape_changes`."""
-        self.motion.save(path, shape_changes=self.changes)
+        self.motion.save(path, **{CHANGES: self.changes})
+
+    @staticmethod
+    def is_in(path: str | Path) -> bool:
+        """Whether a motion file holds changes of shape."""
+        return CHANGES in storage.load_arrays(path, "a motion")
 
     @staticmethod
     def load(path: str | Path) -> SoftTissue:
         """Read a file of `save`; StorageError for one that is missing, not a motion, or of a fixed shape."""
         motion, stored = Motion.load(path), storage.load_arrays(path, "a motion")
         with storage.taking_apart(path, f"shape_changes, a row for each of {len(motion.poses)} frames"):
-            changes = storage.numbers(stored, "shape_changes", len(motion.poses), None)
+            changes = storage.numbers(stored, CHANGES, len(motion.poses), None)
         if motion.betas is None or len(motion.betas) > changes.shape[1]:
             raise storage.StorageError(f"{path}: expected a person of at most {changes.shape[1]} betas, "
                                        f"found {0 if motion.betas is None else len(motion.betas)}")

@@ -15,8 +15,10 @@ export class Complete extends Pick {
     this.anew = button("search anew", "forget the body that there is and search again", () => this.send("complete", { anew: true }));
     this.keep = button("save", "write the body, its pose and a report", () => this.send("save"));
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
-    this.scans.before(dropZone(this, "drop a scan here, or choose a file"));
-    this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict);
+    this.markers = make("p", { class: "sk-file" });
+    this.added.placeholder = "a name, or a marker set: cmu41";
+    this.scans.before(dropZone(this, "drop a scan here, or a recording whose markers to click, or choose a file"));
+    this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict, this.markers);
     this.buttons.predict.remove();
   }
 
@@ -25,7 +27,8 @@ export class Complete extends Pick {
     const { completed, working, can_choose: free } = state;
     this.known.checked = state.known;
     this.knownLabel.hidden = !free;
-    const clicked = Object.keys(state.panes[1]?.places ?? {}).length;
+    const clicked = Object.keys(state.panes[1]?.places ?? {}).length - state.markers;
+    this.markers.textContent = state.markers ? `${state.markers} marker${state.markers > 1 ? "s" : ""}: “save” writes where on the model to layout.json` : "";
     this.go.disabled = Boolean(working) || state.panes.length < 2;
     this.go.textContent = completed ? "complete again" : clicked ? `complete with ${clicked} landmarks` : "complete without landmarks";
     this.anew.hidden = !completed;

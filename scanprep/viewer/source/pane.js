@@ -231,7 +231,8 @@ function drawLabels(pane, layer, taken) {
     if (!text || layer.hidden.has(i)) return;
     const point = new Vector3().fromArray(layer.positions, 3 * i), at = pane.project(point);
     if (!at || (!layer.described.on_top && pane.covers(point))) return;
-    const x = (at.x + 8) * scale, y = at.y * scale, wide = context.measureText(text).width, high = 7 * scale;
+    const wide = context.measureText(text).width, high = 7 * scale, right = (at.x + 8) * scale, y = at.y * scale;
+    const left = (at.x - 8) * scale - wide, x = right + wide <= pane.canvas.width ? right : Math.max(left, 0);
     if (taken.some((box) => x < box.right && x + wide > box.left && y - high < box.bottom && y + high > box.top)) return;
     taken.push({ text, left: x, right: x + wide, top: y - high, bottom: y + high });
     context.strokeText(text, x, y);

@@ -1,0 +1,92 @@
+"""Soft tissue in the browser: a motion in which the shape changes, beside the same body of fixed shape."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import posed_product
+from scanprep.pictures.colors import Heat
+from scanprep.pictures.low_rank import low_rank
+from scanprep.pictures.shading import Moving, Shape, Solid
+
+from ..mocap.files.markers import MarkerSequence
+from ..mocap.soft_tissue.soft_tissue import SoftTissue
+from ..motion import Motion, spread_frames
+from .contents import Content
+from .motions import AT_ONCE, MADE, of_motion, with_markers
+
+SOFT = (0.55, 0.66, 0.80)
+LEAST = 0.003                        # standard deviations: a direction in which the shape changes less is left out
+
+
+def of_soft_tissue(name: str, soft: SoftTissue, model: BodyModel) -> Content:
+    """A motion with soft tissue, and the same with the person's own shape throughout, to be shown instead."""
+    return with_soft_tissue(of_motion(name, soft.motion, model.subject(soft.motion.betas, np.float32)), soft, model)
+
+
+def soft_tissue_of(path: Path, motion: Motion) -> SoftTissue | None:
+    """What is stored in a motion's file of soft tissue, or lies beside a motion of as many frames; None without."""
+    for file in (path, path.with_name("soft_tissue.npz")):
+        if file.is_file() and (file == path or path.name == "motion.npz") and SoftTissue.is_in(file):
+            soft = SoftTissue.load(file)
+            return soft if len(soft.changes) == len(motion.poses) else None
+    return None
+
+
+def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel, markers: MarkerSequence | None = None
+                     ) -> Content:
+    """A motion, whose body is hidden at first, and with it the body whose shape changes, and what was measured.
+
+    Where the skin is soft is one of its colours: how far the change moves it, the root of the mean square over time.
+    """
+    some = spread_frames(len(soft.motion.poses), MADE)
+    frames = soft.vertices(model, some)
+    basis, coefficients = soft_columns(soft, model, frames)
+    moved = soft.movement(model)
+    shade = Heat(moved, 0.0, max(float(np.quantile(moved, 0.995)), 1e-3), "moved by soft tissue")
+    body = Solid(model.template.with_vertices(frames[0]), SOFT, shades={"soft tissue": shade}, name="with soft tissue")
+    changing = Moving(body, frames[:1].astype(np.float32), soft.motion.rate, (basis, coefficients))
+    content = replace(content, shapes=[*_without(content.shapes), changing])
+    if markers is None:
+        return content
+    note = f"{content.name}: markers are coloured by their distance from the body with soft tissue"
+    return replace(with_markers(content, soft.motion, markers), notes=(*content.notes, note))
+
+
+def _without(shapes: Sequence[Shape | Moving]) -> list[Shape | Moving]:
+    """Shapes of which bodies are hidden and called by what they are."""
+    out: list[Shape | Moving] = []
+    for shape in shapes:
+        if isinstance(shape, Moving) and isinstance(shape.shape, Solid):
+            shape = replace(shape, shape=replace(shape.shape, name="fixed shape", visible=False))
+        out.append(shape)
+    return out
+
+
+def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (N, r) and coefficients (T, r, 3) of all vertices in all frames, from some of the frames (n, N, 3).
+
+    As `as_columns` for a body of fixed shape: what the fast path adds up is linear in betas too, so every direction in
+    which they change adds a product of its own.
+    """
+    made, _ = low_rank(frames)
+    even = np.full((made.shape[0], 1), made.shape[0] ** -0.5)              # moves all vertices alike
+    basis = np.linalg.qr(np.hstack([even, made]))[0]
+    own = soft.betas(0.0)[0]
+    shares, sizes, directions = np.linalg.svd(soft.changes, full_matrices=False)
+    shares = (shares * sizes)[:, sizes > LEAST * np.sqrt(len(soft.changes))]
+    rest = model.basis(own)
+    gained = [model.basis(own + direction) - rest for direction in directions[:shares.shape[1]]]
+    flats = [np.einsum("mnc,nr->mcr", T, basis, optimize=True).reshape(-1, basis.shape[1]) for T in (rest, *gained)]
+    amounts = np.hstack([np.ones((len(shares), 1)), shares])               # of each product, in every frame
+    poses, places = soft.motion.poses, model.skeleton.joints[0] + soft.motion.trans
+    out = np.zeros((len(poses), 3, basis.shape[1]))
+    for flat, amount in zip(flats, amounts.T, strict=True):
+        for i in range(0, len(poses), AT_ONCE):
+            now = slice(i, i + AT_ONCE)
+            out[now] += amount[now, None, None] * posed_product(model.terms, flat, poses[now])
+    return basis, np.swapaxes(out, 1, 2) + places[:, None] * basis.sum(axis=0)[:, None]

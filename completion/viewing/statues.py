@@ -1,0 +1,111 @@
+"""A statue behind sliders: its control mesh is posed, and the detail of the scan stands on the moved normals."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from model.body import BodyModel
+from model.files import load_model
+from model.statue.control.model import FOLDED, HOLE, MEASURED, Statue
+from model.statue.detail.reconstruction import Reconstruction, coverage_at
+from model.statue.detail.subdivision import Subdivision, chart_places, subdivide
+from model.statue.files import ABOUT, CONTROL, body_model, load_statue
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.colors import part_colors
+from scanprep.pictures.shading import CLAY, Solid
+from scanprep.pictures.textures import bilinear
+
+from .contents import Content, Stance, sizes
+from .movable import MovableBody
+
+LEVEL = 3                            # of detail: 64 triangles for one of the control mesh; a move takes 1 to 4 ms
+BODY = "body.npz"
+GUESSED, FILLED = (0.93, 0.62, 0.12), (0.55, 0.66, 0.80)
+
+
+class MovableStatue(MovableBody):
+    """The exact surface of a statue in any pose of the model that moves its control mesh.
+
+    Parameters
+    ----------
+    statue : Statue
+    model : BodyModel
+        Of the control mesh.
+    """
+
+    def __init__(self, statue: Statue, model: BodyModel) -> None:
+        super().__init__(model)
+        fine = subdivide(statue.control.mesh, statue.control.chart, LEVEL)
+        self.detailed = Reconstruction(statue.control, statue.map, fine)
+        self._corners, self._bary = statue.control.mesh.faces[fine.parent], fine.bary
+        self._control = np.zeros((0, 3), dtype=np.float32)
+        self.control = MovableBody(model)
+        self.part_of_vertex = self.part_of_vertex[self._corners[np.arange(len(fine.parent)), fine.bary.argmax(axis=1)]]
+
+    @property
+    def layers(self) -> tuple[MovableBody, ...]:
+        """The surface, and the control mesh below it."""
+        return self, self.control
+
+    def vertices(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """(n, 3) float32, metres, of the detailed surface, relative to the root's joint. [Statues] Eq. 19, 20"""
+        self._control = super().vertices(betas, pose, trans)
+        return self.detailed(self._control).astype(np.float32)
+
+    def joint(self, part: str, y: np.ndarray) -> np.ndarray:
+        """Where a part's joint is in the control mesh below the vertices that were made last."""
+        return super().joint(part, self._control)
+
+    def mesh(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray) -> Mesh:
+        """The detailed surface, made the exact way."""
+        return self.detailed.mesh(self.model.vertices(pose, betas, trans))
+
+    def _column(self, vertex: int) -> np.ndarray:
+        """Of the place of the control mesh below a vertex."""
+        return np.asarray(self.basis[:, self._corners[vertex]] @ self._bary[vertex])
+
+
+def movable(model: BodyModel, statue: Statue | None) -> MovableBody:
+    """What sliders move: a model's body, or the surface of a statue."""
+    return MovableBody(model) if statue is None else MovableStatue(statue, model)
+
+
+def statue_folder(path: Path) -> Path:
+    """The folder of a statue of which a file is named; any other path as it is."""
+    return path.parent if path.name in (ABOUT, CONTROL) and (path.parent / ABOUT).is_file() else path
+
+
+def is_statue(folder: Path) -> bool:
+    """Whether a folder is one of `scape statue fit`."""
+    return (folder / ABOUT).is_file() and (folder / CONTROL).is_file()
+
+
+def read_statue(name: str, folder: Path) -> Content:
+    """The statue of a folder, moved by the model beside it, which knows what poses people take."""
+    statue = load_statue(folder)
+    model = load_model(folder / BODY) if (folder / BODY).is_file() else None
+    same = model is not None and np.array_equal(model.template.faces, statue.control.mesh.faces)
+    return of_statue(name, statue, model if same else None)
+
+
+def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Content:
+    """The surface of a statue where the scan stood, and its control mesh to be shown too."""
+    control = statue.control
+    fine = subdivide(control.mesh, control.chart, LEVEL)
+    mesh = Reconstruction(control, statue.map, fine).mesh()
+    shades = {"parts": part_colors(control.skeleton.part_of_face)[fine.face_parent],
+              "what was measured": _told(statue, fine)}
+    if statue.texture is not None:
+        colors = bilinear(statue.texture, chart_places(control.chart, fine.parent, fine.bary)) / 255
+        mesh, shades = Mesh(mesh.vertices, mesh.faces, colors), {"plain": np.array(CLAY), **shades}
+    shapes = [Solid(mesh, shades=shades, name="statue"),
+              Solid(control.mesh, FILLED, name="control mesh", visible=False)]
+    return Content(name, shapes, Stance.of(mesh), f"{sizes(mesh)}, {len(control.skeleton.parents)} parts",
+                   model=model or body_model(control), statue=statue)
+
+
+def _told(statue: Statue, fine: Subdivision) -> np.ndarray:
+    """(n, 3) colours: measured, folded, or filled where the scan has a hole."""
+    found = coverage_at(statue.control, statue.map, fine.parent, fine.bary)
+    return np.array([CLAY, GUESSED, FILLED])[np.select([found == MEASURED, found == FOLDED, found == HOLE], [0, 1, 2])]
