@@ -72,7 +72,8 @@ def clicked_on_the_scan(page, app, body, seen, toward, count=4):
     for name, vertex in zip(NAMES, MARKS, strict=True):
         if not seen[vertex] or len(app.scan.places) == count:
             continue
-        page.locator(".sk-names li").filter(has_text=name).first.click()
+        item = page.locator(".sk-names li").filter(has_text=name).first
+        item.click() if app.scan.places else item.press("Enter")
         wait_until(page, f"program.state.chosen === {json.dumps(name)}")
         page.mouse.click(*page.evaluate(PLACED, [1, body.vertices[vertex].tolist()]))
         wait_until(page, f"{json.dumps(name)} in program.state.panes[1].places")

@@ -108,6 +108,10 @@ def test_dropped_files_join_the_things_and_take_each_others_place(app, files, tm
     with pytest.raises(ValueError, match=r"half\.ply"):
         drop(app, tmp_path / "half.ply")
     assert app.number == scene and len(app.contents[0].shapes[0].points) == 3 and app.shown == [0, 1]
+    (tmp_path / "worm.npz").write_bytes((files / "worm.npz").read_bytes()[:3000])
+    with pytest.raises(ValueError, match=r"^worm\.npz: expected"):
+        drop(app, tmp_path / "worm.npz")
+    assert [path.name for path in app.files.models] == ["worm.npz"] and app.controls.betas[0] == 1.5
     with pytest.raises(ValueError, match=r"notes\.docx: expected a mesh"):
         (tmp_path / "notes.docx").write_text("hello")
         drop(app, tmp_path / "notes.docx")
@@ -129,7 +133,8 @@ def test_a_depth_picture_is_shown_from_its_camera_and_completed(app, files, mode
     state = drop(app, files / "one.camera.json", files / "worm.npz")
     assert [entry["name"] for entry in state["entries"]] == ["one.png", "worm.npz"] and not state["note"]
     camera = app.cameras[0]
-    assert np.allclose(camera.axes, np.diag([1.0, -1, -1])) and camera.position[2] < 0
+    assert np.allclose(camera.axes, np.diag([1.0, -1, -1])) and np.allclose(camera.position, 0)      # its own place
+    assert camera.distance == pytest.approx(AWAY, abs=0.3)                    # one turns about the body
     page = entered(app, what="complete", scan=0, model=str(app.files.models[0]))
     there = body.vertices - TRANS
     there = there - there.mean(axis=0) + [0, 0, AWAY]
@@ -217,6 +222,11 @@ def test_from_an_empty_page_to_a_saved_body_and_back_by_mouse(app, files, body, 
         wait_until(page, "!program.state.working && program.figure?.panes.length === 3")
         page.get_by_label("colour", exact=True).select_option("expected error")
         page.get_by_label("predicted body").check()
+        page.evaluate("window.before = program.figure")
+        server.send(inner.scene())                                            # as after another completion
+        wait_until(page, "program.figure !== before")
+        assert page.get_by_label("predicted body").is_checked()               # what was chosen stays
+        assert page.get_by_label("colour", exact=True).input_value() == "expected error"
         assert page.locator(".sk-legend").inner_text().split("\n")[0] == "expected error"
         assert "mm" in page.locator(".sk-legend").inner_text()
         page.get_by_role("button", name="save").click()
@@ -239,10 +249,11 @@ def test_an_empty_page_fits_a_telephone_and_is_used_by_keyboard(app, files, new_
         page.goto(server.opening())
         wait_until(page, "Boolean(window.program?.entries)")
         assert page.evaluate("document.documentElement.scrollWidth") <= 420
+        page.evaluate("document.querySelector('[type=file]').onclick = () => { window.asked = true; return false; }")
         page.locator(".sk-drop").focus()
-        with page.expect_file_chooser() as chosen:
-            page.keyboard.press("Enter")
-        chosen.value.set_files([files / "one.camera.json", files / "one.png"])          # the picture is sent first
+        page.keyboard.press("Enter")
+        wait_until(page, "window.asked")
+        page.locator("input[type=file]").set_input_files([files / "one.camera.json", files / "one.png"])
         wait_until(page, "program.entries.length === 1 && program.figure?.panes[0].drawn > 0")
         page.locator("canvas").focus()
         before = page.evaluate("program.figure.panes[0].camera.position.toArray()")

@@ -6,7 +6,6 @@ and with where all sliders stand. Older answers that still wait give way to newe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +17,14 @@ from scanprep.viewer.dropped import Dropped, with_camera
 from scanprep.viewer.messages import Message
 
 from .arrangement import over_each_other, side_by_side
-from .contents import Content
 from .controls import Controls, Shown
 from .files import Entry, Files
-from .movable import MovableBody
 from .pages import Inside
 from .saving import save_bodies, save_poses
-from .statues import movable
-
-MOST = 12                            # panes
+from .things import MOST, Things
 
 
-class ViewApp:
+class ViewApp(Things):
     """Contents side by side, or over each other; ValueError where there are some and none can be read.
 
     Parameters
@@ -49,21 +44,17 @@ class ViewApp:
 
     def __init__(self, entries: Sequence[Entry] = (), over: bool = False, output: Path = Path(),
                  files: Files | None = None) -> None:
-        self.entries, self.over, self.output = list(entries), over, output
+        super().__init__(entries, files or Files())
+        self.over, self.output = over, output
         self.controls, self.rng = Controls(), np.random.default_rng()
-        self.files, self.dropped = files or Files(), Dropped()
+        self.dropped = Dropped()
         self.inside = Inside(self.files, output, self.dropped)
         self.written: list[Path] = []                     # what was saved
         self.note = ""
         self.working: tuple[str, int, int] | None = None
-        self.problems: dict[int, str] = {}
-        self.contents: dict[int, Content] = {}
-        self.bodies: dict[int, MovableBody] = {}
-        self.shown: list[int] = []
         self.number = 0                                   # of the scene, which positions name
         self._scene: list[Message] = []                   # and what belongs to it
         self._notes: tuple[str, ...] = ()
-        self._about: dict[int, str] = {}
         self._positions: dict[tuple[int, int], Message] = {}
         if self.entries:
             first = [i for i, entry in enumerate(self.entries) if entry.first] or [0]
@@ -82,7 +73,7 @@ class ViewApp:
         sliders = self.controls
         return Message("state", {
             "entries": [{"name": entry.name, "shown": i in self.shown, "problem": self.problems.get(i, ""),
-                         "about": self._about.get(i, "")} for i, entry in enumerate(self.entries)],
+                         "about": self.about.get(i, "")} for i, entry in enumerate(self.entries)],
             "notes": list(self._notes), "problems": list(self.problems.values()),
             "saved": [str(path) for path in self.written], "note": self.note, "working": self.working,
             "pages": self.inside.offered(self.entries),
@@ -109,78 +100,32 @@ class ViewApp:
 
     def show(self, wanted: Sequence[int]) -> None:
         """Read these entries and make their scene; those that cannot be read tell why."""
-        self._arrange(self._read(wanted))
+        self.put(self.read(wanted))
 
-    def _read(self, wanted: Sequence[int]) -> list[int]:
-        """Those of some entries that can be read."""
-        if len(wanted) > MOST:
-            raise ValueError(f"at most {MOST} can be shown at a time")
-        read: list[int] = []
-        for i in wanted:
-            try:
-                if i not in self.contents:
-                    content = self.entries[i].load()
-                    self.contents[i] = replace(content, name=self.entries[i].name,
-                                               stance=content.start or content.stance)
-                    self._about[i] = content.about
-                model = self.contents[i].model
-                if model is not None and i not in self.bodies:
-                    self.bodies[i] = movable(model, self.contents[i].statue)
-            except (ValueError, OSError) as problem:
-                self.problems[i] = str(problem)
-            else:
-                self.problems.pop(i, None)
-                read.append(i)
-        return read
-
-    def _arrange(self, read: list[int]) -> None:
-        self.shown = read
-        self.contents = {i: self.contents[i] for i in read}
-        self.bodies = {i: body for i, body in self.bodies.items() if i in read}
+    def put(self, read: Sequence[int]) -> None:
+        """Show what was read, as a new scene."""
+        super().put(read)
         if read:
             self._make_scene()
-
-    def join(self, path: Path) -> None:
-        """Show the things of one more file or folder with the others; ValueError, and all as before, where none can be.
-
-        What is known of things that stay is kept; those that were shown and were read anew are shown again.
-        """
-        before = vars(self).copy()
-        old, self.entries = self.entries, self.files.with_another(self.entries, path)
-        fresh = [i for i, entry in enumerate(self.entries) if entry not in old]
-        place = {i: self.entries.index(entry) for i, entry in enumerate(old) if entry in self.entries}
-        for name in ("problems", "contents", "bodies", "_about"):
-            setattr(self, name, {place[i]: one for i, one in getattr(self, name).items() if i in place})
-        again = {old[i].path for i in self.shown if i not in place}
-        new = [i for i in fresh if self.entries[i].path in again] or [i for i in fresh if self.entries[i].first]
-        read = self._read(sorted([*(place[i] for i in self.shown if i in place), *new][-MOST:]))
-        if not set(new) & set(read):
-            problem = self.problems[new[0]]
-            vars(self).update(before)
-            raise ValueError(problem)
-        self._arrange(read)
 
     # pages inside
 
     def enter(self, send: Send, wanted: Mapping[str, Any]) -> App:
-        """The page of a folder, or the completion of one of the scans by one of the models."""
-        self.note = ""
-        if wanted["what"] != "complete":
-            return self.inside.folder_page(wanted["what"], wanted["folder"], self.entries)
-
+        """The page that a button asks for."""
         def progress(done: int, total: int) -> None:
             self.working = ("building the synthetic people", done, total)
             send(self.state())
 
+        self.note = ""
         try:
-            return self.inside.completion(self.entries[int(wanted["scan"])], wanted["model"], progress)
+            return self.inside.enter(self.entries, wanted, progress)
         finally:
             self.working = None
 
     def returned(self, app: App) -> None:
         """What a page has written joins the things that are shown."""
         for folder in self.inside.written(app):
-            if folder not in self.written:
+            if folder not in self.files.folders(self.entries):
                 self.written.append(folder)
             self.join(folder)
 
@@ -234,6 +179,7 @@ class ViewApp:
 
     def close(self) -> None:
         """Forget what was dropped; all else that was wanted was saved."""
+        self.written += [folder for page in self.inside.completions for folder in self.inside.written(page)]
         self.dropped.close()
 
     def _tell_all(self, send: Send) -> None:

@@ -18,11 +18,13 @@ LAID_OVER = (CLAY, (0.55, 0.66, 0.80), (0.83, 0.62, 0.55), (0.62, 0.75, 0.60), (
 
 
 def side_by_side(contents: Sequence[Content], up: np.ndarray | None = None) -> tuple[list[Camera], list[Pane]]:
-    """A pane for each, in one scale, so that they can be compared."""
+    """A pane for each, in one scale, so that they can be compared; what has a view of its own keeps it."""
     panes = [Pane(content.shapes, content.stance.camera(up), content.name) for content in contents]
-    sizes = [pane.camera.distance for pane in panes]
-    if max(sizes) < ALIKE * min(sizes):                # else one of them is in another unit
-        panes = framed_alike(panes)
+    free = [i for i, content in enumerate(contents) if content.stance.seen is None]
+    sizes = [panes[i].camera.distance for i in free]
+    if free and max(sizes) < ALIKE * min(sizes):       # else one of them is in another unit
+        for i, pane in zip(free, framed_alike([panes[i] for i in free]), strict=True):
+            panes[i] = pane
     return [pane.camera for pane in panes], panes
 
 

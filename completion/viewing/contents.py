@@ -18,6 +18,7 @@ from scanprep.pictures.colors import part_colors
 from scanprep.pictures.scene import NO_INDEX
 from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
 from scanprep.pictures.thinning import thinned
+from scanprep.viewer.clicked import camera_before
 
 from ..bodies import at_rest
 from ..partial.completion import Completion
@@ -36,7 +37,7 @@ class Stance:
     extent: np.ndarray
     up: np.ndarray
     front: np.ndarray
-    straight: bool = False               # seen from the front itself, not from beside it
+    seen: Camera | None = None           # the first view, where one is given
 
     @staticmethod
     def of(mesh: Mesh, poses: np.ndarray | None = None) -> Stance:
@@ -49,11 +50,11 @@ class Stance:
 
     def camera(self, up: np.ndarray | None = None) -> Camera:
         """A view from beside the front, this way up."""
+        if self.seen is not None:
+            return self.seen
         up = self.up if up is None else up
         front = self.front if np.linalg.norm(np.cross(self.front, up)) > 0.1 else np.roll(up, 1)
         flat = front - (front @ up) * up
-        if self.straight:
-            return Camera.from_side(self.extent, flat, up, 0.0)
         side = np.cos(TURN) * flat + np.sin(TURN) * np.cross(up, flat)
         return Camera.from_side(self.extent, side, up, ELEVATION)
 
@@ -107,9 +108,10 @@ def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray
 
 
 def from_camera(content: Content) -> Content:
-    """What a depth camera saw, from its side: it looks along z, with y down."""
-    stance = replace(content.stance, up=np.array([0.0, -1, 0]), front=np.array([0.0, 0, -1]), straight=True)
-    return replace(content, stance=stance)
+    """A mesh that a depth camera saw, from where that was."""
+    body = content.shapes[0]
+    assert isinstance(body, Solid)
+    return replace(content, stance=replace(content.stance, seen=camera_before(body.mesh.vertices)))
 
 
 def sizes(mesh: Mesh) -> str:

@@ -17,6 +17,7 @@ from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import Dots
 from scanprep.viewer.clicked import read_surface
+from scanprep.viewer.dropped import with_camera
 
 from ..mocap.files.markers import MarkerSequence, read_markers
 from ..motion import Motion
@@ -78,7 +79,12 @@ class Files:
             if not path.exists():
                 raise ValueError(f"{path}: no such file or folder")
             if is_camera(path):                          # which is read with its picture
-                continue
+                picture, lacks = with_camera(path)
+                if lacks:
+                    raise ValueError(f"{path}: expected its depth picture, {picture.name}, beside it; there is none")
+                if picture in self.paths:
+                    continue
+                path = picture
             path = statue_folder(path)
             if path.name.lower().endswith(PLACES):
                 self._lay_on(found, path)
@@ -92,6 +98,8 @@ class Files:
     def with_another(self, entries: Sequence[Entry], path: Path) -> list[Entry]:
         """Entries and those of one more file or folder, in the place of those that it had; ValueError as `entries`."""
         self._models.pop(path.resolve(), None)
+        self._found = [one for one in self._found if one != path]
+        self._recordings = [one for one in self._recordings if one != path]
         if path.name.lower().endswith(PLACES):
             found = list(entries)
             beside = [i for i, entry in enumerate(found) if landmarks_beside(entry.path) == path]
@@ -101,11 +109,17 @@ class Files:
                 self._lay_on(found, path)
             return found
         fresh = self._of_folder(path) if path.is_dir() else [self._of_file(path, path.name)]
-        old = [i for i, entry in enumerate(entries) if path in (entry.path, entry.folder)]
-        if old and len(fresh) > 1 and "/" not in entries[old[0]].name:
-            fresh = [replace(entry, name=entry.name.split("/", 1)[-1]) for entry in fresh]     # named as it was
+        old = [i for i, entry in enumerate(entries) if path in (entry.path, *entry.path.parents)]
+        shared = f"{path.resolve().name}/"
+        if old and not entries[old[0]].name.startswith(shared):                               # named as they were
+            fresh = [replace(entry, name=entry.name.removeprefix(shared)) for entry in fresh]
         place = old[0] if old else len(entries)
         return [*entries[:place], *fresh, *(entry for i, entry in enumerate(entries) if i > place and i not in old)]
+
+    def folders(self, entries: Sequence[Entry]) -> list[Path]:
+        """Those that commands wrote and entries are of, and those that were named."""
+        of_commands = [entry.folder for entry in entries if entry.folder is not None]
+        return list(dict.fromkeys([*of_commands, *(path for path in self.paths if path.is_dir())]))
 
     @property
     def models(self) -> list[Path]:
@@ -134,8 +148,8 @@ class Files:
         if kind not in loads:
             raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks, a depth picture "
                              f"or a folder, found {kind}")
-        of_kind = {"model": self._found, "markers": self._recordings}.get(kind, [])
-        of_kind.append(path)
+        self._found = [*self._found, *[path] * (kind == "model")]
+        self._recordings = [*self._recordings, *[path] * (kind == "markers")]
         return Entry(name, loads[kind], kind != "markers" or not self.over, path, kind)
 
     def _surface(self, path: Path, name: str) -> Content:

@@ -1,7 +1,7 @@
 """Pages that are reached from the view: which things offer which, and the apps that were opened."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,16 @@ from .files import SET, Entry, Files
 from .saving import free_name
 
 PEOPLE = "synthetic people"          # the model of those who have none
+Progress = Callable[[int, int], None]
 SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
 
 @dataclass(frozen=True)
 class FolderPage:
-    """A page that folders offer: what its button says, files that tell such a folder, and how its app is made."""
+    """A page that folders offer: what its button says, whether a folder is one of them, and how its app is made."""
 
     label: str
-    files: tuple[str, ...]
+    offered: Callable[[Path], bool]
     make: Callable[[Path], App]
 
 
@@ -37,7 +38,11 @@ def _mend(folder: Path) -> App:
     return MendApp(folder, ENDING)
 
 
-FOLDER_PAGES = {"mend": FolderPage("mend landmarks of", (SET, RUN), _mend)}
+def _has(*names: str) -> Callable[[Path], bool]:
+    return lambda folder: all((folder / name).is_file() for name in names)
+
+
+FOLDER_PAGES = {"mend": FolderPage("mend landmarks of", _has(SET, RUN), _mend)}
 
 
 class CompletePage(CompleteApp):
@@ -85,24 +90,30 @@ class Inside:
 
     def offered(self, entries: Sequence[Entry]) -> dict[str, Any]:
         """What the buttons are: pages of folders, and the scans and models of a completion, by number of the entry."""
-        folders = list(dict.fromkeys(entry.folder for entry in entries if entry.folder is not None))
+        folders = [(folder, page, one) for folder in self.files.folders(entries)
+                   for page, one in FOLDER_PAGES.items() if one.offered(folder)]
         return {"folders": [{"page": page, "folder": str(folder), "label": f"{one.label} {folder.resolve().name}"}
-                            for folder in folders for page, one in FOLDER_PAGES.items() if _has(folder, one.files)],
+                            for folder, page, one in folders],
                 "scans": [i for i, entry in enumerate(entries) if entry.kind in SCANS],
                 "models": [{"path": "", "name": PEOPLE},
                            *({"path": str(path), "name": path.name} for path in self.files.models)]}
 
-    def folder_page(self, page: str, name: str, entries: Sequence[Entry]) -> App:
-        """A page of the folder of this name that entries are of."""
-        folder = next((entry.folder for entry in entries if str(entry.folder) == name), None)
-        if page not in FOLDER_PAGES or folder is None:
-            raise ValueError(f"page: expected one that the list of things offers, got {page} of {name}")
-        if (page, folder) not in self.opened:
-            self.opened[page, folder] = FOLDER_PAGES[page].make(folder)
-        return self.opened[page, folder]
+    def enter(self, entries: Sequence[Entry], wanted: Mapping[str, Any], progress: Progress) -> App:
+        """What was asked for of things: a page of a folder, or the completion of a scan.
 
-    def completion(self, scan: Entry, model: str, progress: Callable[[int, int], None]) -> App:
-        """Completion of a scan by the model in a file, or, where that is "", of the synthetic people."""
+        `wanted` has "what", the page, and either "folder", or "scan", its number, and "model", a file or "".
+        """
+        if wanted["what"] == "complete":
+            return self._completion(entries[int(wanted["scan"])], wanted["model"], progress)
+        what, known = wanted["what"], self.files.folders(entries)
+        folder = next((folder for folder in known if str(folder) == wanted["folder"]), None)
+        if what not in FOLDER_PAGES or folder is None:
+            raise ValueError(f"page: expected one that the list of things offers, got {what} of {wanted['folder']}")
+        if (what, folder) not in self.opened:
+            self.opened[what, folder] = FOLDER_PAGES[what].make(folder)
+        return self.opened[what, folder]
+
+    def _completion(self, scan: Entry, model: str, progress: Progress) -> App:
         if scan.kind not in SCANS:
             raise ValueError(f"{scan.name}: expected a scan, found {scan.kind}")
         path = next((path for path in self.files.models if str(path) == model), None)
@@ -115,7 +126,7 @@ class Inside:
         page.open(scan)
         return page
 
-    def _complete_page(self, path: Path | None, progress: Callable[[int, int], None]) -> CompletePage:
+    def _complete_page(self, path: Path | None, progress: Progress) -> CompletePage:
         if path is None:
             from ..synthetic_people import synthetic_model
 
@@ -126,13 +137,14 @@ class Inside:
         work = Work(body, name, marks_of_template(model, None, name), CompletionConfig(), self.files.unit)
         return CompletePage(model, work, self.output, self.dropped)
 
+    @property
+    def completions(self) -> list[CompletePage]:
+        """Those that were opened."""
+        return [page for page in self.opened.values() if isinstance(page, CompletePage)]
+
     def written(self, app: App) -> list[Path]:
         """Folders that a page has written to since this was last asked."""
         if isinstance(app, CompletePage):
             fresh, app.fresh = app.fresh, []
             return list(dict.fromkeys(fresh))
         return [folder for (_, folder), other in self.opened.items() if other is app and folder is not None]
-
-
-def _has(folder: Path, files: tuple[str, ...]) -> bool:
-    return all((folder / name).is_file() for name in files)

@@ -107,8 +107,16 @@ def read_surface(path: Path, unit: str | None = None) -> Mesh | np.ndarray:
 
 
 def camera_before(points: np.ndarray) -> Camera:
-    """A view of points (n, 3) from the side of the depth camera that they come from, as it saw them."""
-    return Camera.from_side(points, np.array([0.0, 0, -1]), np.array([0.0, -1, 0]), 0.0)
+    """What a depth camera in the origin, that looks along z with y down, saw of points (n, 3), as it saw them.
+
+    One turns about what stands in the middle of the picture.
+    """
+    across = points[:, :2] / points[:, 2:]
+    low, high = across.min(axis=0), across.max(axis=0)
+    middle = (np.abs(across - (low + high) / 2) <= (high - low) / 6).all(axis=1)
+    away = float(np.quantile(points[middle if middle.any() else slice(None), 2], 0.25))
+    width, height = 2 * away * np.abs(across).max(axis=0)
+    return Camera(np.array([0, 0, away]), np.diag([1.0, -1, -1]), np.array([0, -1.0, 0]), width, height, away)
 
 
 def camera_of(shape: Mesh | np.ndarray) -> Camera:

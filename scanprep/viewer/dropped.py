@@ -12,14 +12,21 @@ from ..depth_camera.picture import CAMERA, camera_file, is_camera, is_picture
 
 
 class Dropped:
-    """A temporary folder with the files that were dropped."""
+    """A temporary folder with the files that were dropped, which is made with the first."""
 
     def __init__(self) -> None:
-        self.folder = Path(tempfile.mkdtemp(prefix="scapekit-"))
+        self._folder: Path | None = None
+
+    @property
+    def folder(self) -> Path:
+        """Where they are."""
+        if self._folder is None:
+            self._folder = Path(tempfile.mkdtemp(prefix="scapekit-"))
+        return self._folder
 
     def holds(self, path: Path) -> bool:
         """Whether this is one of its files."""
-        return path.parent == self.folder
+        return path.parent == self._folder
 
     @contextlib.contextmanager
     def keeping(self, name: str, path: Path) -> Iterator[Path]:
@@ -44,7 +51,8 @@ class Dropped:
 
     def close(self) -> None:
         """Forget all."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def with_camera(path: Path) -> tuple[Path, str]:

@@ -3,7 +3,7 @@ import { dropZone } from "./drop.js";
 import { make } from "./figure.js";
 import { button, OFF, Pick } from "./pick.js";
 
-const WHOLE = "Boxes and the list of colours under the bodies lay completed body, predicted body and scan over each other.";
+const WHOLE = "Under the bodies: boxes show the completed body, the predicted one and the scan; the list has the expected error as colours.";
 
 export class Complete extends Pick {
   build() {

@@ -17,6 +17,7 @@ export class Program {
       make("section", { class: "sk-view" }, this.stage, make("footer", {}, this.progress, this.status)));
     document.body.append(this.main);
     this.answers = {};
+    for (const kind of ["dragover", "drop"]) this.onWindow(kind, (event) => event.preventDefault());      // else the browser leaves the page
     this.theme();
     if (!hasWebGL()) this.say("This browser has no WebGL, so that bodies cannot be shown. Another browser, or its settings, may help.", "bad");
   }

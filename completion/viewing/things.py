@@ -1,0 +1,89 @@
+"""The things of a view: which there are, what is known of them, and which are shown."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from .contents import Content
+from .files import Entry, Files
+from .movable import MovableBody
+from .statues import movable
+
+MOST = 12                            # that are shown at a time
+
+
+class Things:
+    """Entries by their number, and for those that are shown what was read.
+
+    Attributes
+    ----------
+    entries : list of Entry
+    shown : list of int
+    contents, bodies : dict
+        What was read of those shown, and the bodies of those that are models.
+    problems, about : dict
+        Why one cannot be read; what is told of one that was.
+    """
+
+    def __init__(self, entries: Sequence[Entry], files: Files) -> None:
+        self.entries, self.files = list(entries), files
+        self.shown: list[int] = []
+        self.contents: dict[int, Content] = {}
+        self.bodies: dict[int, MovableBody] = {}
+        self.problems: dict[int, str] = {}
+        self.about: dict[int, str] = {}
+
+    def read(self, wanted: Sequence[int]) -> list[int]:
+        """Those of some entries that can be read."""
+        if len(wanted) > MOST:
+            raise ValueError(f"at most {MOST} can be shown at a time")
+        read: list[int] = []
+        for i in wanted:
+            try:
+                if i not in self.contents:
+                    content = self.entries[i].load()
+                    self.contents[i] = replace(content, name=self.entries[i].name,
+                                               stance=content.start or content.stance)
+                    self.about[i] = content.about
+                model = self.contents[i].model
+                if model is not None and i not in self.bodies:
+                    self.bodies[i] = movable(model, self.contents[i].statue)
+            except (ValueError, OSError) as problem:
+                self.problems[i] = str(problem)
+            else:
+                self.problems.pop(i, None)
+                read.append(i)
+        return read
+
+    def put(self, read: Sequence[int]) -> None:
+        """Show those that were read, and forget what was read of others."""
+        self.shown = list(read)
+        self.contents = {i: self.contents[i] for i in read}
+        self.bodies = {i: body for i, body in self.bodies.items() if i in read}
+
+    def join(self, path: Path) -> None:
+        """Show the things of one more file or folder with the others; ValueError, and all as before, where none can be.
+
+        What is known of things that stay is kept; those that were shown and have changed are shown again.
+        """
+        before = [(one, vars(one).copy()) for one in (self, self.files)]
+        try:
+            self._join(self.files.with_another(self.entries, path))
+        except (ValueError, OSError):
+            for one, kept in before:
+                vars(one).update(kept)
+            raise
+
+    def _join(self, entries: list[Entry]) -> None:
+        place = {i: entries.index(entry) for i, entry in enumerate(self.entries) if entry in entries}
+        fresh = [i for i in range(len(entries)) if i not in place.values()]
+        for name in ("problems", "contents", "bodies", "about"):
+            setattr(self, name, {place[i]: one for i, one in getattr(self, name).items() if i in place})
+        changed = {self.entries[i].path for i in self.shown if i not in place}
+        new = [i for i in fresh if entries[i].path in changed] or [i for i in fresh if entries[i].first] or fresh[:1]
+        self.entries = entries
+        read = self.read(sorted([*(place[i] for i in self.shown if i in place), *new][-MOST:]))
+        if not set(new) & set(read):
+            raise ValueError(self.problems[new[0]])
+        self.put(read)
