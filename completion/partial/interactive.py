@@ -28,8 +28,9 @@ from scanprep.viewer.surface_clicks import Clickable
 
 from .completion import Completion, complete
 from .report import completion_panes
-from .work import Inputs, ScanFiles, Work, figures, read_views, write_results
+from .work import Inputs, ScanFiles, Work, figures, read_masks, read_views, write_results
 
+ENDING = ".landmarks.json"
 FEWEST = 3                           # landmarks that say where a body is
 HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
@@ -42,6 +43,8 @@ class Made:
     seconds: float                       # that it took
     places: Mapping[str, np.ndarray]     # of the landmarks
     known: bool                          # whether the person's shape was
+    masked: np.ndarray | None = None     # points that were clothing or hair
+    stale: bool = False                  # whether its scan or the settings have changed since
 
 
 class CompleteApp(PickApp):
@@ -71,11 +74,18 @@ class CompleteApp(PickApp):
         super().__init__(template, [self._clicked(path) for path in scans], (), fixed=marks)
 
     def _clicked(self, path: Path, file: Path | None = None) -> Clicked:
-        one = Clicked.found(path, ".landmarks.json", self.work.unit, file)
-        self._views[path] = read_views([path], self.work.unit)
-        view = self._views[path].views[0]
-        one.surface = Clickable(view if isinstance(view, Mesh) else view.points)
+        one = Clicked.found(path, ENDING, self.work.unit, file)
+        one.surface = clickable(self._files(path))
         return one
+
+    def _files(self, path: Path) -> ScanFiles:
+        """A scan, read when it is first wanted."""
+        if path not in self._views:
+            self._views[path] = read_views([path], self.work.unit)
+        return self._views[path]
+
+    def _inputs(self, scan: Clicked) -> Inputs:
+        return Inputs((scan.path,), scan.file)
 
     # what the page is sent
 
@@ -92,8 +102,12 @@ class CompleteApp(PickApp):
         made = self.made.get(self.scan.path) if self.scan else None
         if made is None or self.scan is None:
             return None
-        views = list(self._views[self.scan.path].views)
-        return completion_panes(views, made.completion, self.model.template)[-1]
+        views = list(self._files(self.scan.path).views)
+        return completion_panes(views, made.completion, self.model.template, made.masked)[-1]
+
+    def _masked(self, scan: Clicked) -> np.ndarray | None:
+        masks = self._inputs(scan).masks
+        return read_masks(masks, self._files(scan.path), self.work.unit) if masks else None
 
     def more(self) -> dict[str, Any]:
         """What the completion says of itself, and what would help it."""
@@ -112,13 +126,13 @@ class CompleteApp(PickApp):
     def _figures(self, made: Made) -> list[Metric]:
         assert self.scan is not None
         pairs = pairs_of(made.places, self.work.marks)
-        return figures(self.work, Inputs((self.scan.path,)), made.completion, pairs, None)
+        return figures(self.work, Inputs((self.scan.path,)), made.completion, pairs, made.masked)
 
     def _outdated(self, made: Made) -> bool:
-        """Whether landmarks were changed since."""
+        """Whether landmarks, or anything else that it was made from, were changed since."""
         assert self.scan is not None
         now = {name: self.scan.places[name] for name in self._usable(self.scan)}
-        return made.known != self.known or set(now) != set(made.places) or any(
+        return made.stale or made.known != self.known or set(now) != set(made.places) or any(
             not np.array_equal(now[name], made.places[name]) for name in now)
 
     def _usable(self, scan: Clicked) -> list[str]:
@@ -130,6 +144,7 @@ class CompleteApp(PickApp):
         """A scan that was dropped on the page; it is completed beside the others, its landmarks saved with it."""
         kept = self._dropped / name
         shutil.copyfile(path, kept)
+        self._views.pop(kept, None)
         file = self.output / f"{name.split('.')[0]}.landmarks.json"
         one = self._clicked(kept, file if file.exists() else None)
         one.file = file
@@ -159,15 +174,17 @@ class CompleteApp(PickApp):
         if 0 < len(names) < FEWEST:
             raise ValueError(f"click at least {FEWEST} landmarks, or none")
         made = self.made.get(self.scan.path)
-        start = made.completion if made is not None and made.known == self.known and names and not anew else None
+        start = made.completion if made is not None and made.known == self.known and names and not anew \
+            and not self.work.config.free_scale else None
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in names}
+        views, masked = list(self._files(scan.path).views), self._masked(scan)
 
         def work(tell: Callable[[int, int], None]) -> str:
             begin = time.perf_counter()
-            done = complete(self._body(known), list(self._views[scan.path].views), pairs_of(places, self.work.marks),
-                            self.work.config, tell, start=start)
+            done = complete(self._body(known), views, pairs_of(places, self.work.marks), self.work.config, tell, masked,
+                            start)
             with self._lock:
-                self.made[scan.path] = Made(done, time.perf_counter() - begin, places, known)
+                self.made[scan.path] = Made(done, time.perf_counter() - begin, places, known, masked)
                 self.saved.pop(scan.path, None)
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
             if scan is self.scan:
@@ -191,17 +208,28 @@ class CompleteApp(PickApp):
         scan = self.scan
         folder = self.output if len(self.scans) == 1 else self.output / scan.path.name.split(".")[0]
         with workspace(folder) as space, space.staging("completion") as staged:
-            rows = write_results(replace(self.work, body=self._body(made.known)), Inputs((scan.path,), scan.file),
-                                 self._views[scan.path], made.completion, pairs_of(made.places, self.work.marks), None,
-                                 staged.folder)
-            write_report(Outcome(staged.folder, rows, {"complete": self.work.config}),
-                         "scape complete --interactive", made.seconds)
+            self._write(scan, made, staged.folder)
         self.saved[scan.path] = folder
         self.note = f"saved in {folder}"
+
+    def _write(self, scan: Clicked, made: Made, folder: Path) -> list[Metric]:
+        """All files of a completion into a folder; the figures."""
+        rows = write_results(replace(self.work, body=self._body(made.known)), self._inputs(scan),
+                             self._files(scan.path), made.completion, pairs_of(made.places, self.work.marks),
+                             made.masked, folder)
+        write_report(Outcome(folder, rows, {"complete": self.work.config}), "scape complete --interactive",
+                     made.seconds)
+        return rows
 
     def close(self) -> None:
         """Forget files that were dropped."""
         shutil.rmtree(self._dropped, ignore_errors=True)
+
+
+def clickable(files: ScanFiles) -> Clickable:
+    """The first view of a scan."""
+    view = files.views[0]
+    return Clickable(view if isinstance(view, Mesh) else view.points)
 
 
 def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -211,7 +239,8 @@ def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tupl
 
 def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict[str, np.ndarray]:
     """Where the completed body has its landmarks, of those that the scan shows."""
-    return {name: scan.nearest(done.completed.vertices[vertex]) for name, vertex in marks.items() if done.seen[vertex]}
+    return {name: scan.nearest(done.completed.vertices[vertex] / done.scale)
+            for name, vertex in marks.items() if done.seen[vertex]}
 
 
 def helpful(model: BodyModel, marks: Mapping[str, int], made: Made) -> list[str]:

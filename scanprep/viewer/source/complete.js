@@ -1,6 +1,6 @@
 // `scape complete --interactive`: landmarks as in `scape pick`, then a button, the whole body, and what it is worth.
 import { make } from "./figure.js";
-import { button, Pick } from "./pick.js";
+import { button, Pick, WORDS } from "./pick.js";
 
 export class Complete extends Pick {
   build() {
@@ -12,7 +12,8 @@ export class Complete extends Pick {
     this.anew = button("search anew", "forget the body that there is and search again", () => this.send("complete", { anew: true }));
     this.keep = button("save", "write the body, its pose and a report", () => this.send("save"));
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
-    this.scans.before(this.drop());
+    this.place = this.drop();
+    this.scans.before(this.place);
     this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict);
     this.buttons.predict.remove();
   }
@@ -31,7 +32,8 @@ export class Complete extends Pick {
 
   update(state) {
     super.update(state);
-    const { completed, working, can_choose: free } = state;
+    const { completed, working, can_choose: free, verdicts } = state;      // verdicts: of a folder of completions
+    this.place.hidden = Boolean(verdicts);
     this.known.checked = state.known;
     this.knownLabel.hidden = !free;
     const clicked = Object.keys(state.panes[1]?.places ?? {}).length;
@@ -39,19 +41,19 @@ export class Complete extends Pick {
     this.go.textContent = completed ? "complete again" : clicked ? `complete with ${clicked} landmarks` : "complete without landmarks";
     this.anew.hidden = !completed;
     this.anew.disabled = Boolean(working);
-    this.keep.disabled = !completed || Boolean(working);
-    this.verdict.hidden = !completed;
-    if (completed) this.judge(completed);
+    this.keep.disabled = !completed || Boolean(working) || (verdicts && Boolean(completed.outdated || completed.saved));
+    const stored = verdicts && { rows: [], helpful: [], ...verdicts[state.scan] };
+    this.verdict.hidden = !(completed ?? stored);
+    if (completed ?? stored) this.judge(completed ?? stored);
   }
 
   judge({ verdict, reasons, rows, outdated, helpful, saved }) {
-    const words = { good: "good", check: "look at it", failed: "failed" };
     this.verdict.dataset.verdict = verdict;
-    this.verdict.replaceChildren(make("strong", {}, outdated ? "landmarks changed since: complete again" : words[verdict] ?? verdict),
+    this.verdict.replaceChildren(make("strong", {}, outdated ? "it changed since: complete again" : WORDS[verdict] ?? verdict),
       make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))),
       helpful.length ? make("p", {}, "A landmark would help at: ", ...helpful.flatMap((name, i) => [i ? ", " : "",
         make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("choose", { name }); } }, name)])) : "",
-      make("details", {}, make("summary", {}, "figures"), make("table", {}, ...rows.map((row) => make("tr", {}, ...row.map((cell) => make("td", {}, cell)))))),
+      rows.length ? table(rows) : "",
       saved ? make("p", {}, `saved in ${saved}`) : "");
   }
 
@@ -59,4 +61,9 @@ export class Complete extends Pick {
     if (this.state.panes.length < 2) return "Drop a scan on the page.";
     return this.state.completed ? "" : `${super.hint()} Three to ten landmarks help most; then press “complete”.`;
   }
+}
+
+function table(rows) {
+  return make("details", {}, make("summary", {}, "figures"),
+    make("table", {}, ...rows.map((row) => make("tr", {}, ...row.map((cell) => make("td", {}, cell))))));
 }

@@ -6,6 +6,7 @@ import { Program } from "./program.js";
 const NEAR = 12;                     // pixels from a landmark that still take hold of it
 const STILL = 4;                     // pixels that a hand moves while it clicks
 const COLORS = { set: "#d5392f", chosen: "#f0a400", predicted: "#3b82c4" };
+export const WORDS = { good: "good", check: "look at it", failed: "failed", new: "new" };       // verdicts
 export const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete", "take the landmark away"],
   ["Enter", "confirm the predicted ones"], ["[ and ]", "previous, next scan"], ["+ and -", "move it along the view, into the body"],
   ["i", "click inside the body: joints"]];
@@ -55,7 +56,8 @@ export class Pick extends Program {
   update(state) {
     this.state = state;
     this.scans.hidden = state.scans.length < 2;
-    this.scans.replaceChildren(...state.scans.map(({ name, count }, i) => make("option", { selected: i === state.scan }, `${name}: ${count}`)));
+    this.scans.replaceChildren(...state.scans.map(({ name, count }, i) => make("option", { selected: i === state.scan },
+      state.verdicts ? `${WORDS[state.verdicts[i].verdict]} · ${name} (${count})` : `${name}: ${count}`)));
     this.buttons.undo.disabled = !state.undo;
     this.buttons.redo.disabled = !state.redo;
     const waiting = Object.keys(this.waiting()).length;
