@@ -217,6 +217,7 @@ class CompleteApp(PickApp):
         rows = write_results(replace(self.work, body=self._body(made.known)), self._inputs(scan),
                              self._files(scan.path), made.completion, pairs_of(made.places, self.work.marks),
                              made.masked, folder)
+        rows += [Metric("completed", "in the browser"), Metric("shape", "known" if made.known else "found")]
         write_report(Outcome(folder, rows, {"complete": self.work.config}), "scape complete --interactive",
                      made.seconds)
         return rows

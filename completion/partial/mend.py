@@ -12,7 +12,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.opening import workspace
 from scanprep.batch.workspace import HOME, Results, Workspace
-from scanprep.console import Metric, judgement_of, write_report
+from scanprep.console import judgement_of, write_report
 from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
@@ -141,8 +141,7 @@ class CompletionsApp(CompleteApp):
         with workspace(self.output) as space:
             with space.instead(self.plain, self.tasks[name]) as staged:
                 (staged.folder / name).mkdir()
-                how = Metric("completed", "in the browser" + (", as the model's own person" if made.known else ""))
-                staged.value = [*self._write(scan, made, staged.folder / name), how]
+                staged.value = self._write(scan, made, staged.folder / name)
             self.fresh.add(name)
             self.results = kept_results(space, list(self.tasks))
             with space.staging("report") as staged:

@@ -12,8 +12,8 @@ export class Complete extends Pick {
     this.anew = button("search anew", "forget the body that there is and search again", () => this.send("complete", { anew: true }));
     this.keep = button("save", "write the body, its pose and a report", () => this.send("save"));
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
-    this.place = this.drop();
-    this.scans.before(this.place);
+    this.dropping = this.drop();
+    this.scans.before(this.dropping);
     this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict);
     this.buttons.predict.remove();
   }
@@ -33,7 +33,7 @@ export class Complete extends Pick {
   update(state) {
     super.update(state);
     const { completed, working, can_choose: free, verdicts } = state;      // verdicts: of a folder of completions
-    this.place.hidden = Boolean(verdicts);
+    this.dropping.hidden = Boolean(verdicts);
     this.known.checked = state.known;
     this.knownLabel.hidden = !free;
     const clicked = Object.keys(state.panes[1]?.places ?? {}).length;
