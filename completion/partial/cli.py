@@ -68,8 +68,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     if up is not None:
         config = replace(config, up=AXES[up])
     if len(scans) == 1 and scans[0].is_dir():
-        person = subject if subject in (None, "template") else str(Path(subject).absolute())
-        call = FolderCall(scans[0], model, landmarks, person, template_landmarks, _only(mask), unit, config)
+        call = FolderCall(scans[0], model, landmarks, subject, template_landmarks, _only(mask), unit, config)
         return _mended(call, space) if interactive else _folder(call, space, workers)
     if interactive:
         return _in_browser(scans, output, model, subject, template_landmarks, unit, config)

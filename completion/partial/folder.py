@@ -37,6 +37,7 @@ class FolderCall(KeptCall):
     """What `scape complete` was called with for a folder of scans."""
 
     command: ClassVar[str] = "scape complete"
+    may_be_files: ClassVar[tuple[str, ...]] = ("subject",)
     scans: Path
     model: Path | None = None
     landmarks: Path | None = None

@@ -23,10 +23,13 @@ class KeptCall:
     """
 
     command: ClassVar[str]
+    may_be_files: ClassVar[tuple[str, ...]] = ()         # fields with a text that is a word or names a file
 
     def write(self, folder: Path) -> None:
         """Keep it in a folder."""
         given: dict[str, Any] = {f.name: _absolute(getattr(self, f.name)) for f in fields(self)}
+        given |= {name: str(Path(given[name]).absolute()) for name in self.may_be_files
+                  if given[name] is not None and Path(given[name]).exists()}
         given["config"] = config_files.write({"config": given["config"]})
         storage.write_json(folder / RUN, {"kind": _kind(self), "version": VERSION, **given})
 

@@ -87,13 +87,19 @@ export class Pick extends Program {
     this.list.replaceChildren(...names.map((name) => {
       const marks = panes.map((pane) => make("span", { class: name in pane.places ? "sk-on" : name in pane.predicted ? "sk-guess" : "sk-off",
         title: name in pane.places ? "set" : name in pane.predicted ? "predicted" : "not set" }));
-      const far = panes[1] && name in panes[1].places && name in panes[1].predicted ? distance(panes[1].places[name], panes[1].predicted[name]) : null;
       const item = make("li", { "aria-current": name === chosen ? "true" : null, tabindex: 0, onclick: (event) => this.choose(name, event) },
         make("span", { class: "sk-dots" }, ...marks), make("span", {}, name),
-        far === null ? "" : make("small", { title: "from where it was predicted" }, `${(1000 * far).toFixed(0)} mm`));
+        this.beside(name));
       return item;
     }));
     this.list.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+  }
+
+  // What is told beside a name: how far it is from where it was predicted.
+  beside(name) {
+    const { places = {}, predicted = {} } = this.state.panes[1] ?? {};
+    if (!(name in places && name in predicted)) return "";
+    return make("small", { title: "from where it was predicted" }, `${(1000 * distance(places[name], predicted[name])).toFixed(0)} mm`);
   }
 
   choose(name, event) {

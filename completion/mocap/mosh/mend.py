@@ -1,0 +1,235 @@
+"""A result of `scape mosh` in the browser: the markers on the body, those worst first, put right, and run again."""
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.body import BodyModel
+from scanprep.batch.opening import workspace
+from scanprep.batch.pool import Progress, Workers
+from scanprep.batch.workspace import HOME, Workspace
+from scanprep.console import Metric, judgement_of, write_report
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.scene import pack_scene
+from scanprep.viewer.app import Send
+from scanprep.viewer.clicked import Clicked
+from scanprep.viewer.messages import Message
+from scanprep.viewer.pick import SCAN, PickApp
+from scanprep.viewer.surface_clicks import Clickable
+
+from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import choose_layout
+from .call import MoshCall
+from .cli import carried_out
+from .mended_layout import Spot, changes, mended, next_file
+from .people import Found, found_people
+from .work import ERRORS
+
+MENDED = "scape mosh, mended in the browser"
+LEAST = 3                            # markers that a person needs
+GRAVEST = ("failed", "check", "good")
+
+
+def mend_mosh(folder: Path) -> MoshApp:
+    """The app of a folder that `scape mosh` made; ValueError for one that does not tell."""
+    return MoshApp(folder)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a folder holds: figures of the people, those worst first, and the layout as it was used."""
+
+    call: MoshCall
+    rows: dict[str, list[Metric]]
+    people: list[Found]
+    usual: MarkerLayout
+    template: Mesh
+
+    @staticmethod
+    def read(folder: Path, call: MoshCall) -> Result:
+        """That of a folder, which need not be open."""
+        models, kept = call.models(), Workspace(folder, folder / HOME)
+        names = set(kept.kept(""))
+        actors = [actor for actor in call.actors(folder) if actor.name in names]
+        rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
+        people = found_people(folder, sorted(actors, key=lambda actor: _gravity(rows[actor.name])), models, call.unit)
+        return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
+
+
+class MoshApp(PickApp):
+    """The state of the page on which a result of `scape mosh` is mended.
+
+    The first pane is the layout on the model's template, the second a person at rest with the markers where they were
+    found, which are moved, exchanged or taken away; the third a frame of the person.
+    """
+
+    name, title = "mosh", "Mend markers"
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.frame = folder, 0
+        self.before: dict[str, list[Metric]] = {}
+        self._show(Result.read(folder, MoshCall.read(folder)))
+        super().__init__(self.template, self.scans, (), fixed=self.template.places)
+
+    def _show(self, result: Result) -> None:
+        """Begin with a result, and with corrections that were not run yet."""
+        self.result, self.file = result, next_file(self.folder, result.call.layout)
+        self.spots = changes(result.usual, MarkerLayout.load(self.file)) if self.file.exists() else {}
+        self.template = Clicked(Path("layout"), self.file, surface=Clickable(result.template))
+        at = result.usual.skin_points(result.template.vertices)
+        self.template.places = dict(zip(result.usual.labels, at, strict=True))
+        self.scans = [Clicked(Path(one.name), self.file, surface=Clickable(one.body)) for one in result.people]
+        self._place()
+
+    @property
+    def person(self) -> Found:
+        """That is shown."""
+        return self.result.people[self.current]
+
+    # what the page is sent
+
+    def scene(self) -> Message:
+        """The layout, the person at rest, and a frame."""
+        assert self.scan is not None, "a result is of somebody"
+        frame = self.person.worst[self.frame]
+        panes = [replace(self.template.pane("the layout"), label="where the layout has them"),
+                 self.scan.pane(f"{self.person.name}: where they were found"), self.person.pane(frame)]
+        return Message("scene", {}, pack_scene(panes))
+
+    def more(self) -> dict[str, Any]:
+        """What is to be thought of people, markers and frames; and the figures of the run before."""
+        person, rows = self.person, self.result.rows[self.person.name]
+        before = {m.name: m.text() for m in self.before.get(person.name, [])}
+        changed = [label for label in person.names if self._own(label) in self.spots]
+        return {"verdicts": [_told(self.result.rows[one.name]) for one in self.result.people],
+                "off": {label: 1000 * far for label, far in person.off.items() if np.isfinite(far)},
+                "doubts": person.doubts, "changed": changed, "frame": self.frame,
+                "frames": [one.told for one in person.worst], "corrected": self.file.name,
+                "rows": [[m.name, before.get(m.name, ""), m.text(), m.unit] for m in rows if m.name in ERRORS]}
+
+    def choose_next(self, last: str | None, pane: int = SCAN) -> None:
+        """The marker stays the same: at first the worst."""
+        self.names = tuple(self.person.names)
+        self.chosen = last if last in self.names else self.names[0]
+
+    # what the page sends
+
+    def on_open(self, send: Send, scan: int) -> None:
+        """Another person."""
+        if not 0 <= scan < len(self.scans):
+            raise ValueError(f"person: expected 0 to {len(self.scans) - 1}, got {scan}")
+        if scan != self.current:
+            self.current, self.frame = scan, 0
+            self.choose_next(None)
+            send(self.scene())
+
+    def on_frame(self, send: Send, frame: int) -> None:
+        """Another of the worst frames."""
+        if not 0 <= frame < len(self.person.worst):
+            raise ValueError(f"frame: expected 0 to {len(self.person.worst) - 1}, got {frame}")
+        self.frame = frame
+        send(self.scene())
+
+    def on_exchange(self, send: Send, name: str, other: str) -> None:
+        """Exchange two markers: each is where the other was."""
+        places = self._editable(SCAN).places
+        if name == other or name not in places or other not in places:
+            raise ValueError("choose two markers that have a place, to exchange them")
+        self._change(self.current, {name: places[other], other: places[name]})
+
+    def on_run(self, send: Send) -> None:
+        """The same call with the corrected layout."""
+        if self.working is not None:
+            return
+        if not self.spots:
+            raise ValueError("nothing was corrected: move, exchange or take away a marker first")
+        call, before = replace(self.result.call, layout=str(self.file)), self.result.rows
+        worn = {label for one in self.result.people for label in one.names}
+        mended(self.result.usual, self.spots).matched(sorted(worn), LEAST)
+
+        def work(tell: Progress) -> str:
+            begin = time.perf_counter()
+            with workspace(self.folder) as space:
+                outcome = carried_out(call, space, Workers(workers=1), MENDED, lambda done, total: None, tell)
+                with space.staging("report") as staged:
+                    write_report(replace(outcome, output=staged.folder), MENDED, time.perf_counter() - begin)
+            result, person = Result.read(self.folder, call), self.person.name
+            with self._lock:
+                self.before, self.frame = before, 0
+                self._show(result)
+                self.done.clear()
+                self.undone.clear()
+                self.current = next((i for i, one in enumerate(result.people) if one.name == person), 0)
+                self.choose_next(self.chosen)
+                scene = self.scene()
+            send(scene)
+            failed = f"; failed: {'; '.join(outcome.failures)}" if outcome.failures else ""
+            return f"run again with {Path(str(call.layout)).name}{failed}"
+
+        self.beside("finding shape, markers and motion", work, send, "it could not be run again")
+
+    # the state itself
+
+    def _editable(self, pane: int) -> Clicked:
+        if pane != SCAN:
+            raise ValueError("the first body shows the layout as it was; click on the person beside it")
+        return super()._editable(pane)
+
+    def _predict_if_time(self, send: Send, pane: int) -> None:
+        """Markers are not predicted."""
+
+    def _set(self, number: int, places: Mapping[str, np.ndarray | None]) -> None:
+        """Markers of a person elsewhere, and so of all, whose layout is one; the file is written at once."""
+        person = self.result.people[number]
+        for label, place in places.items():
+            found = person.places.get(label)
+            if place is None if found is None else place is not None and np.array_equal(place, found):
+                self.spots.pop(self._own(label), None)
+            else:
+                self.spots[self._own(label)] = None if place is None else Spot.at(person.body, place)
+        self._place()
+        if self.spots:
+            mended(self.result.usual, self.spots).save(self.file)
+        else:
+            self.file.unlink(missing_ok=True)
+
+    def _place(self) -> None:
+        """The markers of all people as they were found, but for those that were changed."""
+        for person, scan in zip(self.result.people, self.scans, strict=True):
+            scan.places = dict(person.places)
+            for label in person.names:
+                if self._own(label) in self.spots:
+                    scan.places.pop(label, None)
+                    if (spot := self.spots[self._own(label)]) is not None:
+                        scan.places[label] = spot.on(person.body)
+
+    def _own(self, label: str) -> str:
+        """The layout's name of a marker."""
+        return self.result.usual.aliases.get(label, label)
+
+
+def _usual(call: MoshCall, model: BodyModel, people: list[Found]) -> MarkerLayout:
+    """The layout that all people have in common, as it was before it was corrected here."""
+    names = [call.layout] if call.layout else sorted({one.layout_name for one in people})
+    if len(names) > 1:
+        raise ValueError(f"the people of this folder wear different sets of markers ({', '.join(names)}); run "
+                         "scape mosh for each of them into a folder of its own")
+    labels = tuple(dict.fromkeys(label for one in people for label in one.labels))
+    return choose_layout(model, names[0], labels)[0]
+
+
+def _gravity(rows: list[Metric]) -> tuple[int, float]:
+    """Failed people first, then those with the largest error."""
+    error = next((float(m.value) for m in rows if m.name == ERRORS[0]), 0.0)
+    return GRAVEST.index(_told(rows)["verdict"]), -error
+
+
+def _told(rows: list[Metric]) -> dict[str, Any]:
+    judgement = judgement_of(rows)
+    return {"verdict": "good", "reasons": []} if judgement is None else \
+        {"verdict": judgement.verdict, "reasons": list(judgement.reasons)}
