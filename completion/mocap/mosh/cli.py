@@ -140,8 +140,8 @@ def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], fail
     """All people, those with the largest error first."""
     page = Page(f"{len(metrics)} {'person' if len(metrics) == 1 else 'people'} from markers, worst first",
                 "Each picture leads to the page of the person, and that to the sequences.")
-    page.text("A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should not be "
-              "used: open this folder with `scape view` and press `mend` to put them right and run again.")
+    page.text("A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should "
+              "not be used: open this folder with `scape view` and press `mend` to put them right and run again.")
     if failures:
         page.section("Failed").table([(line,) for line in failures])
     error = {name: float(next(m.value for m in rows if m.name == ERRORS[0])) for name, rows in metrics.items()}

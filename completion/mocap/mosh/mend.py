@@ -136,11 +136,26 @@ class MoshApp(PickApp):
         send(self.scene())
 
     def on_exchange(self, send: Send, name: str, other: str) -> None:
-        """Exchange two markers: each is where the other was."""
-        places = self._editable(SCAN).places
-        if name == other or name not in places or other not in places:
-            raise ValueError("choose two markers that have a place, to exchange them")
-        self._change(self.current, {name: places[other], other: places[name]})
+        """Exchange two markers, whose labels were mixed up: each is where the layout has the other.
+
+        Not where the other was found, which by the wrong label is anywhere.
+        """
+        if name == other or not {name, other} <= set(self.person.names):
+            raise ValueError("choose two markers of this person, to exchange them")
+        self._change(self.current, {name: self._given(other), other: self._given(name)})
+
+    def _given(self, label: str) -> np.ndarray:
+        """Where the layout, as it is corrected by now, has a marker on the person that is shown."""
+        spot = self.spots.get(self._own(label)) or Spot.of(self.result.usual, self._own(label))
+        return spot.on(self.person.body)
+
+    def _spot(self, number: int, label: str, place: np.ndarray) -> Spot:
+        """A place as the layout will have it: that of one of its markers with all that it says of that."""
+        person, usual = self.result.people[number], self.result.usual
+        for spot in [*self.spots.values(), *(Spot.of(usual, other) for other in usual.labels)]:
+            if spot is not None and np.array_equal(spot.on(person.body), place):
+                return spot
+        return Spot.at(person.body, place, Spot.of(usual, self._own(label)).distance)
 
     def on_run(self, send: Send) -> None:
         """The same call with the corrected layout."""
@@ -191,7 +206,7 @@ class MoshApp(PickApp):
             if place is None if found is None else place is not None and np.array_equal(place, found):
                 self.spots.pop(self._own(label), None)
             else:
-                self.spots[self._own(label)] = None if place is None else Spot.at(person.body, place)
+                self.spots[self._own(label)] = None if place is None else self._spot(number, label, place)
         self._place()
         if self.spots:
             mended(self.result.usual, self.spots).save(self.file)

@@ -36,6 +36,7 @@ export class Mosh extends Pick {
     this.frames.replaceChildren(...frames.map((told, i) => make("option", { selected: i === frame }, told)));
     const wanted = this.other.value;
     this.other.replaceChildren(...names.filter((name) => name !== chosen && name in panes[1].places).map((name) => make("option", { selected: name === wanted }, name)));
+    this.told.hidden = !doubts[chosen];
     this.told.replaceChildren(...(doubts[chosen] ?? []).map((line) => make("li", {}, line)));
     this.away.disabled = this.exchange.disabled = !(chosen in panes[1].places);
     this.go.disabled = Boolean(working) || !changed.length;
