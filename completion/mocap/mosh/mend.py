@@ -31,6 +31,7 @@ from .people import Found, found_people
 from .work import ERRORS
 
 MENDED = "scape mosh, mended in the browser"
+TOLD = "markers in the mean distance"
 LEAST = 3                            # markers that a person needs
 GRAVEST = ("failed", "check", "good")
 
@@ -59,6 +60,15 @@ class Result:
         rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
         people = found_people(folder, sorted(actors, key=lambda actor: _gravity(rows[actor.name])), models, call.unit)
         return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
+
+
+    def figures(self, name: str) -> list[Metric]:
+        """How far the markers of a person are from the body: all of them, and those that are believed."""
+        off = next(one.off for one in self.people if one.name == name)
+        known = [1000 * far for far in off.values() if np.isfinite(far)] or [np.nan]
+        return [Metric("distance of all markers, mean", float(np.mean(known)), "mm"),
+                Metric("distance of the worst marker", float(np.max(known)), "mm"),
+                *(m for m in self.rows[name] if m.name in (*ERRORS, TOLD))]
 
 
 class MoshApp(PickApp):
@@ -103,14 +113,15 @@ class MoshApp(PickApp):
 
     def more(self) -> dict[str, Any]:
         """What is to be thought of people, markers and frames; and the figures of the run before."""
-        person, rows = self.person, self.result.rows[self.person.name]
+        person = self.person
         before = {m.name: m.text() for m in self.before.get(person.name, [])}
         changed = [label for label in person.names if self._own(label) in self.spots]
         return {"verdicts": [_told(self.result.rows[one.name]) for one in self.result.people],
                 "off": {label: 1000 * far for label, far in person.off.items() if np.isfinite(far)},
                 "doubts": person.doubts, "changed": changed, "frame": self.frame,
                 "frames": [one.told for one in person.worst], "corrected": self.file.name,
-                "rows": [[m.name, before.get(m.name, ""), m.text(), m.unit] for m in rows if m.name in ERRORS]}
+                "rows": [[m.name, before.get(m.name, ""), m.text(), m.unit]
+                         for m in self.result.figures(person.name)]}
 
     def choose_next(self, last: str | None, pane: int = SCAN) -> None:
         """The marker stays the same: at first the worst."""
@@ -163,7 +174,8 @@ class MoshApp(PickApp):
             return
         if not self.spots:
             raise ValueError("nothing was corrected: move, exchange or take away a marker first")
-        call, before = replace(self.result.call, layout=str(self.file)), self.result.rows
+        call = replace(self.result.call, layout=str(self.file))
+        before = {one.name: self.result.figures(one.name) for one in self.result.people}
         worn = {label for one in self.result.people for label in one.names}
         mended(self.result.usual, self.spots).matched(sorted(worn), LEAST)
 
