@@ -170,8 +170,7 @@ def test_a_folder_is_completed_scan_by_scan(folder):
         assert load_completion(out / name).seen.any() and (out / name / "report.html").is_file()
     page = (out / "report.html").read_text()
     assert 'href="a/report.html"' in page and len(scenes_of(page)) == 2 and "c.ply" in page
-    assert sorted(p.name for p in out.iterdir() if p.name != ".scapekit") == [
-        "a", "b", "report.html", "report.json", "run.json"]
+    assert sorted(p.name for p in out.iterdir() if p.name != ".scapekit") == ["a", "b", "report.html", "report.json"]
 
 
 def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder, capsys):

@@ -15,7 +15,7 @@ from completion.partial import report
 from completion.partial.completion import load_completion
 from completion.partial.folder import FolderCall
 from completion.partial.mend import CompletionsApp, mend_completions
-from scanprep.batch.calls import RUN
+from scanprep.batch.calls import RUN, command_of
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.landmarks import read_landmarks, write_landmarks
 from scanprep.geometry.storage import StorageError
@@ -162,6 +162,7 @@ def test_a_folder_is_mended_in_the_browser_and_the_command_keeps_it(place, new_p
 
 
 def test_a_folder_that_was_moved_or_made_earlier_is_told(place, tmp_path):
+    assert command_of(place / "out") == "scape complete" and command_of(place / "scans") == ""
     call = FolderCall.read(place / "out")
     assert call.scans == place / "scans" and call.config.rounds == 3 and call.subject == "template"
     replace(call, scans=tmp_path / "gone").write(tmp_path)

@@ -47,8 +47,7 @@ def done(place, tmp_path_factory):
 
 
 def test_everything_is_written(done):
-    assert {p.name for p in done.iterdir()} == {
-        ".scapekit", "ann", "report.html", "report.json", "run.json", "subjects.csv"}
+    assert {p.name for p in done.iterdir()} == {".scapekit", "ann", "report.html", "report.json", "subjects.csv"}
     assert {p.name for p in (done / "ann").iterdir()} == PERSON | {"walk", "run"}
     for name in ("walk", "run"):
         assert {p.name for p in (done / "ann" / name).iterdir()} == TAKE | {

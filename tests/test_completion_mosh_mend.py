@@ -146,6 +146,7 @@ def test_a_result_that_was_moved_or_made_earlier_is_told(place, tmp_path):
         with pytest.raises(ValueError, match=message):
             MoshApp(tmp_path / "out")
     (tmp_path / "out" / RUN).unlink()
+    (tmp_path / "out" / HOME / RUN).unlink()
     with pytest.raises(StorageError, match="run the same command once more"):
         MoshApp(tmp_path / "out")
 

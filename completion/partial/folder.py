@@ -13,7 +13,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from model.posing.cli import read_subject
 from scanprep.batch.calls import KeptCall
-from scanprep.batch.workspace import Results, Task, Workspace
+from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, failures_of
 from scanprep.geometry.landmarks import read_landmark_vertices
@@ -93,7 +93,7 @@ def written(call: FolderCall, model: str, results: Results, space: Workspace, co
     with space.staging(PAGE) as staged:
         folder_page(results.values, list(results.failures.values()), space.folder, call).write(
             staged.folder / "report.html")
-        call.write(staged.folder)
+        call.write(staged.folder / HOME)
         staged.value = results.failures
     return told(call, model, results, space, count)
 

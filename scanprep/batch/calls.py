@@ -1,4 +1,7 @@
-"""What a command was called with, kept in the folder that it wrote: the same can be done again from elsewhere."""
+"""What a command was called with, kept in the folder that it wrote: the same can be done again from elsewhere.
+
+In the folder itself, or with the rest of what scapekit knows of it.
+"""
 from __future__ import annotations
 
 import typing
@@ -10,8 +13,9 @@ from typing import Any, ClassVar, TypeVar
 from .. import config_files
 from ..geometry import storage
 from ..ranges import Settings
+from .ownership import HOME
 
-RUN, VERSION = "run.json", 1
+RUN, VERSION, CALL = "run.json", 1, "call of "
 Of = TypeVar("Of", bound="KeptCall")
 
 
@@ -36,8 +40,8 @@ class KeptCall:
     @classmethod
     def read(cls: type[Of], folder: Path) -> Of:
         """That of a folder; StorageError for one that does not tell."""
-        path = folder / RUN
-        if not path.exists():
+        path = _file(folder)
+        if path is None:
             raise storage.StorageError(f"{folder}: it does not tell what it was made from, as what {cls.command} made "
                                        "earlier does not; run the same command once more")
         with storage.taking_apart(path, f"a {_kind(cls)}"):
@@ -50,8 +54,23 @@ class KeptCall:
             return cls(**{name: _as(value, hints[name]) for name, value in told.items()} | {"config": config})
 
 
+def command_of(folder: Path) -> str:
+    """The command whose call is kept in a folder, such as "scape mosh"; empty where none is."""
+    path = _file(folder)
+    try:
+        told = storage.read_json(path, "a kept call") if path else None
+    except storage.StorageError:
+        return ""
+    kind = told.get("kind") if isinstance(told, dict) else None
+    return kind.removeprefix(CALL) if isinstance(kind, str) and kind.startswith(CALL) else ""
+
+
+def _file(folder: Path) -> Path | None:
+    return next((path for path in (folder / RUN, folder / HOME / RUN) if path.is_file()), None)
+
+
 def _kind(call: KeptCall | type[KeptCall]) -> str:
-    return f"call of {call.command}"
+    return CALL + call.command
 
 
 def _absolute(value: Any) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from scanprep.batch.pool import Progress, Workers
-from scanprep.batch.workspace import Task, Workspace
+from scanprep.batch.workspace import HOME, Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, judgement_of, say
 from scanprep.pictures.page import Page
@@ -90,7 +90,7 @@ def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str
     metrics = {name: [m for m in rows if m.name != JUDGEMENT] for name, (rows, _) in done.values.items()}
     with space.staging("page") as staged:
         _page(actors, metrics, failures).write(staged.folder / "report.html")
-        call.write(staged.folder)
+        call.write(staged.folder / HOME)
     settings = {"mosh": call.config, "model": loaded.name, "layout": call.layout, "held out": call.hold_out}
     return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures)
 
