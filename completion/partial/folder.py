@@ -126,9 +126,8 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
                 ) -> Page:
     """The page of all scans, those worst explained first; what is told of them lies in the folder."""
     page = Page(f"{len(metrics)} scans completed", "Worst first; each name leads to the page of its scan.")
-    model = f" -m {call.model}" if call.model else ""
-    page.text("To mend some, the same command with --interactive opens these results in the browser, worst first: "
-              f"scape complete {call.scans}{model} -o {folder} --interactive")
+    page.text("To mend some, run the same command with --interactive: it opens these results in the browser, worst "
+              f"first (scape complete {call.scans} ... -o {folder} --interactive).")
     if failures:
         page.section("Failed").table([(line,) for line in failures])
     names = sorted(metrics, key=lambda name: explained(metrics[name]))

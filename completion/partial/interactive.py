@@ -165,7 +165,7 @@ class CompleteApp(PickApp):
         self.known = bool(known) or not self.can_choose
 
     def on_complete(self, send: Send, anew: bool = False) -> None:
-        """Complete the scan, going on from the body that there is; `anew` searches again."""
+        """Complete the scan, going on from the body that there is, if that means anything; `anew` searches again."""
         if self.scan is None:
             raise ValueError("drop a scan on the page first")
         if self.working is not None:
@@ -174,8 +174,9 @@ class CompleteApp(PickApp):
         if 0 < len(names) < FEWEST:
             raise ValueError(f"click at least {FEWEST} landmarks, or none")
         made = self.made.get(self.scan.path)
-        start = made.completion if made is not None and made.known == self.known and names and not anew \
-            and not self.work.config.free_scale else None
+        on = made is not None and made.known == self.known and names and not anew \
+            and not self.work.config.free_scale and made.completion.judgement.verdict != "failed"
+        start = made.completion if made is not None and on else None
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in names}
         views, masked = list(self._files(scan.path).views), self._masked(scan)
 

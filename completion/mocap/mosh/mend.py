@@ -166,7 +166,7 @@ class MoshApp(PickApp):
         for spot in [*self.spots.values(), *(Spot.of(usual, other) for other in usual.labels)]:
             if spot is not None and np.array_equal(spot.on(person.body), place):
                 return spot
-        return Spot.at(person.body, place, Spot.of(usual, self._own(label)).distance)
+        return Spot.at(person.skin, place, Spot.of(usual, self._own(label)).distance)
 
     def on_run(self, send: Send) -> None:
         """The same call with the corrected layout."""

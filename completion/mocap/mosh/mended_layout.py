@@ -37,10 +37,10 @@ class Spot:
     loose: bool = False
 
     @staticmethod
-    def at(body: Mesh, place: np.ndarray, distance: float) -> Spot:
+    def at(surface: Surface, place: np.ndarray, distance: float) -> Spot:
         """That nearest to a place (3,), metres, on a body."""
-        found = Surface(body).closest(place[None])
-        return Spot(body.faces[found.faces[0]], found.bary[0], distance)
+        found = surface.closest(place[None])
+        return Spot(surface.mesh.faces[found.faces[0]], found.bary[0], distance)
 
     @staticmethod
     def of(layout: MarkerLayout, label: str) -> Spot:

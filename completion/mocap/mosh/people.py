@@ -13,6 +13,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Bones, Dots, Heat, Solid
 
@@ -72,6 +73,11 @@ class Found:
     def body(self) -> Mesh:
         """At rest."""
         return standing(self.model, np.array(self.about["betas"]))
+
+    @cached_property
+    def skin(self) -> Surface:
+        """At rest, for what is nearest."""
+        return Surface(self.body)
 
     @cached_property
     def places(self) -> dict[str, np.ndarray]:

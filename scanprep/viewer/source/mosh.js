@@ -50,6 +50,11 @@ export class Mosh extends Pick {
       name in doubts ? `${told} ?` : told);
   }
 
+  place(...given) {
+    this.inside = false;                                // of the key for joints
+    super.place(...given);
+  }
+
   hint() { return `Click where “${this.state.chosen}” truly sits on the person at rest, or drag it there.`; }
 
   tellFile() { this.file.textContent = this.state.changed.length ? `saved at every click in ${this.state.corrected}; your own layout stays as it is` : ""; }
