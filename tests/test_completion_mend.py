@@ -19,6 +19,7 @@ from scanprep.batch.calls import RUN, command_of
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.landmarks import read_landmarks, write_landmarks
 from scanprep.geometry.storage import StorageError
+from scanprep.viewer import server
 from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server
 
@@ -123,9 +124,9 @@ def test_a_folder_is_mended_in_the_browser_and_the_command_keeps_it(place, new_p
     """The exchanged landmarks are taken away by key, the body, which had failed, completed again, and saved."""
     untouched = (place / "out" / "a" / "completed.ply").stat().st_mtime_ns
     app = mend_completions(place / "out")
-    with Server(app) as server:
+    with Server(app) as served:
         page = new_page(viewport={"width": 1300, "height": 800})
-        page.goto(server.opening())
+        page.goto(served.opening())
         wait_until(page, "Boolean(window.program?.figure && program.state)")
         page.locator("select[aria-label=scan]").select_option(index=1)
         wait_until(page, "program.state.scan === 1 && program.figure.panes.length === 3")
@@ -154,11 +155,35 @@ def test_a_folder_is_mended_in_the_browser_and_the_command_keeps_it(place, new_p
     assert made["command"] == "scape complete --interactive"
     assert {"metric": "completed", "value": "in the browser", "unit": ""} in made["metrics"]
     assert "--interactive" in (place / "out" / "report.html").read_text()
+    later = (place / "scans" / "d.ply").rename(place / "d.ply")
+    assert run(place) == 1 and figures(place)["of them in this run"] == 0    # c fails still
+    later.rename(place / "scans" / "d.ply")
     shutil.copy(place / "scans" / "a.landmarks.json", place / "scans" / "d.landmarks.json")
-    assert run(place) == 1 and figures(place)["of them in this run"] == 1    # d alone is new; c fails still
     assert (place / "out" / "a" / "completed.ply").stat().st_mtime_ns == untouched
     kept = load_completion(place / "out" / "b")
     np.testing.assert_array_equal(kept.completed.vertices, mended.completed.vertices)
+
+
+def test_by_the_command_itself_nothing_is_lost_and_new_scans_can_be_begun(place, monkeypatch):
+    """Looked at and left alone; then the scan that came later is completed there, in a folder of its own too."""
+    before = json.loads((place / "out" / "report.json").read_text())
+    monkeypatch.setattr(server, "serve", lambda app: None)
+    assert run(place, "--interactive") == 1                                  # c fails still
+    after = json.loads((place / "out" / "report.json").read_text())
+    assert after["failures"] == before["failures"] and {"metric": "bodies saved", "value": 0, "unit": ""} in \
+        after["metrics"]
+
+    def complete_d(app):
+        opened(app, "d")
+        sent(app, "complete")
+        finished(app)
+        sent(app, "save")
+
+    (place / "scans" / "c.ply").unlink()
+    monkeypatch.setattr(server, "serve", complete_d)
+    assert run(place, "--interactive", "-o", str(place / "new")) == 0
+    assert sorted(p.name for p in (place / "new").iterdir()) == [".scapekit", "d", "report.html", "report.json"]
+    assert [one["verdict"] for one in told(mend_completions(place / "new"))["verdicts"]][1:] == ["new", "new"]
 
 
 def test_a_folder_that_was_moved_or_made_earlier_is_told(place, tmp_path):

@@ -123,6 +123,24 @@ def test_corrections_are_saved_beside_and_undone(place):
     assert (place / "layout.json").read_bytes() == given
 
 
+def test_a_correction_is_of_the_layout_and_so_of_all_people(place, tmp_path):
+    assert run(place, place / "people", "-o", tmp_path / "out", repair=False, soft_tissue=False) in (0, 1)
+    app = mend_mosh(tmp_path / "out")
+    assert {one["name"] for one in told(app)["scans"]} == {"ann", "bob"}
+    assert len({frame.split(",")[0] for frame in told(app)["frames"]}) == (2 if app.person.name == "ann" else 1)
+    first, found = app.person, [dict(scan.places) for scan in app.scans]
+    moved(place, app)
+    sent(app, "open", scan=1)
+    assert app.person is not first and told(app)["changed"] == [MOVED] and app.chosen == app.names[0]
+    np.testing.assert_allclose(app.scan.places[MOVED], true_spot(place, app)[0], atol=1e-6)       # on another body
+    sent(app, "undo")
+    assert app.person is first and [set(scan.places) for scan in app.scans] == [set(places) for places in found]
+    assert all(np.array_equal(scan.places[MOVED], places[MOVED])
+               for scan, places in zip(app.scans, found, strict=True))
+    with pytest.raises(ValueError, match="expected 0 to 1, got 2"):
+        sent(app, "open", scan=2)
+
+
 def test_another_run_at_work_is_told_and_corrections_stay(place):
     app = mend_mosh(place / "out")
     sent(app, "remove", pane=1, name="M5")
