@@ -98,6 +98,14 @@ def test_dots_and_bones_with_names_and_without_places(body):
     np.testing.assert_array_equal(read.colors(rods["shades"][0], 4), 255 * np.eye(3)[[0, 0, 1, 1]])
 
 
+def test_dots_are_coloured_by_values_with_a_legend(body):
+    heat = Heat(np.array([0.0, 0.02, np.nan]), 0.0, 0.05, "off")
+    read = SceneReader(pack_scene([pane(Dots(body.vertices[:3], heat, name="marks"))]))
+    (shade,) = read.layer("marks")["shades"]
+    assert shade["legend"] == {"title": "off", "low": 0.0, "high": 0.05, "unit": "mm"}
+    np.testing.assert_allclose(read.colors(shade, 3), 255 * heat.colors(), atol=2)
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_a_motion_comes_back_within_its_tolerance(body, dtype):
     frames = turning(body).astype(dtype)

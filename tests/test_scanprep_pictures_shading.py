@@ -9,6 +9,7 @@ from scanprep.pictures.shading import (
     Bones,
     Camera,
     Dots,
+    Heat,
     Solid,
     balls,
     capsules,
@@ -112,6 +113,13 @@ def test_missing_points_are_left_out():
     assert np.array_equal(render(Dots(points), camera, 40, 40), render(Dots(points[:1]), camera, 40, 40))
     nothing = render(Bones(points[1:], points[:1]), camera, 40, 40)
     assert (nothing == 255).all()
+
+
+def test_dots_by_values_have_their_colours():
+    shown, points = Heat(np.array([0.0, 1.0]), 0.0, 1.0), np.array([[0.0, 0, 0], [0.5, 0, 0]])
+    camera = Camera.around(ball(), 0, 0)
+    one, other = (render(Dots(points, color), camera, 40, 40) for color in (shown, shown.colors()))
+    assert np.array_equal(one, other) and (one < 255).any()
 
 
 def test_colours_per_face_vertex_and_mesh_agree():

@@ -6,11 +6,12 @@ from browser import wait_until
 from scan_folders import MARKS, WITH_PICTURES, ball, contents, write_scans
 
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
+from scanprep.batch.calls import RUN
 from scanprep.batch.opening import locked, workspace
 from scanprep.batch.ownership import HOME
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.storage import StorageError
-from scanprep.pipeline.again import RUN, Call
+from scanprep.pipeline.again import Call
 from scanprep.pipeline.cli import carried_out
 from scanprep.pipeline.mend import MendApp
 from scanprep.viewer.clicked import KEPT

@@ -7,20 +7,18 @@ from typing import Annotated, Literal
 
 import tyro
 
-from model.body import BodyModel
-from model.linear import Subject
-from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, say
+from scanprep.console import Metric, Outcome, bar, judgement_of, say
 from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.pipeline.scans import find_scans
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig
+from .folder import FolderCall, body_of, kept_results, told, written
 from .settings import CompletionConfig
-from .work import Inputs, Work, folder_inputs, folder_page, marks_of_template, summary
+from .work import Inputs, Work, marks_of_template
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN [SCAN ...]")]
 AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
@@ -59,7 +57,8 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         up: The axis of the scan that points up, where it is known: people mostly stand. Of a depth camera that stands
             upright it is -y, written --up=-y, of one upside down y.
         interactive: In the browser: click landmarks, complete, look at the body from all sides, correct, save. A scan
-            can also be dropped on the page. A recording of markers, named or dropped, tells which ones to click.
+            can also be dropped on the page. A recording of markers, named or dropped, tells which ones to click. Of a
+            folder, the results that are in the output are opened, worst first.
         config: Settings.
         workers: Who completes the scans of a folder.
     """
@@ -69,29 +68,45 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         config, unit = replace(config, free_scale=True), None
     if up is not None:
         config = replace(config, up=AXES[up])
+    if len(scans) == 1 and scans[0].is_dir():
+        call = FolderCall(scans[0], model, landmarks, subject, template_landmarks, _only(mask), unit, config)
+        return _mended(call, space) if interactive else _folder(call, space, workers)
     if interactive:
         return _in_browser(scans, output, model, subject, template_landmarks, unit, config)
-    folder = scans[0] if len(scans) == 1 and scans[0].is_dir() else None
-    found = folder_inputs(folder, landmarks, _only(mask)) if folder else {}
     loaded, name = read_model(model)
-    body = _body(loaded, subject, unit)
     inputs = Inputs(scans, landmarks or landmarks_beside(scans[0]), mask)
-    wanted = any(one.landmarks for one in found.values()) if folder else inputs.landmarks is not None
-    marks = marks_of_template(loaded, template_landmarks, name) if wanted else {}
-    work = Work(body, name, marks, config, unit, ColorConfig(fill=config.fill_colors))
-    settings = {"complete": config, "model": name}
-    if folder is None:
-        if inputs.landmarks is None:
-            say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
-        with bar("completing") as progress:
-            done = space.run(work, [Task("completion", inputs)], inside=progress).only
-        return Outcome(output, done, settings, judgement=judgement_of(done))
-    work = replace(work, command=f"scape complete {folder}")
+    marks = {} if inputs.landmarks is None else marks_of_template(loaded, template_landmarks, name)
+    work = Work(body_of(loaded, subject, unit), name, marks, config, unit, ColorConfig(fill=config.fill_colors))
+    if inputs.landmarks is None:
+        say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
+    with bar("completing") as progress:
+        done = space.run(work, [Task("completion", inputs)], inside=progress).only
+    return Outcome(output, done, {"complete": config, "model": name}, judgement=judgement_of(done))
+
+
+def _folder(call: FolderCall, space: Workspace, workers: Workers) -> Outcome:
+    """Complete the scans of a folder."""
+    tasks = call.tasks()
+    _, work = call.work(any(task.given.landmarks for task in tasks.values()))
     with bar("completing scans") as progress:
-        results = space.run(work, [Task(name, one, name) for name, one in found.items()], workers, progress)
-    with space.staging("page") as staged:
-        folder_page(results.values, list(results.failures.values()), space.folder).write(staged.folder / "report.html")
-    return Outcome(output, summary(results.values, len(results.fresh), len(found)), settings, failures_of(results))
+        results = space.run(work, list(tasks.values()), workers, progress)
+    return written(call, work.model, results, space, len(tasks))
+
+
+def _mended(call: FolderCall, space: Workspace) -> Outcome:
+    """Look at what a folder was completed to, and mend it, in the browser."""
+    from scanprep.viewer.server import serve
+
+    from .mend import CompletionsApp
+
+    app = CompletionsApp(call, space.folder)
+    serve(app)
+    results = kept_results(space, list(app.tasks))
+    saved = Metric("bodies saved", len(app.fresh))
+    if not results.values and not results.failures:
+        return Outcome(None, [saved])
+    outcome = told(call, app.plain.model, results, space, len(app.tasks))
+    return replace(outcome, metrics=[saved, *outcome.metrics])
 
 
 def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subject: str | None,
@@ -107,20 +122,13 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
     labels = [label for path in scans for label in labels_of(path)]
     scans = tuple(path for path in scans if not is_recording(path))
     files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]
-    app = CompleteApp(loaded, Work(_body(loaded, subject, unit), name, marks, config, unit), files, output, labels)
+    app = CompleteApp(loaded, Work(body_of(loaded, subject, unit), name, marks, config, unit), files, output, labels)
     serve(app)
     if not app.saved:
         return Outcome(None, [Metric("bodies saved", 0)], {"complete": config, "model": name})
     return Outcome(output, [Metric("bodies saved", len(app.saved)),
                             *(Metric(scan.name, app.made[scan].completion.judgement.verdict) for scan in app.saved)],
                    {"complete": config, "model": name})
-
-
-def _body(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:
-    """The model where the person's shape is to be found, else a body of known shape."""
-    if subject is None and model.n_betas:
-        return model
-    return read_subject(model, None if subject in (None, "template") else Path(str(subject)), unit)
 
 
 def _only(masks: tuple[Path, ...]) -> Path | None:

@@ -29,10 +29,11 @@ from scanprep.viewer.surface_clicks import Clickable
 
 from .completion import Completion, complete
 from .report import completion_panes
-from .work import Inputs, ScanFiles, Work, figures, person_in, read_picture, read_views, write_results
+from .work import Inputs, ScanFiles, Work, figures, person_in, read_masks, read_picture, read_views, write_results
 from .worn import labels_of, worn_markers, write_worn
 
 ENDING = ".landmarks.json"           # of landmark files
+COMPLETED = "completed.ply"
 FEWEST = 3                           # landmarks that say where a body is
 HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
@@ -46,6 +47,8 @@ class Made:
     seconds: float                       # that it took
     places: Mapping[str, np.ndarray]     # of the landmarks
     known: bool                          # whether the person's shape was
+    masked: np.ndarray | None = None     # points that were clothing or hair
+    stale: bool = False                  # whether its scan or the settings have changed since
 
 
 class CompleteApp(PickApp):
@@ -82,11 +85,30 @@ class CompleteApp(PickApp):
         file = self.output / (path.name.split(".")[0] + ENDING) if self.dropped.holds(path) else None
         one = Clicked.found(path, ENDING, self.work.unit, file if file and file.exists() else None)
         one.file = file or one.file
-        read = self._read[path] = read_picture([path], self.work.unit) or read_views([path], self.work.unit)
-        if isinstance(read, ScanFiles):
-            view = read.views[0]
-            one.surface = Clickable(view if isinstance(view, Mesh) else view.points)
+        one.surface = self._surface(path)
         return one
+
+    def _given(self, path: Path) -> ScanFiles | DepthPicture:
+        """What is in a file, read when it is first wanted."""
+        if path not in self._read:
+            self._read[path] = read_picture([path], self.work.unit) or read_views([path], self.work.unit)
+        return self._read[path]
+
+    def _surface(self, path: Path) -> Clickable | None:
+        """The first view of a scan; a depth picture has its own way to be shown."""
+        given = self._given(path)
+        if not isinstance(given, ScanFiles):
+            return None
+        view = given.views[0]
+        return Clickable(view if isinstance(view, Mesh) else view.points)
+
+    def _inputs(self, scan: Clicked) -> Inputs:
+        return Inputs((scan.path,), scan.file)
+
+    def _files(self, path: Path, pairs: tuple[np.ndarray, np.ndarray] | None) -> ScanFiles:
+        """The views of a scan; of a depth picture the person in it, whom landmarks tell from others."""
+        given = self._given(path)
+        return given if isinstance(given, ScanFiles) else person_in(given, self.model.template, pairs)
 
     # what the page is sent
 
@@ -96,41 +118,45 @@ class CompleteApp(PickApp):
         if self.scan is not None:
             panes.append(self.scan.pane(self.scan.path.name))
             if (result := self._result_pane()) is not None:
-                panes.append(result)
+                panes.append(replace(result, label="the whole body: blue measured, yellow filled in"))
         return Message("scene", {}, pack_scene(panes))
 
     def _result_pane(self) -> Pane | None:
         made = self.made.get(self.scan.path) if self.scan else None
         if made is None:
             return None
-        return completion_panes(list(made.files.views), made.completion, self.model.template)[-1]
+        return completion_panes(list(made.files.views), made.completion, self.model.template, made.masked)[-1]
+
+    def _masked(self, scan: Clicked, files: ScanFiles) -> np.ndarray | None:
+        masks = self._inputs(scan).masks
+        return read_masks(masks, files, self.work.unit) if masks else None
 
     def more(self) -> dict[str, Any]:
         """What the completion says of itself, and what would help it."""
         made = self.made.get(self.scan.path) if self.scan else None
         markers = worn_markers(self.scan.places, self.work.marks) if self.scan else {}
         out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None,
-                               "markers": len(markers)}
+                               "markers": len(markers), "fewest": FEWEST}
         if made is None or self.scan is None:
             return out
-        judgement = made.completion.judgement
+        judgement, saved = made.completion.judgement, self.saved.get(self.scan.path)
         out["completed"] = {
             "verdict": judgement.verdict, "reasons": list(judgement.reasons), "landmarks": len(made.places),
             "rows": [[m.name, m.text(), m.unit] for m in self._figures(made)],
             "outdated": self._outdated(made), "helpful": helpful(self.model, self.work.marks, made),
-            "saved": str(self.saved.get(self.scan.path, ""))}
+            "saved": str(saved.absolute() / COMPLETED) if saved else ""}
         return out
 
     def _figures(self, made: Made) -> list[Metric]:
         assert self.scan is not None
         pairs = pairs_of(made.places, self.work.marks)
-        return figures(self.work, Inputs((self.scan.path,)), made.completion, pairs, None)
+        return figures(self.work, Inputs((self.scan.path,)), made.completion, pairs, made.masked)
 
     def _outdated(self, made: Made) -> bool:
-        """Whether landmarks were changed since."""
+        """Whether landmarks, or anything else that it was made from, were changed since."""
         assert self.scan is not None
         now = {name: self.scan.places[name] for name in self._usable(self.scan)}
-        return made.known != self.known or set(now) != set(made.places) or any(
+        return made.stale or made.known != self.known or set(now) != set(made.places) or any(
             not np.array_equal(now[name], made.places[name]) for name in now)
 
     def _usable(self, scan: Clicked) -> list[str]:
@@ -176,6 +202,7 @@ class CompleteApp(PickApp):
 
     def take(self, path: Path) -> None:
         """Show one more scan, or the same anew in its place."""
+        self._read.pop(path, None)
         one = self._clicked(path)
         _ = one.shown                                            # what cannot be shown is refused
         with self._lock:
@@ -193,7 +220,7 @@ class CompleteApp(PickApp):
         self.known = bool(known) or not self.can_choose
 
     def on_complete(self, send: Send, anew: bool = False) -> None:
-        """Complete the scan, going on from the body that there is; `anew` searches again."""
+        """Complete the scan, going on from the body that there is, if that means anything; `anew` searches again."""
         if self.scan is None:
             raise ValueError("drop a scan on the page first")
         if self.working is not None:
@@ -202,17 +229,20 @@ class CompleteApp(PickApp):
         if 0 < len(names) < FEWEST:
             raise ValueError(f"click at least {FEWEST} landmarks, or none")
         made = self.made.get(self.scan.path)
-        start = made.completion if made is not None and made.known == self.known and names and not anew else None
+        on = made is not None and made.known == self.known and names and not anew \
+            and not self.work.config.free_scale and made.completion.judgement.verdict != "failed"
+        start = made.completion if made is not None and on else None
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in names}
-        read = self._read[scan.path]
+        given = self._given(scan.path)
 
         def work(tell: Callable[[int, int], None]) -> str:
-            begin, body, given, pairs = time.perf_counter(), self._body(known), read, pairs_of(places, self.work.marks)
-            files = given if isinstance(given, ScanFiles) else person_in(given, self.model.template, pairs)
-            done = complete(body, list(given.views) if isinstance(given, ScanFiles) else given, pairs,
-                            self.work.config, tell, start=start)
+            begin, pairs = time.perf_counter(), pairs_of(places, self.work.marks)
+            files = self._files(scan.path, pairs)
+            masked = self._masked(scan, files)
+            done = complete(self._body(known), list(given.views) if isinstance(given, ScanFiles) else given, pairs,
+                            self.work.config, tell, masked, start)
             with self._lock:
-                self.made[scan.path] = Made(done, files, time.perf_counter() - begin, places, known)
+                self.made[scan.path] = Made(done, files, time.perf_counter() - begin, places, known, masked)
                 self.saved.pop(scan.path, None)
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
             if scan is self.scan:
@@ -233,20 +263,33 @@ class CompleteApp(PickApp):
         made = self.made.get(self.scan.path) if self.scan else None
         if made is None or self.scan is None:
             raise ValueError("complete the scan first")
-        scan, folder = self.scan, self.folder_of(self.scan)
+        self.working = ("saving", 0, 1)
+        send(self.state())
+        try:
+            self._save(self.scan, made)
+        finally:
+            self.working = None
+
+    def _save(self, scan: Clicked, made: Made) -> None:
+        folder = self.folder_of(scan)
         with workspace(folder) as space, space.staging("completion") as staged:
-            rows = write_results(replace(self.work, body=self._body(made.known)), Inputs((scan.path,), scan.file),
-                                 made.files, made.completion, pairs_of(made.places, self.work.marks), None,
-                                 staged.folder)
-            rows += write_worn(staged.folder, made.completion, worn_markers(scan.places, self.work.marks))
-            write_report(Outcome(staged.folder, rows, {"complete": self.work.config}),
-                         "scape complete --interactive", made.seconds)
+            self._write(scan, made, staged.folder)
         self.saved[scan.path] = folder
-        self.note = f"saved in {folder}"
+        self.note = f"saved: {folder.absolute() / COMPLETED}, and beside it the pose, the shape and a page"
 
     def folder_of(self, scan: Clicked) -> Path:
         """Where the body of a scan is saved."""
         return self.output if len(self.scans) == 1 else self.output / scan.path.name.split(".")[0]
+
+    def _write(self, scan: Clicked, made: Made, folder: Path) -> list[Metric]:
+        """All files of a completion into a folder; the figures."""
+        rows = write_results(replace(self.work, body=self._body(made.known)), self._inputs(scan), made.files,
+                             made.completion, pairs_of(made.places, self.work.marks), made.masked, folder)
+        rows += write_worn(folder, made.completion, worn_markers(scan.places, self.work.marks))
+        rows += [Metric("completed", "in the browser"), Metric("shape", "known" if made.known else "found")]
+        write_report(Outcome(folder, rows, {"complete": self.work.config}), "scape complete --interactive",
+                     made.seconds)
+        return rows
 
     def close(self) -> None:
         """Forget files that were dropped."""
@@ -260,7 +303,8 @@ def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tupl
 
 def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict[str, np.ndarray]:
     """Where the completed body has its landmarks, of those that the scan shows."""
-    return {name: scan.nearest(done.completed.vertices[vertex]) for name, vertex in marks.items() if done.seen[vertex]}
+    return {name: scan.nearest(done.completed.vertices[vertex] / done.scale)
+            for name, vertex in marks.items() if done.seen[vertex]}
 
 
 def helpful(model: BodyModel, marks: Mapping[str, int], made: Made) -> list[str]:

@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +21,9 @@ from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
-from scanprep.pictures.page import Page
-from scanprep.pictures.scene import SCENE, small_scene, worst_that_turn
-from scanprep.pictures.sheets import save_png, small_picture
+from scanprep.pictures.scene import SCENE, small_scene
+from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
-from scanprep.pipeline.scans import find_scans
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, save_completion
@@ -44,7 +41,7 @@ class Work:
     """What the scans of one call have in common."""
 
     body: BodyModel | Subject
-    model: str                       # its name, for the report
+    model: str = field(metadata={"digest": False})                   # its name, for the report
     marks: dict[str, int]            # name -> vertex of the template
     config: CompletionConfig
     unit: Unit | None = None         # of the scans and landmarks, where the files cannot tell
@@ -214,12 +211,15 @@ def person_in(picture: DepthPicture, template: Mesh, landmarks: tuple[np.ndarray
     return ScanFiles((PointCloud(person.points, person.normals),), (None,))
 
 
-def marks_of_template(model: BodyModel, given: Path | None, name: str) -> dict[str, int]:
-    """Vertices of a model's template by name, from a file or the model itself; `name` is the model's."""
+def marks_of_template(model: BodyModel, given: Path | None, name: str, wanted: bool = True) -> dict[str, int]:
+    """Vertices of a model's template by name, from a file or the model itself; `name` is the model's.
+
+    ValueError where there are none and they are wanted.
+    """
     if given is not None:
         return read_landmark_vertices(given, model.template)
-    kept = model.info.get("landmarks")
-    if not kept:
+    kept = model.info.get("landmarks") or {}
+    if wanted and not kept:
         raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
     return {name: int(vertex) for name, vertex in kept.items()}
 
@@ -234,44 +234,3 @@ def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
         if "no faces" in str(error):
             return read_points(path, unit)
         raise
-
-
-def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> dict[str, Inputs]:
-    """The scans of a folder by name, with their landmarks, in their folder or its own, and masks of their names."""
-    if masks is not None and not masks.is_dir():
-        raise ValueError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
-    found = {}
-    for task in find_scans(folder, landmarks):
-        mine = sorted(p for p in masks.iterdir() if p.name.split(".")[0] == task.name) if masks else []
-        found[task.name] = Inputs((task.scan,), task.landmarks, tuple(mine[:1]))
-    return found
-
-
-def summary(metrics: Mapping[str, Sequence[Metric]], fresh: int, count: int) -> list[Metric]:
-    """The rows of the closing table."""
-    rows = [Metric("scans completed", f"{len(metrics)} of {count}"), Metric("of them in this run", fresh)]
-    for name in MEANS:
-        found = [m for of_one in metrics.values() for m in of_one if m.name == name]
-        if found:
-            rows.append(Metric(f"{name}, mean", float(np.mean([float(m.value) for m in found])), found[0].unit))
-    return rows
-
-
-def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str], folder: Path) -> Page:
-    """The page of all scans, those worst explained first; what is told of them lies in the folder."""
-    page = Page(f"{len(metrics)} scans completed", "Worst first; each name leads to the page of its scan.")
-    if failures:
-        page.section("Failed").table([(line,) for line in failures])
-
-    def explained(name: str) -> float:
-        return next((float(m.value) for m in metrics[name] if m.name == MEANS[1]), 0.0)
-
-    names = sorted(metrics, key=explained)
-    turning = worst_that_turn([folder / name / SCENE for name in names])
-    for name, scene in zip(names, turning, strict=True):
-        told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
-        shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
-            page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
-        page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
-    return page

@@ -2,20 +2,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from model.body import BodyModel
-from scanprep.pipeline.again import RUN
-from scanprep.viewer.app import App, Send
+from scanprep.batch.calls import command_of
+from scanprep.viewer.app import App
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.dropped import Dropped
 
-from ..partial.interactive import ENDING, CompleteApp
+from ..partial.interactive import ENDING, CompleteApp, Made
 from ..partial.settings import CompletionConfig
 from ..partial.work import Work, marks_of_template
-from .files import SET, Entry, Files
+from .files import Entry, Files
 from .saving import free_name
 
 PEOPLE = "synthetic people"          # the model of those who have none
@@ -23,26 +22,28 @@ Progress = Callable[[int, int], None]
 SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
 
-@dataclass(frozen=True)
-class FolderPage:
-    """A page that folders offer: what its button says, whether a folder is one of them, and how its app is made."""
-
-    label: str
-    offered: Callable[[Path], bool]
-    make: Callable[[Path], App]
-
-
-def _mend(folder: Path) -> App:
+def _set(folder: Path) -> App:
     from scanprep.pipeline.mend import MendApp
 
     return MendApp(folder, ENDING)
 
 
-def _has(*names: str) -> Callable[[Path], bool]:
-    return lambda folder: all((folder / name).is_file() for name in names)
+def _completions(folder: Path) -> App:
+    from ..partial.mend import mend_completions
+
+    return mend_completions(folder)
 
 
-FOLDER_PAGES = {"mend": FolderPage("mend landmarks of", _has(SET, RUN), _mend)}
+def _people(folder: Path) -> App:
+    from ..mocap.mosh.mend import mend_mosh
+
+    return mend_mosh(folder)
+
+
+# What commands wrote that can be mended: what the button says, and the app of such a folder.
+MENDED: Mapping[str, tuple[str, Callable[[Path], App]]] = {
+    "scape prep run": ("mend landmarks of", _set), "scape complete": ("mend landmarks of", _completions),
+    "scape mosh": ("mend markers of", _people)}
 
 
 class CompletePage(CompleteApp):
@@ -67,11 +68,9 @@ class CompletePage(CompleteApp):
             self._folders[scan.path] = free_name(self.output / f"{scan.path.name.split('.')[0]}_completed")
         return self._folders[scan.path]
 
-    def on_save(self, send: Send) -> None:
-        """Write what `scape complete` writes."""
-        super().on_save(send)
-        assert self.scan is not None
-        self.fresh.append(self.saved[self.scan.path])
+    def _save(self, scan: Clicked, made: Made) -> None:
+        super()._save(scan, made)
+        self.fresh.append(self.saved[scan.path])
 
 
 class Inside:
@@ -90,10 +89,10 @@ class Inside:
 
     def offered(self, entries: Sequence[Entry]) -> dict[str, Any]:
         """What the buttons are: pages of folders, and the scans and models of a completion, by number of the entry."""
-        folders = [(folder, page, one) for folder in self.files.folders(entries)
-                   for page, one in FOLDER_PAGES.items() if one.offered(folder)]
-        return {"folders": [{"page": page, "folder": str(folder), "label": f"{one.label} {folder.resolve().name}"}
-                            for folder, page, one in folders],
+        commands = {folder: command_of(folder) for folder in self.files.folders(entries)}
+        return {"folders": [{"page": "mend", "folder": str(folder),
+                             "label": f"{MENDED[command][0]} {folder.resolve().name}"}
+                            for folder, command in commands.items() if command in MENDED],
                 "scans": [i for i, entry in enumerate(entries) if entry.kind in SCANS],
                 "models": [{"path": "", "name": PEOPLE},
                            *({"path": str(path), "name": path.name} for path in self.files.models)]}
@@ -107,10 +106,11 @@ class Inside:
             return self._completion(entries[int(wanted["scan"])], wanted["model"], progress)
         what, known = wanted["what"], self.files.folders(entries)
         folder = next((folder for folder in known if str(folder) == wanted["folder"]), None)
-        if what not in FOLDER_PAGES or folder is None:
+        command = "" if folder is None else command_of(folder)
+        if what != "mend" or folder is None or command not in MENDED:
             raise ValueError(f"page: expected one that the list of things offers, got {what} of {wanted['folder']}")
         if (what, folder) not in self.opened:
-            self.opened[what, folder] = FOLDER_PAGES[what].make(folder)
+            self.opened[what, folder] = MENDED[command][1](folder)
         return self.opened[what, folder]
 
     def _completion(self, scan: Entry, model: str, progress: Progress) -> App:

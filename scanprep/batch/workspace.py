@@ -88,7 +88,7 @@ class Workspace:
         """
         tell = progress or (lambda done, total: None)
         common = self.digests.of(work)
-        keys = {task.name: self.digests.of(common, task.place, task.given) for task in tasks}
+        keys = {task.name: self._key(common, task) for task in tasks}
         assert len(keys) == len(tasks), "names of tasks differ"
         by_name = {task.name: task for task in tasks}
         values = {task.name: self._kept(task.name, keys[task.name]) for task in tasks}
@@ -129,13 +129,26 @@ class Workspace:
             staged.value = make(staged.folder)
         return self.value(name)
 
+    def is_done(self, work: Any, task: Task) -> bool:
+        """Whether `run` would leave a task as it is."""
+        return self._kept(task.name, self._key(self.digests.of(work), task)) is not NOTHING
+
     @contextlib.contextmanager
-    def staging(self, name: str, key: str = "") -> Iterator[Staged]:
+    def instead(self, work: Any, task: Task) -> Iterator[Staged]:
+        """As `staging`, of a task that somebody does in another way: for `run` it is done."""
+        if line := self._blocked(task):
+            raise ForeignFileError(line)
+        common = self.digests.of(work)
+        with self.staging(task.name, self._key(common, task), common) as staged:
+            yield staged
+
+    @contextlib.contextmanager
+    def staging(self, name: str, key: str = "", work: str = "") -> Iterator[Staged]:
         """A folder for files that take their place in the output, all of them, when the block ends well."""
         staged = Staged(self._making())
         try:
             yield staged
-            self._publish(name, staged.folder, key, staged.value)
+            self._publish(name, staged.folder, key, staged.value, work)
         finally:
             shutil.rmtree(staged.folder, ignore_errors=True)
 
@@ -176,6 +189,10 @@ class Workspace:
     def value(self, name: str) -> Any:
         """A result as it is kept: how arrays lie in memory decides the last digits of sums."""
         return load_value(self._record(name))
+
+    def _key(self, common: str, task: Task) -> str:
+        """What a task depends on; `common` is the digest of the work."""
+        return self.digests.of(common, task.place, task.given)
 
     def _kept(self, name: str, key: str) -> Any:
         """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""

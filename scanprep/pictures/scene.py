@@ -144,8 +144,8 @@ def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, whole: 
     else:
         rods = isinstance(shape, Bones)
         points = np.stack([shape.starts, shape.ends], axis=1) if isinstance(shape, Bones) else shape.points
-        color = np.asarray(shape.color, dtype=float)
-        color = np.repeat(color, 2, axis=0) if rods and color.ndim == 2 else color
+        color = shape.color if isinstance(shape.color, Heat) else np.asarray(shape.color, dtype=float)
+        color = np.repeat(color, 2, axis=0) if rods and not isinstance(color, Heat) and color.ndim == 2 else color
         looks = {"kind": "bones" if rods else "dots", "radius": shape.radius, "on_top": shape.on_top,
                  "shades": [_shade("", color, None, columns)],
                  "labels": list(shape.labels) if isinstance(shape, Dots) else []}

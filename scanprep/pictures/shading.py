@@ -42,7 +42,7 @@ class Dots:
     """Small balls: markers, joints, landmarks."""
 
     points: np.ndarray  # (n, 3) float, metres: points that are not finite are left out
-    color: np.ndarray | Sequence[float] = (0.86, 0.24, 0.20)  # (3,) or (n, 3) in [0, 1]
+    color: np.ndarray | Sequence[float] | Heat = (0.86, 0.24, 0.20)  # (3,) or (n, 3) in [0, 1]
     radius: float = 0.012  # metres
     on_top: bool = False  # seen through the meshes in front of them
     coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
@@ -133,7 +133,8 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         use = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
         corners, normals, owner = capsules(starts[use] - origin, ends[use] - origin, shape.radius)
         count = len(starts)
-    color = as_light(np.broadcast_to(np.asarray(shape.color, dtype=float), (count, 3)))[use][owner]
+    given = shape.color.colors() if isinstance(shape.color, Heat) else shape.color
+    color = as_light(np.broadcast_to(np.asarray(given, dtype=float), (count, 3)))[use][owner]
     return Triangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
 
 

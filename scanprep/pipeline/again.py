@@ -1,15 +1,12 @@
-"""What `scape prep run` was called with, kept in the set, so that the same can be done again from elsewhere.
-
-`run.json` holds absolute paths, and the settings as `--write-config` prints them.
-"""
+"""What `scape prep run` was called with, kept in the set, so that the same can be done again from elsewhere."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
-from .. import config_files
-from ..geometry import storage
+from ..batch.calls import KeptCall
 from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_template_landmarks
 from ..geometry.mesh import Mesh
@@ -17,14 +14,14 @@ from .prepare import PrepareConfig
 from .scan import Init
 from .scans import ScanTask, find_scans
 
-RUN, KIND, VERSION = "run.json", "call of scape prep run", 1
 LISTED = 5                    # scans that a line names
 
 
 @dataclass(frozen=True)
-class Call:
+class Call(KeptCall):
     """Scans, template and settings of a set; paths are absolute once they were read."""
 
+    command: ClassVar[str] = "scape prep run"
     scans: Path
     template: Path
     landmarks: Path | None = None
@@ -43,30 +40,6 @@ class Call:
         if note:
             tell(f"note: {note}")
         return tasks, body, marks
-
-    def write(self, folder: Path) -> None:
-        """Keep it in a folder."""
-        given = {f.name: getattr(self, f.name) for f in fields(self)}
-        paths = {name: value.absolute() for name, value in given.items() if isinstance(value, Path)}
-        storage.write_json(folder / RUN, {"kind": KIND, "version": VERSION, **given, **paths,
-                                          "config": config_files.write({"config": self.config})})
-
-    @classmethod
-    def read(cls, folder: Path) -> Call:
-        """That of a set; StorageError for one that does not tell."""
-        path = folder / RUN
-        if not path.exists():
-            raise storage.StorageError(f"{folder}: it does not tell where its scans are, as sets that scape prep run "
-                                       "made earlier; run the same command once more")
-        with storage.taking_apart(path, f"a {KIND}"):
-            told = storage.read_json(path, f"a {KIND}")
-            if told.pop("kind") != KIND or told.pop("version") != VERSION:
-                raise ValueError(f"kind and version are not those of a {KIND} that is known here")
-            config = config_files.parsed(told.pop("config"), path, {"config": PrepareConfig()})["config"]
-            assert isinstance(config, PrepareConfig), "settings keep their type"
-            paths = {name: told.pop(name) for name in ("scans", "template", "landmarks", "template_landmarks")}
-            return cls(**{name: value and Path(value) for name, value in paths.items()},
-                       subject=str(told.pop("subject")), config=config)
 
 
 def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], init: Init

@@ -10,18 +10,16 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from model.body import BodyModel
-from model.files import load_model
-from scanprep.batch.pool import Workers
-from scanprep.batch.workspace import Task, Workspace
+from scanprep.batch.pool import Progress, Workers
+from scanprep.batch.workspace import HOME, Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, judgement_of, say
 from scanprep.pictures.page import Page
 
-from ...cli import read_model
 from ..marker_sets.named import choose_layout
+from .call import MoshCall
 from .mosh import MoshConfig
-from .recordings import TABLE, Actor, Grouping, find_actors, write_table
+from .recordings import TABLE, Actor, Grouping, write_table
 from .report import add_entry
 from .work import ERRORS, Work
 
@@ -69,17 +67,21 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     """
     if not markers:
         raise ValueError("MARKERS: expected at least one file or folder")
-    actors = find_actors(markers, Grouping.of(subjects, subject_prefix), output)
     held = tuple(label for words in hold_out for label in words.split(",") if label)
-    loaded, model_name = read_model(model[0] if model else None)
-    work = Work(loaded, model_name, _sexes(model, retarget_to),
-                None if retarget_to is None else _character(retarget_to, loaded),
-                None if layout is None else choose_layout(loaded, layout, ()), held, unit, config,
-                f"scape mosh {' '.join(sys.argv[2:])}")
-    _keep_table(space, actors, subjects)
-    _tell(actors)
+    call = MoshCall(markers, model, layout, subjects, subject_prefix, held, retarget_to, unit, config)
     with bar("people") as people, bar("one of them") as inside:
-        done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, people, inside)
+        return carried_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
+
+
+def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str, *tell: Progress) -> Outcome:
+    """Do what has changed of a call in an output that is open; `tell` is the progress of people, and inside one."""
+    actors, loaded = call.actors(space.folder), call.models()
+    work = Work(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
+                None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
+                call.unit, call.config, command)
+    _keep_table(space, actors, call.subjects)
+    _tell(actors)
+    done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *tell)
     failures = [line if line.startswith(f"{name}: ") else f"{name}: {line}" for name, line in done.failures.items()]
     for name, (rows, failed) in done.values.items():
         judgement = judgement_of(rows)
@@ -88,25 +90,9 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     metrics = {name: [m for m in rows if m.name != JUDGEMENT] for name, (rows, _) in done.values.items()}
     with space.staging("page") as staged:
         _page(actors, metrics, failures).write(staged.folder / "report.html")
-    settings = {"mosh": config, "model": model_name, "layout": layout, "held out": held}
-    return Outcome(output, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures)
-
-
-def _sexes(models: Sequence[Path], character: Path | None) -> dict[str, BodyModel]:
-    """The models of women and men, where they are given."""
-    if len(models) not in (0, 1, 3):
-        raise ValueError(f"--model: expected one, or three of both sexes, of women and of men, got {len(models)}")
-    if character is not None and len(models) == 3:
-        raise ValueError("--retarget-to: a character is made of one model; expected one --model, got 3")
-    return dict(zip(("female", "male"), map(load_model, models[1:]), strict=True)) if len(models) == 3 else {}
-
-
-def _character(path: Path, model: BodyModel) -> BodyModel:
-    character = load_model(path)
-    if character.kind != model.kind or character.template.faces.shape != model.template.faces.shape:
-        raise ValueError(f"{path}: expected a character made of the model, with its {len(model.template.faces)} "
-                         f"triangles, found {character.kind} with {len(character.template.faces)}")
-    return character
+        call.write(staged.folder / HOME)
+    settings = {"mosh": call.config, "model": loaded.name, "layout": call.layout, "held out": call.hold_out}
+    return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures)
 
 
 def _keep_table(space: Workspace, actors: Sequence[Actor], subjects: str) -> None:
@@ -154,6 +140,8 @@ def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], fail
     """All people, those with the largest error first."""
     page = Page(f"{len(metrics)} {'person' if len(metrics) == 1 else 'people'} from markers, worst first",
                 "Each picture leads to the page of the person, and that to the sequences.")
+    page.text("A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should "
+              "not be used: open this folder with `scape view` and press `mend` to put them right and run again.")
     if failures:
         page.section("Failed").table([(line,) for line in failures])
     error = {name: float(next(m.value for m in rows if m.name == ERRORS[0])) for name, rows in metrics.items()}

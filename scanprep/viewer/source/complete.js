@@ -1,7 +1,7 @@
 // `scape complete --interactive`: landmarks as in `scape pick`, then a button, the whole body, and what it is worth.
 import { dropZone } from "./drop.js";
 import { make } from "./figure.js";
-import { button, OFF, Pick } from "./pick.js";
+import { button, OFF, Pick, WORDS } from "./pick.js";
 
 const WHOLE = "Under the bodies: boxes show the completed body, the predicted one and the scan; the list has the expected error as colours.";
 
@@ -17,14 +17,15 @@ export class Complete extends Pick {
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
     this.markers = make("p", { class: "sk-file" });
     this.added.placeholder = "a name, or a marker set: cmu41";
-    this.scans.before(dropZone(this, "drop a scan here, or a recording whose markers to click, or choose a file"));
+    this.scans.before(this.dropping = dropZone(this, "drop a scan here, or a recording whose markers to click, or choose a file"));
     this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict, this.markers);
     this.buttons.predict.remove();
   }
 
   update(state) {
     super.update(state);
-    const { completed, working, can_choose: free } = state;
+    const { completed, working, can_choose: free, verdicts } = state;      // verdicts: of a folder of completions
+    this.dropping.hidden = Boolean(verdicts);
     this.known.checked = state.known;
     this.knownLabel.hidden = !free;
     const clicked = Object.keys(state.panes[1]?.places ?? {}).length - state.markers;
@@ -34,22 +35,22 @@ export class Complete extends Pick {
     this.go.textContent = few ? `click ${few} more, or none` : completed ? "complete again" : clicked ? `complete with ${clicked} landmarks` : "complete without landmarks";
     this.anew.hidden = !completed;
     this.anew.disabled = Boolean(working);
-    this.keep.disabled = !completed || Boolean(working);
-    this.verdict.hidden = !completed;
-    if (completed) this.judge(completed);
+    this.keep.disabled = !completed || Boolean(working) || (verdicts && Boolean(completed.outdated || completed.saved));
+    const stored = verdicts && { rows: [], helpful: [], ...verdicts[state.scan] };
+    this.verdict.hidden = !(completed ?? stored);
+    if (completed ?? stored) this.judge(completed ?? stored);
   }
 
   judge({ verdict, reasons, rows, outdated, helpful, saved }) {
     const off = outdated ? [] : Object.keys(this.state.panes[1].places).filter((name) => this.off(name) > OFF);
     const link = (name, text) => make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("choose", { name }); } }, text);
     const list = (names, text) => names.flatMap((name, i) => [i ? ", " : "", link(name, text(name))]);
-    const words = { good: "good", check: "look at it", failed: "failed" };
     this.verdict.dataset.verdict = outdated ? "check" : verdict;
-    this.verdict.replaceChildren(make("strong", {}, outdated ? "changed since: complete again" : words[verdict] ?? verdict),
+    this.verdict.replaceChildren(make("strong", {}, outdated ? "changed since: complete again" : WORDS[verdict] ?? verdict),
       make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))),
       off.length ? make("p", {}, "Not where the body has them: ", ...list(off, (name) => `${name}, ${(1000 * this.off(name)).toFixed(0)} mm`)) : "",
       helpful.length ? make("p", {}, "A landmark would help at: ", ...list(helpful, (name) => name)) : "",
-      make("details", {}, make("summary", {}, "figures"), make("table", {}, ...rows.map((row) => make("tr", {}, ...row.map((cell) => make("td", {}, cell)))))),
+      rows.length ? table(rows) : "",
       saved && !outdated ? make("p", {}, `saved: ${saved}`) : "");
   }
 
@@ -57,4 +58,9 @@ export class Complete extends Pick {
     if (this.state.panes.length < 2) return "Drop a scan on the page.";
     return this.state.completed ? `${super.hint()} ${WHOLE}` : `${super.hint()} Three to ten landmarks help most; then press “complete”.`;
   }
+}
+
+function table(rows) {
+  return make("details", {}, make("summary", {}, "figures"),
+    make("table", {}, ...rows.map((row) => make("tr", {}, ...row.map((cell) => make("td", {}, cell))))));
 }

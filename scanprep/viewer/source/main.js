@@ -3,6 +3,7 @@ import { Complete } from "./complete.js";
 import { Figure } from "./figure.js";
 import { Mend } from "./mend.js";
 import { run } from "./pages.js";
+import { Mosh } from "./mosh.js";
 import { hasWebGL } from "./pane.js";
 import { Pick } from "./pick.js";
 import { fromBase64, unpackScene } from "./unpack.js";
@@ -36,7 +37,7 @@ async function turn(figure) {
   figure.dataset.turns = "";
 }
 
-const PROGRAMS = { complete: Complete, mend: Mend, pick: Pick, view: View };
+const PROGRAMS = { complete: Complete, mend: Mend, mosh: Mosh, pick: Pick, view: View };
 
 export function start(name) {
   if (!name) startReport();

@@ -1,9 +1,7 @@
 // `scape pick SET`: scans worst first, their landmarks mended as in `scape pick`, and a button that registers them again.
 import { make } from "./figure.js";
-import { button, Pick } from "./pick.js";
+import { button, Pick, WORDS } from "./pick.js";
 import { unpackScene } from "./unpack.js";
-
-const WORDS = { good: "good", check: "look at it", failed: "failed", new: "new" };
 
 export class Mend extends Pick {
   build() {
@@ -27,8 +25,6 @@ export class Mend extends Pick {
   update(state) {
     super.update(state);
     const { scans, scan, verdicts, changed, template_changed: all, working } = state;
-    this.scans.replaceChildren(...scans.map(({ name, count }, i) => make("option", { selected: i === scan },
-      `${WORDS[verdicts[i].verdict]} · ${name} (${count})`)));
     const { verdict, reasons } = verdicts[scan];
     this.verdict.dataset.verdict = verdict;
     const mended = all || changed.includes(scans[scan].name.split(".")[0]);

@@ -6,8 +6,9 @@ import { Program } from "./program.js";
 const NEAR = 12;                     // pixels from a landmark that still take hold of it
 const STILL = 4;                     // pixels that a hand moves while it clicks
 const BESIDE = [3, 6, 9];            // pixels beside a surface that a click still means it: finger tips are at ragged borders
-export const OFF = 0.03;                    // metres from where a landmark is predicted, from which on it is to be looked at
+export const OFF = 0.03;             // metres from where a landmark is predicted, from which on it is to be looked at
 const COLORS = { set: "#d5392f", chosen: "#f0a400", predicted: "#3b82c4" };
+export const WORDS = { good: "good", check: "look at it", failed: "failed", new: "new" };       // verdicts
 export const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete", "take the landmark away"],
   ["c", "confirm the predicted ones"], ["[ and ]", "previous, next scan"], ["+ and -", "move it along the view, into the body"],
   ["i", "click inside the body: joints"], ["drag, arrow keys", "turn the body"], ["wheel", "zoom"], ["right button", "shift the body"]];
@@ -71,7 +72,8 @@ export class Pick extends Program {
   update(state) {
     this.state = state;
     this.scans.hidden = state.scans.length < 2;
-    this.scans.replaceChildren(...state.scans.map(({ name, count }, i) => make("option", { selected: i === state.scan }, `${name}: ${count}`)));
+    this.scans.replaceChildren(...state.scans.map(({ name, count }, i) => make("option", { selected: i === state.scan },
+      state.verdicts ? `${WORDS[state.verdicts[i].verdict]} · ${name} (${count})` : `${name}: ${count}`)));
     this.buttons.undo.disabled = !state.undo;
     this.buttons.redo.disabled = !state.redo;
     const waiting = Object.keys(this.waiting()).length;
@@ -103,14 +105,19 @@ export class Pick extends Program {
     this.list.replaceChildren(...names.map((name) => {
       const marks = panes.map((pane) => make("span", { class: name in pane.places ? "sk-on" : name in pane.predicted ? "sk-guess" : "sk-off",
         title: name in pane.places ? "set" : name in pane.predicted ? "predicted" : "not set" }));
-      const far = this.off(name);
       const item = make("li", { "aria-current": name === chosen ? "true" : null, tabindex: 0, onclick: (event) => this.choose(name, event),
         onkeydown: (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); event.stopPropagation(); this.choose(name, event); } } },
-        make("span", { class: "sk-dots" }, ...marks), make("span", {}, name),
-        far === null ? "" : make("small", { title: "from where it is predicted", class: far > OFF ? "sk-bad" : null }, `${(1000 * far).toFixed(0)} mm off`));
+        make("span", { class: "sk-dots" }, ...marks), make("span", {}, name), this.beside(name));
       return item;
     }));
     this.list.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+  }
+
+  // What is told beside a name: how far it is from where it was predicted.
+  beside(name) {
+    const far = this.off(name);
+    if (far === null) return "";
+    return make("small", { title: "from where it is predicted", class: far > OFF ? "sk-bad" : null }, `${(1000 * far).toFixed(0)} mm off`);
   }
 
   choose(name, event) {

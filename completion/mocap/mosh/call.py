@@ -1,0 +1,70 @@
+"""What `scape mosh` was called with, kept in its output, so that the same can be done again with another layout."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+from model.body import BodyModel
+from model.files import load_model
+from scanprep.batch.calls import KeptCall
+from scanprep.cli import Unit
+
+from ...cli import read_model
+from .mosh import MoshConfig
+from .recordings import Actor, Grouping, find_actors
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """The model and its name for reports, those of `female` and `male` people, if any, and a character, if any."""
+
+    neutral: BodyModel
+    name: str
+    sexes: Mapping[str, BodyModel]
+    character: BodyModel | None
+
+
+@dataclass(frozen=True)
+class MoshCall(KeptCall):
+    """The arguments of `scape mosh`, but who does the work."""
+
+    command: ClassVar[str] = "scape mosh"
+    may_be_files: ClassVar[tuple[str, ...]] = ("layout", "subjects")
+    markers: tuple[Path, ...]
+    model: tuple[Path, ...] = ()
+    layout: str | None = None
+    subjects: str = "auto"
+    subject_prefix: str | None = None
+    hold_out: tuple[str, ...] = ()
+    retarget_to: Path | None = None
+    unit: Unit | None = None
+    config: MoshConfig = field(default_factory=MoshConfig)
+
+    def actors(self, output: Path) -> list[Actor]:
+        """The people of the recordings as they are now."""
+        return find_actors(self.markers, Grouping.of(self.subjects, self.subject_prefix), output)
+
+    def models(self) -> Models:
+        """All that was named, read."""
+        loaded, name = read_model(self.model[0] if self.model else None)
+        return Models(loaded, name, _sexes(self.model, self.retarget_to),
+                      None if self.retarget_to is None else _character(self.retarget_to, loaded))
+
+
+def _sexes(models: tuple[Path, ...], character: Path | None) -> dict[str, BodyModel]:
+    """The models of women and men, where they are given."""
+    if len(models) not in (0, 1, 3):
+        raise ValueError(f"--model: expected one, or three of both sexes, of women and of men, got {len(models)}")
+    if character is not None and len(models) == 3:
+        raise ValueError("--retarget-to: a character is made of one model; expected one --model, got 3")
+    return dict(zip(("female", "male"), map(load_model, models[1:]), strict=True)) if len(models) == 3 else {}
+
+
+def _character(path: Path, model: BodyModel) -> BodyModel:
+    character = load_model(path)
+    if character.kind != model.kind or character.template.faces.shape != model.template.faces.shape:
+        raise ValueError(f"{path}: expected a character made of the model, with its {len(model.template.faces)} "
+                         f"triangles, found {character.kind} with {len(character.template.faces)}")
+    return character

@@ -1,0 +1,262 @@
+"""A result of `scape mosh` in the browser: the markers on the body, those worst first, put right, and run again."""
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.body import BodyModel
+from scanprep.batch.opening import workspace
+from scanprep.batch.pool import Progress, Workers
+from scanprep.batch.workspace import HOME, Workspace
+from scanprep.console import Metric, judgement_of, write_report
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.scene import pack_scene
+from scanprep.viewer.app import Send
+from scanprep.viewer.clicked import Clicked
+from scanprep.viewer.messages import Message
+from scanprep.viewer.pick import SCAN, PickApp
+from scanprep.viewer.surface_clicks import Clickable
+
+from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import choose_layout
+from .call import MoshCall
+from .cli import carried_out
+from .mended_layout import Spot, changes, mended, next_file
+from .people import Found, found_people
+from .work import ERRORS
+
+MENDED = "scape mosh, mended in the browser"
+TOLD = "markers in the mean distance"
+LEAST = 3                            # markers that a person needs
+GRAVEST = ("failed", "check", "good")
+
+
+def mend_mosh(folder: Path) -> MoshApp:
+    """The app of a folder that `scape mosh` made; ValueError for one that does not tell."""
+    return MoshApp(folder)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a folder holds: figures of the people, those worst first, and the layout as it was used."""
+
+    call: MoshCall
+    rows: dict[str, list[Metric]]
+    people: list[Found]
+    usual: MarkerLayout
+    template: Mesh
+
+    @staticmethod
+    def read(folder: Path, call: MoshCall) -> Result:
+        """That of a folder, which need not be open."""
+        models, kept = call.models(), Workspace(folder, folder / HOME)
+        names = set(kept.kept(""))
+        actors = [actor for actor in call.actors(folder) if actor.name in names]
+        rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
+        people = found_people(folder, sorted(actors, key=lambda actor: _gravity(rows[actor.name])), models, call.unit)
+        return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
+
+
+    def figures(self, name: str) -> list[Metric]:
+        """How far the markers of a person are from the body: all of them, and those that are believed."""
+        off = next(one.off for one in self.people if one.name == name)
+        known = [1000 * far for far in off.values() if np.isfinite(far)] or [np.nan]
+        return [Metric("distance of all markers, mean", float(np.mean(known)), "mm"),
+                Metric("distance of the worst marker", float(np.max(known)), "mm"),
+                *(m for m in self.rows[name] if m.name in (*ERRORS, TOLD))]
+
+
+class MoshApp(PickApp):
+    """The state of the page on which a result of `scape mosh` is mended.
+
+    The first pane is the layout on the model's template, the second a person at rest with the markers where they were
+    found, which are moved, exchanged or taken away; the third a frame of the person.
+    """
+
+    name, title = "mosh", "Mend markers"
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.frame = folder, 0
+        self.before: dict[str, list[Metric]] = {}
+        self._show(Result.read(folder, MoshCall.read(folder)))
+        super().__init__(self.template, self.scans, (), fixed=self.template.places)
+
+    def _show(self, result: Result) -> None:
+        """Begin with a result, and with corrections that were not run yet."""
+        self.result, self.file = result, next_file(self.folder, result.call.layout)
+        self.spots = changes(result.usual, MarkerLayout.load(self.file)) if self.file.exists() else {}
+        self.template = Clicked(Path("layout"), self.file, surface=Clickable(result.template))
+        at = result.usual.skin_points(result.template.vertices)
+        self.template.places = dict(zip(result.usual.labels, at, strict=True))
+        self.scans = [Clicked(Path(one.name), self.file, surface=Clickable(one.body)) for one in result.people]
+        self._place()
+
+    @property
+    def person(self) -> Found:
+        """That is shown."""
+        return self.result.people[self.current]
+
+    # what the page is sent
+
+    def scene(self) -> Message:
+        """The layout, the person at rest, and a frame."""
+        assert self.scan is not None, "a result is of somebody"
+        frame = self.person.worst[self.frame]
+        panes = [replace(self.template.pane("the layout"), label="where the layout has them"),
+                 self.scan.pane(f"{self.person.name}: where they were found"), self.person.pane(frame)]
+        return Message("scene", {}, pack_scene(panes))
+
+    def more(self) -> dict[str, Any]:
+        """What is to be thought of people, markers and frames; and the figures of the run before."""
+        person = self.person
+        before = {m.name: m.text() for m in self.before.get(person.name, [])}
+        changed = [label for label in person.names if self._own(label) in self.spots]
+        return {"verdicts": [_told(self.result.rows[one.name]) for one in self.result.people],
+                "off": {label: 1000 * far for label, far in person.off.items() if np.isfinite(far)},
+                "doubts": person.doubts, "changed": changed, "frame": self.frame,
+                "frames": [one.told for one in person.worst], "corrected": self.file.name,
+                "rows": [[m.name, before.get(m.name, ""), m.text(), m.unit]
+                         for m in self.result.figures(person.name)]}
+
+    def choose_next(self, last: str | None, pane: int = SCAN) -> None:
+        """The marker stays the same: at first the worst."""
+        self.names = tuple(self.person.names)
+        self.chosen = last if last in self.names else self.names[0]
+
+    # what the page sends
+
+    def on_open(self, send: Send, scan: int) -> None:
+        """Another person."""
+        if not 0 <= scan < len(self.scans):
+            raise ValueError(f"person: expected 0 to {len(self.scans) - 1}, got {scan}")
+        if scan != self.current:
+            self.current, self.frame = scan, 0
+            self.choose_next(None)
+            send(self.scene())
+
+    def on_frame(self, send: Send, frame: int) -> None:
+        """Another of the worst frames."""
+        if not 0 <= frame < len(self.person.worst):
+            raise ValueError(f"frame: expected 0 to {len(self.person.worst) - 1}, got {frame}")
+        self.frame = frame
+        send(self.scene())
+
+    def on_exchange(self, send: Send, name: str, other: str) -> None:
+        """Exchange two markers, whose labels were mixed up: each is where the layout has the other.
+
+        Not where the other was found, which by the wrong label is anywhere.
+        """
+        if name == other or not {name, other} <= set(self.person.names):
+            raise ValueError("choose two markers of this person, to exchange them")
+        self._change(self.current, {name: self._given(other), other: self._given(name)})
+
+    def _given(self, label: str) -> np.ndarray:
+        """Where the layout, as it is corrected by now, has a marker on the person that is shown."""
+        spot = self.spots.get(self._own(label)) or Spot.of(self.result.usual, self._own(label))
+        return spot.on(self.person.body)
+
+    def _spot(self, number: int, label: str, place: np.ndarray) -> Spot:
+        """A place as the layout will have it: that of one of its markers with all that it says of that."""
+        person, usual = self.result.people[number], self.result.usual
+        for spot in [*self.spots.values(), *(Spot.of(usual, other) for other in usual.labels)]:
+            if spot is not None and np.array_equal(spot.on(person.body), place):
+                return spot
+        return Spot.at(person.skin, place, Spot.of(usual, self._own(label)).distance)
+
+    def on_run(self, send: Send) -> None:
+        """The same call with the corrected layout."""
+        if self.working is not None:
+            return
+        if not self.spots:
+            raise ValueError("nothing was corrected: move, exchange or take away a marker first")
+        call = replace(self.result.call, layout=str(self.file))
+        before = {one.name: self.result.figures(one.name) for one in self.result.people}
+        worn = {label for one in self.result.people for label in one.names}
+        mended(self.result.usual, self.spots).matched(sorted(worn), LEAST)
+
+        def work(tell: Progress) -> str:
+            begin = time.perf_counter()
+            with workspace(self.folder) as space:
+                outcome = carried_out(call, space, Workers(workers=1), MENDED, lambda done, total: None, tell)
+                with space.staging("report") as staged:
+                    write_report(replace(outcome, output=staged.folder), MENDED, time.perf_counter() - begin)
+            result, person = Result.read(self.folder, call), self.person.name
+            with self._lock:
+                self.before, self.frame = before, 0
+                self._show(result)
+                self.done.clear()
+                self.undone.clear()
+                self.current = next((i for i, one in enumerate(result.people) if one.name == person), 0)
+                self.choose_next(self.chosen)
+                scene = self.scene()
+            send(scene)
+            failed = f"; failed: {'; '.join(outcome.failures)}" if outcome.failures else ""
+            return f"run again with {Path(str(call.layout)).name}{failed}"
+
+        self.beside("finding shape, markers and motion", work, send, "it could not be run again")
+
+    # the state itself
+
+    def _editable(self, pane: int) -> Clicked:
+        if pane != SCAN:
+            raise ValueError("the first body shows the layout as it was; click on the person beside it")
+        return super()._editable(pane)
+
+    def _predict_if_time(self, send: Send, pane: int) -> None:
+        """Markers are not predicted."""
+
+    def _set(self, number: int, places: Mapping[str, np.ndarray | None]) -> None:
+        """Markers of a person elsewhere, and so of all, whose layout is one; the file is written at once."""
+        person = self.result.people[number]
+        for label, place in places.items():
+            found = person.places.get(label)
+            if place is None if found is None else place is not None and np.array_equal(place, found):
+                self.spots.pop(self._own(label), None)
+            else:
+                self.spots[self._own(label)] = None if place is None else self._spot(number, label, place)
+        self._place()
+        if self.spots:
+            mended(self.result.usual, self.spots).save(self.file)
+        else:
+            self.file.unlink(missing_ok=True)
+
+    def _place(self) -> None:
+        """The markers of all people as they were found, but for those that were changed."""
+        for person, scan in zip(self.result.people, self.scans, strict=True):
+            scan.places = dict(person.places)
+            for label in person.names:
+                if self._own(label) in self.spots:
+                    scan.places.pop(label, None)
+                    if (spot := self.spots[self._own(label)]) is not None:
+                        scan.places[label] = spot.on(person.body)
+
+    def _own(self, label: str) -> str:
+        """The layout's name of a marker."""
+        return self.result.usual.aliases.get(label, label)
+
+
+def _usual(call: MoshCall, model: BodyModel, people: list[Found]) -> MarkerLayout:
+    """The layout that all people have in common, as it was before it was corrected here."""
+    names = [call.layout] if call.layout else sorted({one.layout_name for one in people})
+    if len(names) > 1:
+        raise ValueError(f"the people of this folder wear different sets of markers ({', '.join(names)}); run "
+                         "scape mosh for each of them into a folder of its own")
+    labels = tuple(dict.fromkeys(label for one in people for label in one.labels))
+    return choose_layout(model, names[0], labels)[0]
+
+
+def _gravity(rows: list[Metric]) -> tuple[int, float]:
+    """Failed people first, then those with the largest error."""
+    error = next((float(m.value) for m in rows if m.name == ERRORS[0]), 0.0)
+    return GRAVEST.index(_told(rows)["verdict"]), -error
+
+
+def _told(rows: list[Metric]) -> dict[str, Any]:
+    judgement = judgement_of(rows)
+    return {"verdict": "good", "reasons": []} if judgement is None else \
+        {"verdict": judgement.verdict, "reasons": list(judgement.reasons)}

@@ -1,0 +1,92 @@
+"""A layout in which somebody put markers elsewhere, exchanged them, or took them out of use; and the files of these."""
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+
+from ..marker_sets.layout import MarkerLayout
+
+FILE = "corrected_layout_{}.json"    # numbered: one that was run with is never written again
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """A place on the skin, the same on any body of a model.
+
+    Attributes
+    ----------
+    corners : (3,) int
+        Vertices.
+    weights : (3,) float
+    distance : float, metres
+        Of the marker from the skin.
+    loose : bool
+        Whether the marker may sit anywhere on its limb.
+    """
+
+    corners: np.ndarray
+    weights: np.ndarray
+    distance: float
+    loose: bool = False
+
+    @staticmethod
+    def at(surface: Surface, place: np.ndarray, distance: float) -> Spot:
+        """That nearest to a place (3,), metres, on a body."""
+        found = surface.closest(place[None])
+        return Spot(surface.mesh.faces[found.faces[0]], found.bary[0], distance)
+
+    @staticmethod
+    def of(layout: MarkerLayout, label: str) -> Spot:
+        """That of a marker of a layout."""
+        row, (ids, weights) = layout.labels.index(label), layout.skin
+        return Spot(np.resize(ids[row], 3), np.resize(np.append(weights[row], [0, 0]), 3),
+                    float(np.asarray(layout.distances)[row]), label in layout.loose)
+
+    def same(self, other: Spot) -> bool:
+        """Whether another says the same."""
+        return (_spread(self), self.distance, self.loose) == (_spread(other), other.distance, other.loose)
+
+    def on(self, body: Mesh) -> np.ndarray:
+        """(3,) metres, on a body."""
+        return self.weights @ body.vertices[self.corners]
+
+
+Spots = Mapping[str, Spot | None]    # of markers by label; None for one out of use
+
+
+def mended(layout: MarkerLayout, spots: Spots) -> MarkerLayout:
+    """A layout with some markers elsewhere, or without them."""
+    kept = layout.without(list(spots))
+    moved = {label: spot for label, spot in spots.items() if spot is not None}
+    if moved:
+        there = MarkerLayout(tuple(moved), np.array([spot.corners for spot in moved.values()]),
+                             np.array([spot.distance for spot in moved.values()]),
+                             np.array([spot.weights for spot in moved.values()]),
+                             loose=tuple(label for label, spot in moved.items() if spot.loose))
+        kept = kept.joined(there) if kept.labels else there
+    return replace(kept, aliases={a: label for a, label in layout.aliases.items() if label in kept.labels})
+
+
+def changes(before: MarkerLayout, after: MarkerLayout) -> dict[str, Spot | None]:
+    """What was done to a layout to get another; markers that are only in the other are no change."""
+    new = {label: Spot.of(after, label) if label in after.labels else None for label in before.labels}
+    return {label: spot for label, spot in new.items() if spot is None or not spot.same(Spot.of(before, label))}
+
+
+def _spread(spot: Spot) -> dict[int, float]:
+    """The share of each vertex that has one."""
+    return {int(i): float(w) for i, w in zip(spot.corners, spot.weights, strict=True) if w}
+
+
+def next_file(folder: Path, used: str | None) -> Path:
+    """Where the corrections of the layout that a folder was made with are written: after those it was made with."""
+    folder, before = folder.absolute(), Path(used or "").absolute()
+    number = re.fullmatch(FILE.format(r"(\d+)"), before.name) if before.parent == folder else None
+    return folder / FILE.format(int(number[1]) + 1 if number else 1)

@@ -1,0 +1,196 @@
+"""What the output of `scape mosh` tells of its people, to be looked at: read from the files, when it is wanted."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import Subject
+from scanprep.geometry import storage
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+from scanprep.pictures.scene import Pane
+from scanprep.pictures.shading import Bones, Dots, Heat, Solid
+
+from ...motion import Motion
+from ...motion_pictures import facing, mean_over, upwards, worst_frames
+from ..files.markers import MarkerSequence, read_markers
+from ..marker_sets.layout import MarkerLayout
+from .call import Models
+from .pictures import standing
+from .recordings import Actor, Recording
+
+FRAMES = 6                           # worst frames that are shown of a person
+ROD = (0.35, 0.40, 0.48)
+CLEAR = 0.05                         # metres: the end of the colours of residuals
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a recording, and the mean distance of its markers, metres."""
+
+    take: int
+    number: int
+    told: str
+    off: float
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A person as `scape mosh` found it, in a folder.
+
+    Attributes
+    ----------
+    recordings : those that could be read
+    layout : MarkerLayout
+        Where the markers were found, in the names of the recordings.
+    about : dict
+        What subject.json tells.
+    """
+
+    name: str
+    folder: Path
+    recordings: tuple[Recording, ...]
+    model: BodyModel
+    layout: MarkerLayout
+    about: dict[str, Any]
+    unit: str | None
+
+    @property
+    def layout_name(self) -> str:
+        return str(self.about["layout"])
+
+    @cached_property
+    def subject(self) -> Subject:
+        return self.model.subject(np.array(self.about["betas"]))
+
+    @cached_property
+    def body(self) -> Mesh:
+        """At rest."""
+        return standing(self.model, np.array(self.about["betas"]))
+
+    @cached_property
+    def skin(self) -> Surface:
+        """At rest, for what is nearest."""
+        return Surface(self.body)
+
+    @cached_property
+    def places(self) -> dict[str, np.ndarray]:
+        """Label -> (3,) where it was found on the body at rest."""
+        return dict(zip(self.layout.labels, self.layout.skin_points(self.body.vertices), strict=True))
+
+    @cached_property
+    def motions(self) -> list[Motion]:
+        """One for each recording."""
+        return [Motion.load(self.folder / one.name / "motion.npz") for one in self.recordings]
+
+    @cached_property
+    def markers(self) -> list[MarkerSequence]:
+        """As they were measured."""
+        return [read_markers(one.path, self.unit, one.who) for one in self.recordings]
+
+    @cached_property
+    def labels(self) -> list[str]:
+        """All of the recordings."""
+        return list(dict.fromkeys(label for motion in self.motions for label in motion.labels))
+
+    @cached_property
+    def off(self) -> dict[str, float]:
+        """Label -> mean distance from where the body has it, metres; NaN for one that was not used."""
+        columns: dict[str, list[np.ndarray]] = {}
+        for motion in self.motions:
+            for label, column in zip(motion.labels, motion.residuals.T, strict=True):
+                columns.setdefault(label, []).append(column)
+        return {label: float(mean_over(np.concatenate(some), 0)) for label, some in columns.items()}
+
+    @cached_property
+    def names(self) -> list[str]:
+        """The markers that have a place or were left out of use, the worst first."""
+        out = [label for label in self.about["left_out"] if label in self.off]
+        return [*out, *sorted(set(self.places) - set(out), key=lambda label: -np.nan_to_num(self.off.get(label, 0.0)))]
+
+    @cached_property
+    def doubts(self) -> dict[str, list[str]]:
+        """Label -> what was found wrong with it."""
+        found: dict[str, list[str]] = {}
+        for label, moved in self.about["worn_elsewhere"].items():
+            before, left = (1000 * moved[name] for name in ("from_the_layout", "left"))
+            found.setdefault(label, []).append(f"worn {before:.0f} mm from where the layout has it; moved there, "
+                                               f"{left:.0f} mm are left")
+        for pair in self.about["exchanged"]:
+            for label, other in (pair, pair[::-1]):
+                found.setdefault(label, []).append(f"bears the name of {other} throughout; put back")
+        for label in self.about["left_out"]:
+            found.setdefault(label, []).append("not worn where the layout has it, and found nowhere: left out")
+        for one, motion in zip(self.recordings, self.motions, strict=True):
+            for label in motion.distrusted:
+                found.setdefault(label, []).append(f"{one.name}: hardly believed")
+            for label, line in _artefacts(self.folder / one.name / "artefacts.json"):
+                found.setdefault(label, []).append(f"{one.name}: {line}")
+        return found
+
+    @cached_property
+    def worst(self) -> list[Frame]:
+        """The frames of all recordings in which the markers are farthest, the worst first."""
+        found = []
+        for take, (one, motion) in enumerate(zip(self.recordings, self.motions, strict=True)):
+            for t in worst_frames(motion, FRAMES).tolist():
+                off = float(mean_over(motion.residuals[t], 0))
+                if np.isfinite(off):
+                    told = f"{one.name}, {t / motion.rate:.2f} s: {1000 * off:.0f} mm"
+                    found.append(Frame(take, t, told, off))
+        return sorted(found, key=lambda frame: -frame.off)[:FRAMES] or [Frame(0, 0, self.recordings[0].name, 0.0)]
+
+    def pane(self, frame: Frame) -> Pane:
+        """The body in a frame with the measured markers, coloured by how far they are from where it has them."""
+        motion = self.motions[frame.take]
+        vertices = motion.vertices(self.subject, np.array([frame.number]))[0].astype(float)
+        body, markers = self.model.template.with_vertices(vertices), self.markers[frame.take]
+        measured = dict(zip(markers.labels, markers.positions[frame.number], strict=True))
+        for first, second in self.about["exchanged"]:
+            if first in measured and second in measured:
+                measured[first], measured[second] = measured[second], measured[first]
+        has = {label: place for label, place in zip(self.layout.labels, self.layout.place(body), strict=True)
+               if label in measured}
+        seen, there = np.array([measured[label] for label in has]), np.array(list(has.values()))
+        far = np.linalg.norm(seen - there, axis=1)
+        dots = Dots(seen, Heat(far, 0.0, CLEAR, "measured marker from where the body has it"), 0.014, name="markers",
+                    labels=[f"{label} {1000 * d:.0f}" for label, d in zip(has, far, strict=True)])
+        camera = facing(self.subject, motion.poses[frame.number], body.vertices, vertical=upwards(motion, self.subject))
+        return Pane([Solid(body, name="body"), dots, Bones(there, seen, ROD, 0.004, name="from the body")], camera,
+                    frame.told)
+
+
+def found_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None) -> list[Found]:
+    """The people of an output, as their files tell; StorageError where they do not, ValueError where there are none."""
+    found = [_found(folder / actor.name, actor, models, unit) for actor in actors]
+    if not any(one.recordings for one in found):
+        raise ValueError(f"{folder}: expected what scape mosh found of the people, there is none; run it once more")
+    return [one for one in found if one.recordings]
+
+
+def _found(folder: Path, actor: Actor, models: Models, unit: str | None) -> Found:
+    about = storage.read_json(folder / "subject.json", "a person that scape mosh found")
+    with storage.taking_apart(folder / "subject.json", "a person that scape mosh found"):
+        sex = (about["sex"] or {}).get("sex", "")
+        model = models.sexes.get(sex, models.neutral)
+        about = {name: about[name] for name in ("betas", "layout", "worn_elsewhere", "exchanged", "left_out")}
+    there = tuple(one for one in actor.recordings if (folder / one.name / "motion.npz").exists())
+    layout = MarkerLayout.load(folder / "layout.json", len(model.template.vertices))
+    return Found(actor.name, folder, there, model, layout, about, unit)
+
+
+def _artefacts(path: Path) -> list[tuple[str, str]]:
+    """Label and what is wrong with it for a while, of a file of artefacts."""
+    told = storage.read_json(path, "a list of artefacts")
+    with storage.taking_apart(path, "a list of artefacts"):
+        rate = told["rate"]
+        swaps = [(label, f"exchanged with {other} from {s['begin'] / rate:.2f} to {s['end'] / rate:.2f} s")
+                 for s in told["exchanges"] for label, other in (s["labels"], s["labels"][::-1])]
+        return swaps + [(b["label"], f"{b['kind']} by {1000 * b['distance']:.0f} mm from {b['begin'] / rate:.2f} to "
+                         f"{b['end'] / rate:.2f} s") for b in told["bad"]]

@@ -1,0 +1,172 @@
+"""A folder of completions in the browser: worst first, their landmarks mended, completed again from where they were.
+
+Opened by `scape complete SCANS -o FOLDER --interactive`, or from the folder alone.
+"""
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from model.body import BodyModel
+from model.linear import Subject
+from scanprep.batch.opening import workspace
+from scanprep.batch.workspace import HOME, Results, Workspace
+from scanprep.console import judgement_of, write_report
+from scanprep.pictures.scene import pack_scene
+from scanprep.viewer.app import Send
+from scanprep.viewer.clicked import Clicked
+from scanprep.viewer.messages import Message
+
+from .completion import Completion, load_completion
+from .folder import FolderCall, explained, kept_results, written
+from .interactive import ENDING, CompleteApp, Made, pairs_of
+from .work import Inputs
+
+GRAVEST = ("failed", "check", "good", "new")
+
+
+def mend_completions(folder: Path) -> CompletionsApp:
+    """The app of a folder that `scape complete` made of a folder of scans; ValueError for one that does not tell."""
+    return CompletionsApp(FolderCall.read(folder), folder)
+
+
+class CompletionsApp(CompleteApp):
+    """The state of `scape complete SCANS -o FOLDER --interactive`.
+
+    Parameters
+    ----------
+    call : FolderCall
+        Whose results they are; what is saved is for the same call done.
+    output : the folder of results
+    """
+
+    title = "Mend completions"
+
+    def __init__(self, call: FolderCall, output: Path) -> None:
+        model, self.plain = call.work(True)
+        self.call, self.tasks, self.fresh = call, call.tasks(), set[str]()
+        self._space = Workspace(output, output / HOME)                      # only looked at here
+        self.results = kept_results(self._space, list(self.tasks))
+        self._name_of = {task.given.scans[0]: name for name, task in self.tasks.items()}
+        worst = sorted(self.tasks, key=lambda name: _gravity(name, self.results))
+        super().__init__(model, self.plain, [self.tasks[name].given.scans[0] for name in worst], output)
+        self._bring()
+
+    def _clicked(self, path: Path) -> Clicked:
+        """A scan with the landmarks that the command reads, or will; a file that cannot be read holds none."""
+        found, unit = self.tasks[self._name_of[path]].given.landmarks, self.plain.unit
+        if found is None:
+            return Clicked(path, (self.call.landmarks or path.parent) / (self._name_of[path] + ENDING), unit)
+        try:
+            return Clicked.found(path, ENDING, unit, found)
+        except ValueError:
+            return Clicked(path, found, unit)
+
+    def _inputs(self, scan: Clicked) -> Inputs:
+        """As the command would find them now."""
+        return self.tasks[self._name_of[scan.path]].given
+
+    # what is stored
+
+    def _bring(self) -> None:
+        """The stored completion of the scan that is shown, if it is of this model."""
+        scan = self.scan
+        assert scan is not None, "a folder of scans has some"
+        if scan.path not in self.made and (folder := self.output / self._name_of[scan.path]).exists():
+            try:
+                done = load_completion(folder)
+                if _is_of(done, self.model):
+                    self._keep(scan, done, folder)
+            except ValueError as error:
+                self.note = str(error)
+        if (made := self.made.get(scan.path)) is not None:
+            self.known = made.known
+
+    def _keep(self, scan: Clicked, done: Completion, folder: Path) -> None:
+        task = self.tasks[self._name_of[scan.path]]
+        places = {name: scan.places[name] for name in self._usable(scan)}
+        known = done.betas is None or isinstance(self.plain.body, Subject)
+        files = self._files(scan.path, pairs_of(places, self.work.marks))
+        self.made[scan.path] = Made(done, files, 0.0, places, known, self._masked(scan, files),
+                                    not self._space.is_done(self.plain, task))
+        self.saved[scan.path] = folder
+
+    # what the page is sent
+
+    def scene(self) -> Message:
+        """As of one scan; only the template where the scan cannot be read."""
+        scan = self.scan
+        assert scan is not None, "a folder of scans has some"
+        try:
+            if scan.surface is None:
+                scan.surface = self._surface(scan.path)
+            return super().scene()
+        except (ValueError, OSError) as error:
+            self.note = str(error)
+            return Message("scene", {}, pack_scene([self.template.pane("the model")]))
+
+    def more(self) -> dict[str, Any]:
+        """What is to be thought of each scan besides."""
+        return {**super().more(), "folder": str(self.output),
+                "verdicts": [_told(self._name_of[one.path], self.results) for one in self.scans]}
+
+    # what the page sends
+
+    def on_open(self, send: Send, scan: int) -> None:
+        """Another scan, with what is stored of it."""
+        before = self.current
+        if 0 <= scan < len(self.scans) and scan != before:
+            self._read.clear()
+            self.current = scan
+            self._bring()
+            self.current = before
+        super().on_open(send, scan)
+
+    def receive(self, name: str, path: Path, send: Send) -> None:
+        """Files cannot be dropped here."""
+        raise ValueError(f"copy the scan into {self.call.scans}: all scans there are listed here")
+
+    def _save(self, scan: Clicked, made: Made) -> None:
+        """Write what the command would have written, so that it counts as done there; and the folder's page anew."""
+        if self._outdated(made):
+            raise ValueError("it has changed since: complete again, then save")
+        if scan.path in self.saved:
+            raise ValueError("it is saved: nothing has changed since")
+        name, self.tasks = self._name_of[scan.path], self.call.tasks()        # the landmark file may be new
+        if name not in self.tasks:
+            raise ValueError(f"{scan.path}: no such file; it was moved meanwhile")
+        with workspace(self.output) as space:
+            with space.instead(self.plain, self.tasks[name]) as staged:
+                (staged.folder / name).mkdir()
+                staged.value = self._write(scan, made, staged.folder / name)
+            self.fresh.add(name)
+            self.results = kept_results(space, list(self.tasks))
+            with space.staging("report") as staged:
+                outcome = written(self.call, self.plain.model, self.results, space, len(self.tasks))
+                write_report(replace(outcome, output=staged.folder), f"{self.plain.command} --interactive",
+                             made.seconds)
+        self.saved[scan.path] = self.output / name
+        self.note = f"saved in {self.output / name}; the page of the folder is new"
+
+
+def _is_of(done: Completion, model: BodyModel) -> bool:
+    """Whether a completion is of a model, and not of one with other vertices, parts or betas."""
+    return len(done.completed.vertices) == len(model.template.vertices) \
+        and len(done.pose) == len(model.skeleton.parents) and (done.betas is None or len(done.betas) == model.n_betas)
+
+
+def _gravity(name: str, results: Results) -> tuple[int, float, str]:
+    """Failed ones first, then those worst explained; at the end those that were not completed yet."""
+    verdict = _told(name, results)["verdict"]
+    return GRAVEST.index(verdict), explained(results.values.get(name, ())), name
+
+
+def _told(name: str, results: Results) -> dict[str, Any]:
+    """What is to be thought of a scan, in words."""
+    if name in results.failures:
+        return {"verdict": "failed", "reasons": [results.failures[name]]}
+    judgement = judgement_of(results.values.get(name, ()))
+    if judgement is None:
+        return {"verdict": "new", "reasons": ["not completed yet"]}
+    return {"verdict": judgement.verdict, "reasons": list(judgement.reasons)}

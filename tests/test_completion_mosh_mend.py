@@ -1,0 +1,206 @@
+"""A result of `scape mosh` that is mended: markers moved, exchanged or taken away, saved as a layout, run again."""
+import json
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import wait_until
+from completion_bodies import worm_with_prior
+from mosh_folders import QuietWork, run, small_pictures, write_people
+
+from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
+from completion.mocap.mosh import cli
+from completion.mocap.mosh.call import MoshCall
+from completion.mocap.mosh.mend import MoshApp, mend_mosh
+from completion.mocap.mosh.mended_layout import Spot, changes, mended, next_file
+from scanprep.batch.calls import RUN
+from scanprep.batch.opening import locked
+from scanprep.batch.ownership import HOME
+from scanprep.geometry.storage import StorageError
+from scanprep.viewer.messages import Message
+from scanprep.viewer.server import Server
+
+READY = "Boolean(window.program?.figure && program.state) && program.figure.panes.every((pane) => pane.drawn > 1)"
+MOVED, EXCHANGED = "M12", ["M2", "M20"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def nobody_looks():
+    with small_pictures(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "Work", QuietWork)
+        yield
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A walk with two labels exchanged, by a layout that has a third elsewhere: without any repair it fails."""
+    place = write_people(tmp_path_factory.mktemp("mosh"))
+    shutil.copy(place / "layout.json", place / "true.json")
+    layout = MarkerLayout.load(place / "true.json")
+    body = worm_with_prior().template.vertices
+    far = np.linalg.norm(body - body[layout.vertices[layout.labels.index(MOVED)]], axis=1)
+    layout.moved({MOVED: int(np.abs(far - 0.3).argmin())}).save(place / "layout.json")
+    walk = read_markers(place / "people" / "ann" / "walk.csv")
+    names = dict(zip(EXCHANGED, EXCHANGED[::-1], strict=True))
+    write_markers(place / "walk.csv", MarkerSequence(
+        walk.positions, tuple(names.get(label, label) for label in walk.labels), walk.rate))
+    assert run(place, place / "walk.csv", "-o", place / "out", repair=False, soft_tissue=False) == 1
+    return place
+
+
+def sent(app, kind, **fields):
+    app.handle(Message(kind, fields), lambda message: None)
+
+
+def told(app):
+    return app.greet()[-1].fields
+
+
+def true_spot(place, app):
+    """Where the moved marker truly sits on the person, and the way outward there."""
+    layout = MarkerLayout.load(place / "true.json")
+    vertex, body = layout.vertices[layout.labels.index(MOVED)], app.person.body
+    return body.vertices[vertex], body.vertex_normals[vertex]
+
+
+def moved(place, app):
+    spot, out = true_spot(place, app)
+    sent(app, "place", pane=1, name=MOVED, origin=(spot + 0.3 * out).tolist(), direction=(-out).tolist())
+    np.testing.assert_allclose(app.scan.places[MOVED], spot, atol=1e-6)
+
+
+def test_a_changed_layout_is_told_by_its_changes():
+    vertices = np.array([3, 5, 8, 9])
+    layout = MarkerLayout(("A", "B", "C", "D"), vertices, [0.01, 0.02, 0.01, 0.01], aliases={"a": "A"}, loose=("B",))
+    spots = {"A": Spot.of(layout, "B"), "B": Spot(np.array([1, 2, 4]), np.array([0.2, 0.3, 0.5]), 0.02), "D": None}
+    after = mended(layout, spots)
+    assert set(after.labels) == {"A", "B", "C"} and after.loose == ("A",) and after.aliases == {"a": "A"}
+    back = changes(layout, after)
+    assert set(back) == set(spots) and back["D"] is None
+    assert all(back[label].same(spots[label]) for label in "AB")
+    assert changes(layout, layout) == {} == changes(layout, mended(layout, {}))
+
+
+def test_files_of_corrections_are_numbered(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    out = Path("out")
+    assert next_file(out, None) == next_file(out, "cmu41") == next_file(out, "corrected_layout_4.json") \
+        == tmp_path / "out" / "corrected_layout_1.json"
+    assert next_file(out, str(tmp_path / "out" / "corrected_layout_4.json")).name == "corrected_layout_5.json"
+
+
+def test_corrections_are_saved_beside_and_undone(place):
+    app, given = mend_mosh(place / "out"), (place / "layout.json").read_bytes()
+    state, file = told(app), place / "out" / "corrected_layout_1.json"
+    assert state["scans"] == [{"name": "walk", "count": 34}] and not state["changed"]
+    assert set(app.names[:3]) == {MOVED, *EXCHANGED} and state["verdicts"][0]["verdict"] == "failed"     # worst first
+    assert state["doubts"] == {label: ["walk: hardly believed"] for label in (MOVED, *EXCHANGED)}
+    assert state["frames"][0].startswith("walk, ") and len(app.scene().data) > 1000
+    with pytest.raises(ValueError, match="nothing was corrected"):
+        sent(app, "run")
+    with pytest.raises(ValueError, match="click on the person"):
+        sent(app, "place", pane=0, name=MOVED, origin=[0, 0, 9], direction=[0, 0, -1])
+    sent(app, "exchange", name=EXCHANGED[0], other=EXCHANGED[1])
+    moved(place, app)
+    sent(app, "remove", pane=1, name="M5")
+    saved, usual = MarkerLayout.load(file), MarkerLayout.load(place / "layout.json")
+    assert set(usual.labels) - set(saved.labels) == {"M5"}
+    assert saved.nearest[saved.labels.index("M2")] == usual.vertices[usual.labels.index("M20")]
+    assert set(changes(usual, saved)) == {MOVED, *EXCHANGED, "M5"} == set(told(app)["changed"])
+    again = mend_mosh(place / "out")                                                     # another session
+    assert set(told(again)["changed"]) == set(told(app)["changed"]) and "M5" not in again.scan.places
+    for label, spot in again.scan.places.items():
+        np.testing.assert_allclose(spot, app.scan.places[label], atol=1e-9)
+    for _ in range(3):
+        sent(app, "undo")
+    assert not told(app)["changed"] and not file.exists() and set(app.scan.places) == set(usual.labels)
+    sent(app, "redo")
+    assert set(told(app)["changed"]) == set(EXCHANGED) and file.exists()
+    sent(app, "undo")
+    assert (place / "layout.json").read_bytes() == given
+
+
+def test_a_correction_is_of_the_layout_and_so_of_all_people(place, tmp_path):
+    assert run(place, place / "people", "-o", tmp_path / "out", repair=False, soft_tissue=False) in (0, 1)
+    app = mend_mosh(tmp_path / "out")
+    assert {one["name"] for one in told(app)["scans"]} == {"ann", "bob"}
+    assert len({frame.split(",")[0] for frame in told(app)["frames"]}) == (2 if app.person.name == "ann" else 1)
+    first, found = app.person, [dict(scan.places) for scan in app.scans]
+    moved(place, app)
+    sent(app, "open", scan=1)
+    assert app.person is not first and told(app)["changed"] == [MOVED] and app.chosen == app.names[0]
+    np.testing.assert_allclose(app.scan.places[MOVED], true_spot(place, app)[0], atol=1e-6)       # on another body
+    sent(app, "undo")
+    assert app.person is first and [set(scan.places) for scan in app.scans] == [set(places) for places in found]
+    assert all(np.array_equal(scan.places[MOVED], places[MOVED])
+               for scan, places in zip(app.scans, found, strict=True))
+    with pytest.raises(ValueError, match="expected 0 to 1, got 2"):
+        sent(app, "open", scan=2)
+
+
+def test_another_run_at_work_is_told_and_corrections_stay(place):
+    app = mend_mosh(place / "out")
+    sent(app, "remove", pane=1, name="M5")
+    with locked(place / "out" / HOME / "lock", place / "out"):
+        sent(app, "run")
+        while app.working is not None:
+            time.sleep(0.02)
+    assert "another run is at work" in app.note and told(app)["changed"] == ["M5"]
+    sent(app, "undo")
+
+
+def test_a_result_that_was_moved_or_made_earlier_is_told(place, tmp_path):
+    shutil.copytree(place / "out", tmp_path / "out")
+    call = MoshCall.read(tmp_path / "out")
+    assert call.layout == str(place / "layout.json") and call.markers == (place / "walk.csv",)
+    assert not call.config.repair
+    for other, message in ((replace(call, markers=(tmp_path / "gone.c3d",)), r"gone\.c3d: no such file"),
+                           (replace(call, model=(tmp_path / "gone.npz",)), r"gone\.npz: no such file"),
+                           (replace(call, layout=str(tmp_path / "gone.json")), r"gone\.json")):
+        other.write(tmp_path / "out")
+        with pytest.raises(ValueError, match=message):
+            MoshApp(tmp_path / "out")
+    (tmp_path / "out" / RUN).unlink()
+    (tmp_path / "out" / HOME / RUN).unlink()
+    with pytest.raises(StorageError, match="run the same command once more"):
+        MoshApp(tmp_path / "out")
+
+
+def test_a_result_is_mended_in_the_browser_and_run_again(place, new_page):
+    """Two labels are exchanged by the mouse, a marker moved; the button runs again, and all markers are believed."""
+    app = mend_mosh(place / "out")
+    with Server(app) as server:
+        page = new_page(viewport={"width": 1300, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, READY)
+        assert page.get_by_role("button", name="run again").is_disabled()
+        assert "hardly believed" in page.locator(".sk-doubts").inner_text()               # the worst is chosen
+        page.locator(".sk-names li").filter(has_text="M20").first.click()
+        wait_until(page, "program.state.chosen === 'M20'")
+        page.get_by_label("marker to exchange with").select_option("M2")
+        page.get_by_role("button", name="exchange with").click()
+        wait_until(page, "program.state.changed.length === 2")
+        moved(place, app)
+        page.reload()
+        wait_until(page, READY)
+        page.get_by_role("button", name="run again with 3 corrected").click()
+        wait_until(page, "program.state.working === null && program.state.rows[0][1] !== ''", 60)
+        wait_until(page, "program.figure.panes.length === 3 && program.figure.panes.every((pane) => pane.drawn > 1)")
+        assert page.locator(".sk-before th").all_inner_texts() == ["", "before", "now"]
+        assert page.locator(".sk-verdict").get_attribute("data-verdict") == "good" and page.errors == []
+    rows = {name: (before, now) for name, before, now, _ in told(app)["rows"]}
+    before, now = map(float, rows["distance of all markers, mean"])
+    assert before > 30 and now < 5 and float(rows["distance of the worst marker"][1]) < 10
+    assert [text.split(",")[0] for text in rows["markers in the mean distance"]] == ["31 of 34", "34 of 34"]
+    off = {label: app.person.off[label] for label in (MOVED, *EXCHANGED)}
+    assert max(off.values()) < 0.02 and not app.person.doubts
+    true = true_spot(place, app)[0]
+    assert np.linalg.norm(app.person.places[MOVED] - true) < 0.06
+    call = MoshCall.read(place / "out")
+    assert call.layout == str(place / "out" / "corrected_layout_1.json") and told(app)["corrected"].endswith("_2.json")
+    written = json.loads((place / "out" / "report.json").read_text())
+    assert written["settings"]["layout"] == call.layout and not written["failures"]
+    assert "scape view" in (place / "out" / "report.html").read_text()
