@@ -17,6 +17,7 @@ from model.linear import Subject
 from scanprep.batch.opening import workspace
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.depth_camera.picture import DepthPicture
+from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.scene import Pane, pack_scene
 from scanprep.viewer.app import Send
@@ -35,6 +36,7 @@ from .worn import labels_of, worn_markers, write_worn
 ENDING = ".landmarks.json"           # of landmark files
 COMPLETED = "completed.ply"
 FEWEST = 3                           # landmarks that say where a body is
+FIRST = 10                           # landmarks that are offered first: far from each other, all over the body
 HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
 
@@ -77,7 +79,7 @@ class CompleteApp(PickApp):
         self.known = isinstance(work.body, Subject)
         self.can_choose = model.n_betas > 0
         template = Clicked(Path(work.model), output / "template.landmarks.json", surface=Clickable(model.template))
-        marks = {name: model.template.vertices[vertex] for name, vertex in work.marks.items()}
+        marks = far_apart_first({name: model.template.vertices[vertex] for name, vertex in work.marks.items()})
         super().__init__(template, [self._clicked(path) for path in scans], labels, fixed=marks)
 
     def _clicked(self, path: Path) -> Clicked:
@@ -197,7 +199,7 @@ class CompleteApp(PickApp):
             elif not lacks:
                 self.take(scan)
                 send(self.scene())
-        self.note = lacks
+        self.note = lacks or ("" if labels else f"{scan.name} is open")
         send(self.state())
 
     def take(self, path: Path) -> None:
@@ -299,6 +301,15 @@ class CompleteApp(PickApp):
 def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray] | None:
     """Landmarks as `complete` takes them; None without any."""
     return (np.array([marks[name] for name in places]), np.array(list(places.values()))) if places else None
+
+
+def far_apart_first(places: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same landmarks, those first that lie all over the body: a few clicks are to tell most."""
+    names = list(places)
+    if not names:
+        return {}
+    first = [names[i] for i in farthest_points(np.array([places[name] for name in names]), min(FIRST, len(names)))]
+    return {name: places[name] for name in dict.fromkeys([*first, *names])}
 
 
 def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict[str, np.ndarray]:

@@ -22,7 +22,7 @@ from .completion import Completion
 from .scan import View, all_points, as_views, in_metres
 
 MEASURED, COMPLETED = (0.55, 0.67, 0.80), (0.93, 0.75, 0.42)
-PREDICTED = (0.62, 0.74, 0.62)
+PREDICTED, OVER = (0.62, 0.74, 0.62), (0.45, 0.42, 0.50)
 CLOTHING, MARK = (0.62, 0.48, 0.66), (0.80, 0.12, 0.10)
 HEIGHT = 520
 WIDEST = 2.0                         # times as wide as high a picture of one side may be
@@ -101,7 +101,7 @@ def completion_panes(scan: View | Sequence[View], completion: Completion, templa
     if landmarks is not None:
         labels = [(names or {}).get(int(v), "") for v in landmarks[0]]
         marks = [Dots(completion.scale * np.asarray(landmarks[1]), MARK, 0.010, True, name="landmarks", labels=labels)]
-    over = [replace(shape, name="scan over it", visible=False) for shape in given]
+    over = [replace(shape, name="scan over it", visible=False, color=OVER) for shape in given]
     body = completion.completed
     shades = _shades(scan, completion, masked)
     whole = Solid(Mesh(body.vertices, body.faces), _two_colors(completion), name="completed body", shades=shades)
