@@ -20,7 +20,7 @@ from scanprep.viewer.messages import Message
 
 from .completion import Completion, load_completion
 from .folder import FolderCall, explained, kept_results, written
-from .interactive import ENDING, CompleteApp, Made, pairs_of
+from .interactive import ENDING, CompleteApp, Made, on_scan, pairs_of
 from .work import Inputs
 
 GRAVEST = ("failed", "check", "good", "new")
@@ -90,6 +90,9 @@ class CompletionsApp(CompleteApp):
         files = self._files(scan.path, pairs_of(places, self.work.marks))
         self.made[scan.path] = Made(done, files, 0.0, places, known, self._masked(scan, files),
                                     not self._space.is_done(self.plain, task))
+        if scan.surface is None:
+            scan.surface = self._surface(scan.path)
+        scan.predicted = on_scan(done, self.work.marks, scan.body)
         self.saved[scan.path] = folder
 
     # what the page is sent

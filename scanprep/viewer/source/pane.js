@@ -84,9 +84,14 @@ export class Pane {
     this.camera.position.copy(this.controls.target).addScaledVector(back, this.home.distance);
     this.lens();
     this.controls.update();
+    this.fit();
+  }
+
+  // A step back where the body is wider from this side, so that nothing is cut off.
+  fit() {
     const far = this.reach() / FULL;
-    if (far > 1) {                                      // wider from this side: a step back, so that nothing is cut off
-      this.camera.position.copy(this.controls.target).addScaledVector(back, this.home.distance * far);
+    if (far > 1) {
+      this.camera.position.sub(this.controls.target).multiplyScalar(far).add(this.controls.target);
       this.controls.update();
     }
     this.redraw();

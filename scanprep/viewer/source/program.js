@@ -90,7 +90,10 @@ export class Program {
       this.figure.choose(choices);
     }
     const [first, ...others] = this.figure.panes.slice(this.alike ?? Infinity);
-    for (const pane of others) pane.follow(first);
+    for (const pane of others) {
+      pane.follow(first);
+      if (before?.length !== scene.panes.length) pane.fit();                    // else the view was chosen by hand
+    }
     this.shown?.(this.figure);
   }
 
