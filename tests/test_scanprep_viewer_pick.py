@@ -234,8 +234,10 @@ def test_left_and_right_are_swapped_and_back(folder):
     app.scans[0].places = {"left toe": np.array([1.0, 0, 0]), "right toe": np.array([-1.0, 0, 0]),
                            "left knee": np.array([1.0, 0, 1]), "navel": np.zeros(3)}
     before = dict(app.scans[0].places)
+    app.scans[0].predicted = {"left heel": np.array([1.0, 0, 0]), "nose tip": np.ones(3)}
     sent(app, "swap")
     after = app.scans[0].places
+    assert set(app.scans[0].predicted) == {"right heel", "nose tip"}
     assert set(after) == {"left toe", "right toe", "right knee", "navel"} and after["left toe"][0] == -1
     assert after["right knee"] is before["left knee"] and set(read_landmarks(app.scans[0].file)) == set(after)
     sent(app, "undo")
@@ -286,6 +288,54 @@ def test_landmarks_are_picked_by_mouse_and_saved(new_page, folder, person):
         wait_until(page, "Object.keys(program.state.panes[1].places).length === 4")
         assert page.errors == []
     assert set(read_landmarks(folder / "anna.landmarks.json")) == set(FOUR)
+
+
+def test_the_page_helps_a_hand(new_page, folder, person):
+    """Views, clicks just beside the body, landmarks behind it, and those that are not where they are predicted."""
+    app = app_of(folder)
+    app._predict_if_time = lambda send, pane: None
+    vertex = landmarks()["navel"]
+    place = moved(person.mesh.vertices[vertex])
+    click(app, place, "navel", normal=moved(person.mesh.vertices[vertex] + person.mesh.vertex_normals[vertex]) - place)
+    app.scans[0].predicted, app.chosen = {"navel": app.scans[0].places["navel"] + [0, 0, 0.1]}, "navel"
+    with Server(app) as server:
+        page = new_page(viewport={"width": 1200, "height": 800})
+        page.goto(server.opening())
+        wait_until(page, DRAWN)
+        side, away = page.get_by_label("side", exact=True), "program.figure.panes[1].camera.position.length()"
+        x, y = on_page(page, app.scans[0].places["navel"])
+        before = page.evaluate(away)
+        page.mouse.move(x, y + 60)
+        page.mouse.wheel(0, 300)                                      # nothing was clicked before
+        wait_until(page, f"Math.abs({away} - {before}) > 0.05 && {json.dumps('turned')} === program.figure.side.value")
+        side.select_option("first view")
+        wait_until(page, f"Math.abs({away} - {before}) < 1e-6")
+        near = f"program.near(program.figure.panes[1], 1, {{clientX: {x}, clientY: {y}}})"
+        assert page.evaluate(near) == "navel"
+        side.select_option("back")
+        x, y = on_page(page, app.scans[0].places["navel"])
+        near = f"program.near(program.figure.panes[1], 1, {{clientX: {x}, clientY: {y}}})"
+        assert page.evaluate(near) is None                            # the body hides it
+        assert page.evaluate("program.figure.panes[1].home.distance *= 0.5, program.figure.look(90, 0), "
+                             "program.figure.panes[1].reach()") <= 1
+        page.evaluate("program.figure.panes[1].home.distance *= 2")
+        side.select_option("front")
+        page.locator("button", has_text="move it there").click()
+        wait_until(page, "program.off('navel') < 1e-6 && program.buttons.there.hidden")
+        page.keyboard.press("Control+z")
+        wait_until(page, "Math.abs(program.off('navel') - 0.1) < 1e-6 && !program.buttons.there.hidden")
+        page.locator(".sk-names li").filter(has_text="top of head").first.click()
+        wait_until(page, "program.state.chosen === 'top of head'")
+        x, y = on_page(page, moved(person.mesh.vertices[landmarks()["top of head"]]))
+        border = page.evaluate("""([x, y]) => {
+          const hits = (up) => program.figure.panes[1].hit({clientX: x, clientY: y - up});
+          let up = 0;
+          while (hits(up)) up++;
+          return y - up - 4;
+        }""", [x, y])
+        page.mouse.click(x, border)
+        wait_until(page, "'top of head' in program.state.panes[1].places")
+        assert page.errors == []
 
 
 def test_a_landmark_is_dragged(new_page, folder, person):
