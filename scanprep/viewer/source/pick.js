@@ -9,9 +9,9 @@ const BESIDE = [3, 6, 9];            // pixels beside a surface that a click sti
 export const OFF = 0.03;             // metres from where a landmark is predicted, from which on it is to be looked at
 const COLORS = { set: "#d5392f", chosen: "#f0a400", predicted: "#3b82c4" };
 export const WORDS = { good: "good", check: "look at it", failed: "failed", new: "new" };       // verdicts
-export const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete", "take the landmark away"],
+const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete", "take the landmark away"],
   ["c", "confirm the predicted ones"], ["[ and ]", "previous, next scan"], ["+ and -", "move it along the view, into the body"],
-  ["i", "click inside the body: joints"], ["drag, arrow keys", "turn the body"], ["wheel", "zoom"], ["right button", "shift the body"]];
+  ["i", "click inside the body: joints"]];
 
 export class Pick extends Program {
   constructor(connection, page) {
@@ -47,7 +47,7 @@ export class Pick extends Program {
     this.file = make("p", { class: "sk-file" });
     this.panel.append(this.scans, this.list, this.added, make("div", { class: "sk-buttons" }, ...Object.values(this.buttons)),
       make("label", {}, this.insideBox, "inside the body (joints)"), this.measure, this.file,
-      make("details", {}, make("summary", {}, "mouse and keys"), make("dl", {}, ...KEYS.flatMap(([key, what]) => [make("dt", {}, key), make("dd", {}, what)]))));
+      this.help(KEYS));
   }
 
   confirm() { this.send("confirm", { names: Object.keys(this.waiting()) }); }

@@ -3,6 +3,8 @@ import { Figure, make } from "./figure.js";
 import { unpackScene } from "./unpack.js";
 import { hasWebGL } from "./pane.js";
 
+const MOUSE = [["drag, arrow keys", "turn the body"], ["wheel", "zoom"], ["right button", "shift the body"]];
+
 export class Program {
   constructor(connection, page) {
     this.connection = connection;
@@ -44,6 +46,11 @@ export class Program {
       this.panel.append(make("button", { type: "button", class: "sk-back", title: `back to “${this.page.back}”`,
         onclick: () => this.send("leave") }, `← ${this.page.back}`));
     }
+  }
+
+  help(keys) {
+    return make("details", {}, make("summary", {}, "mouse and keys"),
+      make("dl", {}, ...[...keys, ...MOUSE].flatMap(([key, what]) => [make("dt", {}, key), make("dd", {}, what)])));
   }
 
   on(kind, answer) { this.answers[kind] = answer; }

@@ -43,7 +43,7 @@ export class View extends Program {
     this.pose = make("fieldset", { class: "sk-sliders" }, make("legend", {}, "pose"), this.part, ...this.angles.map((one) => one.row),
       make("label", {}, this.dragging, "drag a part to pose the body"));
     this.buttons = make("div", { class: "sk-buttons" },
-      button("random body", "betas drawn as the training people are spread (b)", () => this.send("random_body")),
+      this.randomBody = button("random body", "betas drawn as the training people are spread (b)", () => this.send("random_body")),
       button("random pose", "a pose drawn from those the model was learned from (p)", () => this.send("random_pose")),
       button("reset", "the mean body at rest (r)", () => this.send("reset")),
       button("save body", "write the mesh, beside what is there", () => this.send("save_body")),
@@ -57,7 +57,7 @@ export class View extends Program {
     this.saved = make("p", { class: "sk-file" });
     this.models = make("div", { class: "sk-models", hidden: true }, this.shape, this.pose, this.buttons);
     this.panel.append(dropZone(this, "drop files here, or choose"), this.list, this.notes, this.completion, this.folders, this.models, this.saved,
-      make("details", {}, make("summary", {}, "keys"), make("dl", {}, ...KEYS.flatMap(([key, what]) => [make("dt", {}, key), make("dd", {}, what)]))));
+      this.help(KEYS));
   }
 
   // What can be opened: a choice is kept for as long as it is there, and a new scan is chosen.
@@ -102,6 +102,7 @@ export class View extends Program {
     }
     this.shape.hidden = !count;
     this.more.hidden = count === this.betas.length;
+    this.randomBody.hidden = !count;
     this.sliders.forEach((one, i) => one.set(this.betas[i]));
   }
 
