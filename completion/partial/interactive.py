@@ -120,7 +120,7 @@ class CompleteApp(PickApp):
         if self.scan is not None:
             panes.append(self.scan.pane(self.scan.path.name))
             if (result := self._result_pane()) is not None:
-                panes.append(replace(result, label="the whole body: blue measured, yellow filled in"))
+                panes.append(replace(result, label="the whole body"))
         return Message("scene", {}, pack_scene(panes))
 
     def _result_pane(self) -> Pane | None:

@@ -3,7 +3,7 @@ import { dropZone } from "./drop.js";
 import { make } from "./figure.js";
 import { button, OFF, Pick, WORDS } from "./pick.js";
 
-const WHOLE = "Under the bodies: boxes show the completed body, the predicted one and the scan; the list has the expected error as colours.";
+const WHOLE = "Blue was measured, yellow filled in. The list below has other colours, such as the expected error.";
 
 export class Complete extends Pick {
   build() {
@@ -17,7 +17,7 @@ export class Complete extends Pick {
     this.verdict = make("div", { class: "sk-verdict", hidden: true });
     this.markers = make("p", { class: "sk-file" });
     this.added.placeholder = "a name, or a marker set: cmu41";
-    this.scans.before(this.dropping = dropZone(this, "drop a scan here, or a recording whose markers to click, or choose a file"));
+    this.scans.before(this.dropping = dropZone(this, "drop a scan here, or choose a file"));
     this.list.before(make("div", { class: "sk-buttons" }, this.go, this.anew, this.keep), this.knownLabel, this.verdict, this.markers);
     this.buttons.predict.remove();
   }
