@@ -158,6 +158,21 @@ def test_from_a_half_view_to_a_saved_body_by_mouse_alone(case, new_page, tmp_pat
         wait_until(page, "Boolean(program.state.completed) && !program.state.working", 60)
         wait_until(page, "program.figure.panes.length === 3 && program.figure.panes[2].drawn > 0")
         assert page.locator(".sk-verdict strong").inner_text() in ("good", "look at it")
+        way = "((pane) => pane.view().position.sub(pane.view().target).normalize().toArray())(program.figure.panes[{}])"
+        one, other = (page.evaluate(way.format(i)) for i in (1, 2))
+        np.testing.assert_allclose(one, other, atol=1e-6)                 # scan and body are seen from one side
+        for left in (3, 2):
+            page.locator(".sk-names li").filter(has=page.locator(".sk-dots :nth-child(2).sk-on")).first.click()
+            wait_until(page, "program.state.chosen in program.state.panes[1].places")
+            page.keyboard.press("Delete")
+            wait_until(page, f"Object.keys(program.state.panes[1].places).length === {left}")
+            assert page.get_by_role("button", name="save").is_disabled()  # it is not of these landmarks
+        assert page.get_by_role("button", name="complete", exact=True).is_disabled()
+        page.keyboard.press("n")
+        wait_until(page, "document.querySelector('.sk-status').textContent.includes('One more, or none')")
+        for _ in range(2):
+            page.keyboard.press("z")
+        wait_until(page, "!program.state.completed.outdated")
         page.get_by_role("button", name="save").click()
         wait_until(page, "Boolean(program.state.completed.saved)", 60)
         assert page.errors == []

@@ -1,6 +1,7 @@
 """`scape view`: what files are, what cannot be shown, the same in a notebook."""
 import json
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from viewing_apps import a_motion, app_of, ask, write_files
 
 from completion.__main__ import main
 from completion.partial.completion import Completion, save_completion
-from completion.viewing.contents import Stance
+from completion.viewing.arrangement import side_by_side
+from completion.viewing.contents import Stance, of_mesh
 from completion.viewing.notebook import view
 from scanprep import RegisteredSet, write_mesh
+from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 
 
@@ -175,3 +178,17 @@ def test_a_notebook_shows_files_and_refuses_the_rest(files):
         view()
     with pytest.raises(ValueError, match="up: expected one of"):
         view(files / "body.ply", up="w")
+
+
+def test_things_at_one_place_are_seen_from_one_side(model):
+    """As a scan and what was made of it; not what stands elsewhere, or faces the other way."""
+    body = of_mesh("body", model.template)
+
+    def standing(angle, away=0.0):
+        stance = body.stance
+        front = rotations.exp(np.radians(angle) * stance.up) @ stance.front
+        return replace(body, stance=replace(stance, front=front, extent=stance.extent + away))
+
+    cameras, _ = side_by_side([body, standing(40), standing(170), standing(40, 5.0)])
+    apart = [np.degrees(np.arccos(np.clip(one.axes[2] @ cameras[0].axes[2], -1, 1))) for one in cameras]
+    assert apart[1] < 1e-3 and apart[2] > 100 and 30 < apart[3] < 50

@@ -1,6 +1,8 @@
 """Pages inside of another: which one is told of what, what is dropped, and that all of them are closed."""
+import numpy as np
 import pytest
 from click_app import Clicks
+from PIL import Image
 
 from scanprep.viewer.dropped import Dropped, with_camera
 from scanprep.viewer.messages import Message
@@ -107,7 +109,10 @@ def test_a_depth_picture_waits_for_its_camera(tmp_path):
     camera.write_text("{}")
     assert with_camera(camera) == (picture, "one.camera.json is kept: now drop its depth picture, one.png")
     camera.unlink()
-    picture.write_bytes(b"")
+    Image.fromarray(np.zeros((4, 5), dtype=np.uint8)).save(picture)
+    with pytest.raises(ValueError, match=r"one[.]png: expected distances, one channel of 16 bits, got uint8"):
+        with_camera(picture)
+    Image.fromarray(np.zeros((4, 5), dtype=np.uint16)).save(picture)
     assert with_camera(picture) == (picture, "one.png is kept: now drop its camera, one.camera.json")
     camera.write_text("{}")
     assert with_camera(picture) == with_camera(camera) == (picture, "")

@@ -37,6 +37,9 @@ ENDING = ".landmarks.json"           # of landmark files
 COMPLETED = "completed.ply"
 FEWEST = 3                           # landmarks that say where a body is
 FIRST = 10                           # landmarks that are offered first: far from each other, all over the body
+TOLD = {"good": "completed: look at it from all sides, then save; or move or add landmarks and complete again",
+        "check": "completed, but look at it: move or add landmarks and complete again, or save",
+        "failed": "the completion failed: correct landmarks, then start over"}
 HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
 
@@ -116,7 +119,7 @@ class CompleteApp(PickApp):
 
     def scene(self) -> Message:
         """The template, the scan, and the whole body once there is one."""
-        panes = [self.template.pane("the model: where the next landmark is")]
+        panes = [self.template.pane("the model")]
         if self.scan is not None:
             panes.append(self.scan.pane(self.scan.path.name))
             if (result := self._result_pane()) is not None:
@@ -249,7 +252,7 @@ class CompleteApp(PickApp):
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
             if scan is self.scan:
                 send(self.scene())
-            return "completed; move or add landmarks and complete again, or save"
+            return TOLD[done.judgement.verdict]
 
         self.beside("completing", work, send, "this scan could not be completed")
 

@@ -170,6 +170,15 @@ def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
     The camera is read from `NAME.camera.json` beside it: `{"fx", "fy", "cx", "cy"}` in pixels, or what Open3D writes,
     `{"intrinsic_matrix": [...]}`, column by column.
     """
+    values = read_distances(path)
+    try:
+        return DepthPicture.of(metres * values, read_camera(camera_file(path)))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def read_distances(path: Path) -> np.ndarray:
+    """(H, W) whole numbers of a PNG file, in its own unit; ValueError for another kind of picture."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -179,10 +188,7 @@ def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
         raise ValueError(f"{path}: it is not a PNG file") from None
     if values.ndim != 2 or values.dtype == np.uint8:
         raise ValueError(f"{path}: expected distances, one channel of 16 bits, got {values.dtype} {values.shape}")
-    try:
-        return DepthPicture.of(metres * values, read_camera(camera_file(path)))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    return values
 
 
 def read_camera(path: Path) -> np.ndarray:

@@ -204,7 +204,7 @@ def _suffix(path: Path) -> str:
 
 def _format(path: Path, formats: dict[str, _Format]) -> _Format:
     if _suffix(path) not in formats:
-        raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found '{_suffix(path)}'")
+        raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found {_suffix(path) or 'none'}")
     return formats[_suffix(path)]
 
 

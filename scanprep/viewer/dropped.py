@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..depth_camera.picture import CAMERA, camera_file, is_camera, is_picture
+from ..depth_camera.picture import CAMERA, camera_file, is_camera, is_picture, read_distances
 
 
 class Dropped:
@@ -56,10 +56,14 @@ class Dropped:
 
 
 def with_camera(path: Path) -> tuple[Path, str]:
-    """The file to open for one that was dropped, and what it still lacks: a depth picture and its camera are one."""
+    """The file to open for one that was dropped, and what it still lacks: a depth picture and its camera are one.
+
+    ValueError for another kind of picture.
+    """
     if is_camera(path):
         picture = path.with_name(path.name[:-len(CAMERA)] + ".png")
         return picture, "" if picture.exists() else f"{path.name} is kept: now drop its depth picture, {picture.name}"
     if is_picture(path) and not camera_file(path).exists():
+        read_distances(path)
         return path, f"{path.name} is kept: now drop its camera, {camera_file(path).name}"
     return path, ""

@@ -146,6 +146,7 @@ class PickApp:
         """Take a landmark away."""
         if name in self._editable(pane).places:
             self._change(self._number(pane), {name: None})
+            self.note = f"{name} is taken away; a click sets it again, undo brings it back"
         self.chosen = name
 
     def on_swap(self, send: Send) -> None:
@@ -189,7 +190,7 @@ class PickApp:
         if wanted:
             self._change(self._number(SCAN), wanted)
             self.choose_next(None)
-            self.note = f"{len(wanted)} predicted landmarks taken; undo takes them back"
+            self.note = f"{len(wanted)} taken as predicted; undo takes them back"
 
     def on_predict(self, send: Send) -> None:
         """Where the other landmarks of the template should be on the scan."""

@@ -101,12 +101,13 @@ export class Figure {
   }
 
   // What is seen and in which colours, to be chosen again in a figure of the same things.
-  choices() { return { visible: new Map(this.layers.map((layer) => [layer.name, layer.object.visible])), color: this.colored }; }
+  choices() { return { visible: new Map(this.layers.map((layer) => [layer.name, layer.object.visible])), color: this.colored, side: this.side.value }; }
 
-  choose({ visible, color }) {
+  choose({ visible, color, side }) {
     this.each((layer) => { if (layer.name) layer.object.visible = visible.get(layer.name) ?? layer.object.visible; });
     if (color !== undefined) this.color(color);
     this.fill();
+    this.side.value = side;
   }
 
   color(name) {

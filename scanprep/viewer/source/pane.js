@@ -50,11 +50,12 @@ export class Pane {
     this.home = camera;
     this.lights();
     this.reset();
-    this.controls.addEventListener("change", () => { this.redraw(); this.onTurn?.(this); });
+    this.controls.addEventListener("change", () => { this.redraw(); this.onTurn?.(this); if (this.held) this.onHand?.(); });
+    this.controls.addEventListener("start", () => { this.held = true; });
+    this.controls.addEventListener("end", () => { this.held = false; });
     this.canvas.addEventListener("wheel", (event) => {  // a page that scrolls goes on doing so until the body was touched
       if (!this.canvas.matches(":focus") && document.documentElement.scrollHeight > innerHeight + 1) event.stopImmediatePropagation();
     }, true);
-    this.controls.addEventListener("start", () => this.onHand?.());
     this.canvas.addEventListener("pointerdown", () => this.canvas.focus({ preventScroll: true }));
     this.canvas.addEventListener("keydown", (event) => this.turnBy(event));
     this.overlays = [];                                 // functions (context, pane) that draw over the picture

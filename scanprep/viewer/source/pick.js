@@ -78,7 +78,7 @@ export class Pick extends Program {
     this.buttons.redo.disabled = !state.redo;
     const waiting = Object.keys(this.waiting()).length;
     this.buttons.confirm.disabled = !waiting;
-    this.buttons.confirm.textContent = waiting ? `confirm ${waiting}` : "confirm all";
+    this.buttons.confirm.textContent = waiting ? `confirm ${waiting} predicted` : "confirm all";
     const common = Object.keys(state.panes[0].places).filter((name) => name in (state.panes[1]?.places ?? {}));
     this.buttons.predict.disabled = common.length < state.enough || Boolean(state.working);
     this.buttons.next.disabled = state.names.length < 2;
@@ -203,7 +203,8 @@ export class Pick extends Program {
     for (const [name, place] of Object.entries(marks)) {
       const point = new Vector3().fromArray(place).sub(pane.origin), at = pane.project(point);
       const away = at ? Math.hypot(at.x - (event.clientX - box.left), at.y - (event.clientY - box.top)) : Infinity;
-      if (away < least && (this.inside || !pane.covers(point))) { best = name; least = away; }
+      const fixed = number === 0 && this.state.fixed;   // is only chosen
+      if (away < least && (this.inside || fixed || !pane.covers(point))) { best = name; least = away; }
     }
     return best;
   }

@@ -57,6 +57,7 @@ export class Program {
 
   // Python drops what is for a page that was left meanwhile.
   send(kind, fields = {}, latest = "", data = undefined) {
+    if (this.status.dataset.kind === "bad" && !this.lost) this.say("");         // what was wrong is over
     const { number } = this.page;
     this.connection.send(kind, number === undefined ? fields : { ...fields, page: number }, data, latest);
   }
