@@ -13,12 +13,15 @@ from config_files import config_file
 from completion.__main__ import main
 from completion.partial import report
 from completion.partial.completion import load_completion
-from completion.partial.folder import FolderCall
+from completion.partial.folder import FolderCall, folder_page
 from completion.partial.mend import CompletionsApp, mend_completions
+from completion.partial.work import MEANS
 from scanprep.batch.calls import RUN, command_of
+from scanprep.console import Metric, judgement_row
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.landmarks import read_landmarks, write_landmarks
 from scanprep.geometry.storage import StorageError
+from scanprep.judgement import Judgement
 from scanprep.viewer import server
 from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Server
@@ -199,3 +202,13 @@ def test_a_folder_that_was_moved_or_made_earlier_is_told(place, tmp_path):
     (tmp_path / RUN).unlink()
     with pytest.raises(StorageError, match="run the same command once more"):
         mend_completions(tmp_path)
+
+
+def test_the_page_has_the_failed_first_and_then_the_worst_explained(tmp_path):
+    def figures(share, verdict):
+        return [judgement_row(Judgement(verdict, ("why",) if verdict != "good" else ())), Metric(MEANS[1], share, "%")]
+
+    results = {"a": figures(98.0, "good"), "b": figures(99.0, "failed"), "c": figures(70.0, "check"),
+               "d": figures(80.0, "good")}
+    html = folder_page(results, [], tmp_path, FolderCall(tmp_path)).html()
+    assert sorted("abcd", key=lambda name: html.index(f'href="{name}/report.html"')) == ["b", "c", "d", "a"]

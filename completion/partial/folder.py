@@ -15,7 +15,7 @@ from model.posing.cli import read_subject
 from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
-from scanprep.console import Metric, Outcome, failures_of
+from scanprep.console import Metric, Outcome, failures_of, judgement_of
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import SCENE, worst_that_turn
 from scanprep.pictures.sheets import small_picture
@@ -26,6 +26,7 @@ from .colors import ColorConfig
 from .settings import CompletionConfig
 from .work import MEANS, Inputs, Work, marks_of_template
 
+GRAVEST = ("failed", "check", "good", "new")                          # verdicts, and what was not completed yet
 PAGE = "page"                        # name of the result that keeps what failed, beside the page
 
 
@@ -111,13 +112,13 @@ def summary(metrics: Mapping[str, Sequence[Metric]], fresh: int, count: int) -> 
 
 def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str], folder: Path, call: FolderCall
                 ) -> Page:
-    """The page of all scans, those worst explained first; what is told of them lies in the folder."""
+    """The page of all scans, worst first; what is told of them lies in the folder."""
     page = Page(f"{len(metrics)} scans completed", "Worst first; each name leads to the page of its scan.")
     page.text("To mend some, run the same command with --interactive: it opens these results in the browser, worst "
               f"first (scape complete {call.scans} ... -o {folder} --interactive).")
     if failures:
         page.section("Failed").table([(line,) for line in failures])
-    names = sorted(metrics, key=lambda name: explained(metrics[name]))
+    names = sorted(metrics, key=lambda name: gravity(metrics[name]))
     turning = worst_that_turn([folder / name / SCENE for name in names])
     for name, scene in zip(names, turning, strict=True):
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
@@ -128,6 +129,8 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
     return page
 
 
-def explained(metrics: Sequence[Metric]) -> float:
-    """Percent of a scan's points that the body explains."""
-    return next((float(m.value) for m in metrics if m.name == MEANS[1]), 0.0)
+def gravity(metrics: Sequence[Metric]) -> tuple[int, float]:
+    """By which scans are sorted: failed ones first, and among equals those whose points the body explains worst."""
+    judgement = judgement_of(metrics)
+    explained = next((float(m.value) for m in metrics if m.name == MEANS[1]), 0.0)
+    return GRAVEST.index("new" if judgement is None else judgement.verdict), explained

@@ -19,11 +19,9 @@ from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
 
 from .completion import Completion, load_completion
-from .folder import FolderCall, explained, kept_results, written
+from .folder import FolderCall, gravity, kept_results, written
 from .interactive import ENDING, CompleteApp, Made, on_scan, pairs_of
 from .work import Inputs
-
-GRAVEST = ("failed", "check", "good", "new")
 
 
 def mend_completions(folder: Path) -> CompletionsApp:
@@ -161,8 +159,7 @@ def _is_of(done: Completion, model: BodyModel) -> bool:
 
 def _gravity(name: str, results: Results) -> tuple[int, float, str]:
     """Failed ones first, then those worst explained; at the end those that were not completed yet."""
-    verdict = _told(name, results)["verdict"]
-    return GRAVEST.index(verdict), explained(results.values.get(name, ())), name
+    return (*((0, 0.0) if name in results.failures else gravity(results.values.get(name, ()))), name)
 
 
 def _told(name: str, results: Results) -> dict[str, Any]:
