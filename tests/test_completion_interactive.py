@@ -9,7 +9,7 @@ from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_pr
 from test_completion_partial import errors
 
 from completion.partial.completion import complete, load_completion
-from completion.partial.interactive import CompleteApp
+from completion.partial.interactive import CompleteApp, doubts
 from completion.partial.work import Work
 from scanprep.batch.opening import workspace
 from scanprep.geometry.files import PointCloud, write_points
@@ -108,6 +108,33 @@ def test_what_python_completes_the_page_completes(case):
     finished(app)
     got = app.made[app.scan.path].completion
     np.testing.assert_allclose(got.completed.vertices, want.completed.vertices, atol=1e-6)
+
+
+def test_landmarks_at_wrong_places_are_told():
+    found = {"left toe": np.zeros(3), "right toe": np.array([0.3, 0, 0]), "left knee": np.array([0, 0, 0.5]),
+             "right knee": np.array([0.3, 0, 0.5]), "nose": np.array([0.1, 0, 1.6])}
+    assert doubts({name: place + 0.03 for name, place in found.items()}, found).startswith("all landmarks are where")
+    swapped = {**found, "left toe": found["right toe"], "right toe": found["left toe"],
+               "left knee": found["right knee"]}
+    assert "left and right are exchanged" in doubts(swapped, found)
+    told = doubts({**found, "nose": found["left knee"], "left toe": found["right toe"]}, found)
+    assert told.endswith("where the rings are: nose (1105 mm), left toe (300 mm)")
+
+
+def test_the_body_is_found_without_the_landmarks_that_are_doubted(case):
+    body, _, seen, app = case
+    marked(app, body, seen)
+    right = {name: place.copy() for name, place in app.scan.places.items()}
+    wrong, *_, other = right
+    app.scan.places[wrong] = right[other]
+    sent(app, "doubt")
+    finished(app)
+    assert f"where the rings are: {wrong} (" in app.note and other not in app.note
+    assert np.linalg.norm(app.scan.predicted[wrong] - right[wrong]) < 0.03
+    app.scan.places[wrong] = right[wrong]
+    sent(app, "doubt")
+    finished(app)
+    assert app.note.startswith("all landmarks are where")
 
 
 def test_too_few_landmarks_and_nothing_to_save_are_refused(case):

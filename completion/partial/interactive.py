@@ -19,6 +19,7 @@ from scanprep.console import Metric, Outcome, write_report
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sides import other_side
 from scanprep.pictures.scene import Pane, pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
@@ -40,6 +41,7 @@ FIRST = 10                           # landmarks that are offered first: far fro
 TOLD = {"good": "completed: look at it from all sides, then save; or move or add landmarks and complete again",
         "check": "completed, but look at it: move or add landmarks and complete again, or save",
         "failed": "the completion failed: correct landmarks, then start over"}
+WRONG = 0.1                          # metres off from where a body found without it has a landmark that is wrong
 HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
 
@@ -256,6 +258,26 @@ class CompleteApp(PickApp):
 
         self.beside("completing", work, send, "this scan could not be completed")
 
+    def on_doubt(self, send: Send) -> None:
+        """Find the body without the landmarks, which tells those that are at wrong places."""
+        if self.scan is None or self.working is not None:
+            return
+        scan, known, given = self.scan, self.known, self._given(self.scan.path)
+        places = {name: scan.places[name] for name in self._usable(scan)}
+
+        def work(tell: Callable[[int, int], None]) -> str:
+            files = self._files(scan.path, pairs_of(places, self.work.marks))
+            done = complete(self._body(known), list(given.views) if isinstance(given, ScanFiles) else given, None,
+                            self.work.config, tell, self._masked(scan, files))
+            if done.judgement.verdict == "failed":
+                return "the body is not found without landmarks either"
+            with self._lock:
+                scan.predicted = on_scan(done, self.work.marks, scan.body)
+            return doubts({name: done.scale * place for name, place in places.items()},
+                          {name: done.completed.vertices[vertex] for name, vertex in self.work.marks.items()})
+
+        self.beside("finding the body without the landmarks", work, send, "it could not be found")
+
     def _body(self, known: bool) -> BodyModel | Subject:
         if not known:
             return self.model
@@ -319,6 +341,20 @@ def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict
     """Where the completed body has its landmarks, of those that the scan shows."""
     return {name: scan.nearest(done.completed.vertices[vertex] / done.scale)
             for name, vertex in marks.items() if done.seen[vertex]}
+
+
+def doubts(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> str:
+    """What landmarks at (3,), metres, are worth beside those of a body that was found without them."""
+    off = {name: float(np.linalg.norm(place - found[name])) for name, place in places.items()}
+    wrong = sorted((name for name in off if off[name] > WRONG), key=lambda name: -off[name])
+    if not wrong:
+        return "all landmarks are where a body found without them has them"
+    others = {name: found.get(other_side(name) or "", np.full(3, np.inf)) for name in wrong}
+    sides = [name for name in wrong if np.linalg.norm(places[name] - others[name]) < off[name] / 2]
+    if len(sides) > 1 and 2 * len(sides) > len(wrong):
+        return "left and right are exchanged: press “swap left and right”, then “start over”"
+    told = ", ".join(f"{name} ({1000 * off[name]:.0f} mm)" for name in wrong)
+    return f"a body found without the landmarks has these elsewhere, where the rings are: {told}"
 
 
 def helpful(model: BodyModel, marks: Mapping[str, int], made: Made) -> list[str]:

@@ -43,14 +43,15 @@ export class Complete extends Pick {
     if (completed ?? stored) this.judge(completed ?? stored);
   }
 
-  judge({ verdict, reasons, rows, outdated, helpful, saved }) {
+  judge({ verdict, reasons, rows, outdated, helpful, saved, landmarks }) {
     const off = outdated ? [] : Object.keys(this.state.panes[1].places).filter((name) => this.off(name) > OFF).sort((a, b) => this.off(b) - this.off(a));
     const link = (name, text) => make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("choose", { name }); } }, text);
     const list = (names, text) => names.flatMap((name, i) => [i ? ", " : "", link(name, text(name))]);
     this.verdict.dataset.verdict = outdated ? "check" : verdict;
     this.verdict.replaceChildren(make("strong", {}, outdated ? "changed since: complete again" : WORDS[verdict] ?? verdict),
       make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))),
-      verdict === "failed" && !outdated ? make("p", {}, "Is a landmark at a wrong place, or are left and right exchanged? Correct it, or “swap left and right”; then “start over”.") : "",
+      verdict !== "good" && !outdated && landmarks ? make("p", {}, make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("doubt"); },
+        title: "find the body without the landmarks, and see which of them it has elsewhere" }, "Is a landmark at a wrong place?")) : "",
       off.length ? make("p", {}, "The body has these landmarks elsewhere: ", ...list(off, (name) => `${name}, ${(1000 * this.off(name)).toFixed(0)} mm`)) : "",
       helpful.length ? make("p", {}, "A landmark would help at: ", ...list(helpful, (name) => name)) : "",
       rows.length ? table(rows) : "",
