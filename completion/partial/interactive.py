@@ -41,6 +41,7 @@ FIRST = 10                           # landmarks that are offered first: far fro
 TOLD = {"good": "completed: look at it from all sides, then save; or move or add landmarks and complete again",
         "check": "completed, but look at it: move or add landmarks and complete again, or save",
         "failed": "the completion failed: correct landmarks, then start over"}
+EXCHANGED = "left and right are exchanged"
 WRONG = 0.1                          # metres off from where a body found without it has a landmark that is wrong
 HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
@@ -345,16 +346,21 @@ def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict
 
 def doubts(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> str:
     """What landmarks at (3,), metres, are worth beside those of a body that was found without them."""
-    off = {name: float(np.linalg.norm(place - found[name])) for name, place in places.items()}
-    wrong = sorted((name for name in off if off[name] > WRONG), key=lambda name: -off[name])
+    wrong = wrong_ones(places, found)
     if not wrong:
         return "all landmarks are where a body found without them has them"
     others = {name: found.get(other_side(name) or "", np.full(3, np.inf)) for name in wrong}
-    sides = [name for name in wrong if np.linalg.norm(places[name] - others[name]) < off[name] / 2]
+    sides = [name for name in wrong if np.linalg.norm(places[name] - others[name]) < wrong[name] / 2]
     if len(sides) > 1 and 2 * len(sides) > len(wrong):
-        return "left and right are exchanged: press “swap left and right”, then “start over”"
-    told = ", ".join(f"{name} ({1000 * off[name]:.0f} mm)" for name in wrong)
+        return f"{EXCHANGED}: press “swap left and right”, then “start over”"
+    told = ", ".join(f"{name} ({1000 * off:.0f} mm)" for name, off in wrong.items())
     return f"a body found without the landmarks has these elsewhere, where the rings are: {told}"
+
+
+def wrong_ones(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Landmarks that are far from where they were found, with how far, metres; the farthest first."""
+    off = {name: float(np.linalg.norm(place - found[name])) for name, place in places.items()}
+    return {name: off[name] for name in sorted(off, key=lambda name: -off[name]) if off[name] > WRONG}
 
 
 def helpful(model: BodyModel, marks: Mapping[str, int], made: Made) -> list[str]:

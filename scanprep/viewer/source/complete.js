@@ -50,7 +50,7 @@ export class Complete extends Pick {
     this.verdict.dataset.verdict = outdated ? "check" : verdict;
     this.verdict.replaceChildren(make("strong", {}, outdated ? "changed since: complete again" : WORDS[verdict] ?? verdict),
       make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))),
-      verdict !== "good" && !outdated && landmarks ? make("p", {}, make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("doubt"); },
+      !outdated && landmarks ? make("p", {}, make("a", { href: "#", onclick: (event) => { event.preventDefault(); this.send("doubt"); },
         title: "find the body without the landmarks, and see which of them it has elsewhere" }, "Is a landmark at a wrong place?")) : "",
       off.length ? make("p", {}, "The body has these landmarks elsewhere: ", ...list(off, (name) => `${name}, ${(1000 * this.off(name)).toFixed(0)} mm`)) : "",
       helpful.length ? make("p", {}, "A landmark would help at: ", ...list(helpful, (name) => name)) : "",
