@@ -274,8 +274,9 @@ class CompleteApp(PickApp):
                 return "the body is not found without landmarks either"
             with self._lock:
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
-            return doubts({name: done.scale * place for name, place in places.items()},
+            told = doubts({name: done.scale * place for name, place in places.items()},
                           {name: done.completed.vertices[vertex] for name, vertex in self.work.marks.items()})
+            return told if done.judgement.verdict == "good" else f"{told}; but that body is itself doubtful"
 
         self.beside("finding the body without the landmarks", work, send, "it could not be found")
 
