@@ -8,8 +8,9 @@ from browser import wait_until
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 from test_completion_partial import errors
 
+from completion.partial.clicked_landmarks import doubts
 from completion.partial.completion import complete, load_completion
-from completion.partial.interactive import CompleteApp, doubts
+from completion.partial.interactive import CompleteApp
 from completion.partial.work import Work
 from scanprep.batch.opening import workspace
 from scanprep.geometry.files import PointCloud, write_points

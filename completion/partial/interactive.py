@@ -17,9 +17,7 @@ from model.linear import Subject
 from scanprep.batch.opening import workspace
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.depth_camera.picture import DepthPicture
-from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sides import other_side
 from scanprep.pictures.scene import Pane, pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
@@ -29,6 +27,7 @@ from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
 from scanprep.viewer.surface_clicks import Clickable
 
+from .clicked_landmarks import doubts, far_apart_first, helpful, on_scan, pairs_of
 from .completion import Completion, complete
 from .report import completion_panes
 from .work import Inputs, ScanFiles, Work, figures, person_in, read_masks, read_picture, read_views, write_results
@@ -37,13 +36,9 @@ from .worn import labels_of, worn_markers, write_worn
 ENDING = ".landmarks.json"           # of landmark files
 COMPLETED = "completed.ply"
 FEWEST = 3                           # landmarks that say where a body is
-FIRST = 10                           # landmarks that are offered first: far from each other, all over the body
 TOLD = {"good": "completed: look at it from all sides, then save; or move or add landmarks and complete again",
         "check": "completed, but look at it: move or add landmarks and complete again, or save",
         "failed": "the completion failed: correct landmarks, then start over"}
-EXCHANGED = "left and right are exchanged"
-WRONG = 0.1                          # metres off from where a body found without it has a landmark that is wrong
-HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +146,7 @@ class CompleteApp(PickApp):
         out["completed"] = {
             "verdict": judgement.verdict, "reasons": list(judgement.reasons), "landmarks": len(made.places),
             "rows": [[m.name, m.text(), m.unit] for m in self._figures(made)],
-            "outdated": self._outdated(made), "helpful": helpful(self.model, self.work.marks, made),
+            "outdated": self._outdated(made), "helpful": helpful(made.completion, self.work.marks, made.places),
             "saved": str(saved.absolute() / COMPLETED) if saved else ""}
         return out
 
@@ -323,51 +318,3 @@ class CompleteApp(PickApp):
     def close(self) -> None:
         """Forget files that were dropped."""
         self.dropped.close()
-
-
-def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Landmarks as `complete` takes them; None without any."""
-    return (np.array([marks[name] for name in places]), np.array(list(places.values()))) if places else None
-
-
-def far_apart_first(places: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The same landmarks, those first that lie all over the body: a few clicks are to tell most."""
-    names = list(places)
-    if not names:
-        return {}
-    first = [names[i] for i in farthest_points(np.array([places[name] for name in names]), min(FIRST, len(names)))]
-    return {name: places[name] for name in dict.fromkeys([*first, *names])}
-
-
-def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict[str, np.ndarray]:
-    """Where the completed body has its landmarks, of those that the scan shows."""
-    return {name: scan.nearest(done.completed.vertices[vertex] / done.scale)
-            for name, vertex in marks.items() if done.seen[vertex]}
-
-
-def doubts(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> str:
-    """What landmarks at (3,), metres, are worth beside those of a body that was found without them."""
-    wrong = wrong_ones(places, found)
-    if not wrong:
-        return "all landmarks are where a body found without them has them"
-    others = {name: found.get(other_side(name) or "", np.full(3, np.inf)) for name in wrong}
-    sides = [name for name in wrong if np.linalg.norm(places[name] - others[name]) < wrong[name] / 2]
-    if len(sides) > 1 and 2 * len(sides) > len(wrong):
-        return f"{EXCHANGED}: press “swap left and right”, then “start over”"
-    told = ", ".join(f"{name} ({1000 * off:.0f} mm)" for name, off in wrong.items())
-    return f"a body found without the landmarks has these elsewhere, where the rings are: {told}"
-
-
-def wrong_ones(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Landmarks that are far from where they were found, with how far, metres; the farthest first."""
-    off = {name: float(np.linalg.norm(place - found[name])) for name, place in places.items()}
-    return {name: off[name] for name in sorted(off, key=lambda name: -off[name]) if off[name] > WRONG}
-
-
-def helpful(model: BodyModel, marks: Mapping[str, int], made: Made) -> list[str]:
-    """Landmarks that were not clicked where the body may be far off, the most doubtful first."""
-    error = made.completion.expected_error
-    if error is None:
-        return []
-    far = {name: float(error[vertex]) for name, vertex in marks.items() if name not in made.places}
-    return [name for name in sorted(far, key=lambda name: -far[name]) if far[name] > HELPFUL][:5]

@@ -18,9 +18,10 @@ from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
 
+from .clicked_landmarks import on_scan, pairs_of
 from .completion import Completion, load_completion
 from .folder import FolderCall, gravity, kept_results, written
-from .interactive import ENDING, CompleteApp, Made, on_scan, pairs_of
+from .interactive import ENDING, CompleteApp, Made
 from .work import Inputs
 
 

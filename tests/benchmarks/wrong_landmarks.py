@@ -15,8 +15,8 @@ import numpy as np
 from half_views import learned
 from protocols import half_view, load_real, machine, scape_fold, write_report
 
+from completion.partial.clicked_landmarks import EXCHANGED, doubts, wrong_ones
 from completion.partial.completion import complete
-from completion.partial.interactive import EXCHANGED, doubts, wrong_ones
 from completion.partial.settings import CompletionConfig
 from model.files import load_model
 from scanprep.geometry.sides import other_side
