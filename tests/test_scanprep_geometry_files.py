@@ -344,6 +344,8 @@ def test_a_glb_with_a_face_out_of_range_or_damaged_json(tmp_path):
 def test_a_name_of_no_known_format(tmp_path):
     (tmp_path / "a.fbx").touch()
     refused(tmp_path / "a.fbx", ".ply", "'.fbx'")
+    (tmp_path / "a").touch()
+    refused(tmp_path / "a", ".ply", "found none")
     with pytest.raises(MeshFileError, match=r"a\.fbx.*'\.fbx'"):
         write_mesh(tmp_path / "a.fbx", TETRAHEDRON)
 

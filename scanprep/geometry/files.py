@@ -203,9 +203,11 @@ def _suffix(path: Path) -> str:
 
 
 def _format(path: Path, formats: dict[str, _Format]) -> _Format:
-    if _suffix(path) not in formats:
-        raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found {_suffix(path) or 'none'}")
-    return formats[_suffix(path)]
+    suffix = _suffix(path)
+    if suffix not in formats:
+        found = f"'{suffix}'" if suffix else "none"
+        raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found {found}")
+    return formats[suffix]
 
 
 def _read(path: Path, formats: dict[str, _Format]) -> Contents:
