@@ -72,7 +72,7 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
     out = {}
     for name, value in entries.items():
         if isinstance(value, int):
-            out[name] = value
+            out[name] = _vertex(path, name, value, mesh)
         elif isinstance(value, dict):
             corners = mesh.faces[value["face"]]
             out[name] = int(corners[np.linalg.norm(mesh.vertices[corners] - points[name], axis=1).argmin()])
@@ -227,11 +227,21 @@ def _place(path: Path, name: str, value: _Entry, mesh: Mesh | None) -> np.ndarra
     if mesh is None:
         kind = "vertex" if isinstance(value, int) else "face"
         raise ValueError(f"mesh: {path} gives landmark '{name}' by {kind}, so the mesh is needed it refers to")
-    what, index, count = (("vertex", value, len(mesh.vertices)) if isinstance(value, int)
-                          else ("face", value["face"], len(mesh.faces)))
-    if not 0 <= index < count:
-        raise MeshFileError(f"{path}: landmark '{name}' refers to {what} {index}, the mesh has 0..{count - 1}")
-    return mesh.vertices[index].copy() if isinstance(value, int) else value["bary"] @ mesh.corners[index]
+    if isinstance(value, int):
+        return mesh.vertices[_vertex(path, name, value, mesh)].copy()
+    _check_number(path, name, "face", value["face"], len(mesh.faces))
+    return value["bary"] @ mesh.corners[value["face"]]
+
+
+def _vertex(path: Path, name: str, number: int, mesh: Mesh) -> int:
+    """The vertex of a mesh that a file calls by this number, which is that in the file of the mesh."""
+    _check_number(path, name, "vertex", number, len(mesh.vertices if mesh.of_file is None else mesh.of_file))
+    return number if mesh.of_file is None else int(mesh.of_file[number])
+
+
+def _check_number(path: Path, name: str, what: str, number: int, count: int) -> None:
+    if not 0 <= number < count:
+        raise MeshFileError(f"{path}: landmark '{name}' refers to {what} {number}, the mesh has 0..{count - 1}")
 
 
 def _json_entry(path: Path, name: str, value: Any) -> _Entry:
