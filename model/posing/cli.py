@@ -17,9 +17,10 @@ from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
-from ..export.cli import read_motion, write_frames
+from ..export.cli import write_frames
 from ..files import load_model
 from ..linear import Subject
+from ..motion.onto import read_motion
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
@@ -35,7 +36,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
     Args:
         model: Model file.
         body: Mesh with the triangles of the model.
-        poses: Motion file (.npz), as of scape animate; its betas are not used.
+        poses: Motion file of scape animate (.npz), BVH or AMASS; its betas are not used.
         output: Folder for the meshes.
         unit: Unit of the body.
     """
