@@ -15,7 +15,6 @@ from ..blend_weights import CARRIERS, skin_weights, strongest
 from ..body import BodyModel
 from ..skinning import SkinningModel
 
-
 SLIDER = 3.0                         # standard deviations that a morph target of a beta reaches at weight 1
 
 
