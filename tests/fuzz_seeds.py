@@ -20,10 +20,10 @@ from completion.motion import Motion
 from completion.partial.completion import Completion, load_completion, save_completion
 from completion.partial.masks import read_mask
 from model.export.bvh import write_bvh
-from model.export.bvh_read import read_bvh
-from model.export.cli import read_motion
 from model.files import load_model
 from model.learning.cli import _read_sexes
+from model.motion.bvh import read_bvh
+from model.motion.onto import read_motion
 from model.posing.cli import _read_betas, _read_turns
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
 from scanprep.correspondence.correspondences import Correspondences, read_correspondences, write_correspondences

@@ -163,8 +163,10 @@ def test_decimate_keeps_landmarks(place, tmp_path):
     assert apart.max() < 1e-9
 
 
-def test_decimate_set(place, tmp_path):
-    assert run("decimate-set", place / "set", "--faces", 500, "-o", tmp_path / "small") == 0
+def test_decimate_set(place, tmp_path, capsys):
+    assert run("decimate", place / "set", "--faces", 500, "--method", "fast", "-o", tmp_path / "no") == 1
+    assert "--method: it says nothing about a registered set" in capsys.readouterr().err
+    assert run("decimate", place / "set", "--faces", 500, "-o", tmp_path / "small") == 0
     small, whole = RegisteredSet.load(tmp_path / "small"), RegisteredSet.load(place / "set")
     assert small.names == whole.names and len(small.template.faces) <= 500
     assert small.skeleton.names == whole.skeleton.names
@@ -234,7 +236,7 @@ def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     assert run(*beside, "-o", tmp_path / "beside.json") == 1
     assert (tmp_path / "beside.json").read_bytes() == (tmp_path / "pairs.json").read_bytes()
     capsys.readouterr()
-    assert run(*beside, "--ignore-landmarks", "-o", tmp_path / "none.json") == 1
+    assert run(*beside, "--landmarks", "none", "-o", tmp_path / "none.json") == 1
     assert "at least three limbs" in capsys.readouterr().err
     few = read_mesh(scan).vertices[::90]
     write_correspondences(tmp_path / "few.json", Correspondences(np.arange(642)[::90], few, np.ones(len(few))))
