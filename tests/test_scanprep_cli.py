@@ -277,6 +277,14 @@ def test_register_finds_the_landmarks_beside_the_scan(place, tmp_path, ending, q
 
 
 def landmark_file(ending, points):
+    if ending == ".fcsv":
+        rows = "".join(f"{i},{1000 * x},{1000 * y},{1000 * z},0,0,0,1,1,1,0,{name},,\n"
+                       for i, (name, (x, y, z)) in enumerate(points.items()))
+        return f"# CoordinateSystem = LPS\n{rows}"
+    if ending == ".scalismo.json":
+        return json.dumps([{"id": name, "coordinates": list(p)} for name, p in points.items()])
+    if ending.endswith(".csv"):
+        return "name,x,y,z\n" + "".join(f"{name},{x},{y},{z}\n" for name, (x, y, z) in points.items())
     if ending == ".mrk.json":
         return json.dumps({"markups": [{"coordinateUnits": "m", "controlPoints": [
             {"label": name, "position": list(p)} for name, p in points.items()]}]})
