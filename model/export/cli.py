@@ -95,7 +95,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         write_bvh(output, ready.skeleton, poses, trans, moves.rate, unit or "cm", axis, ready.mesh)
         told.insert(0, Metric("unit", unit or "cm"))
     else:
-        write_skinned_glb(output, ready, poses, trans, moves.rate, axis)
+        write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
     return Outcome(output, [_size(output), *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
                             Metric("frames", len(poses)), *told])
 
