@@ -97,6 +97,6 @@ def _onto(path: Path, moving: MovingSkeleton, subject: Subject, rest: str, gende
         found = retargeted(pair)
     except ValueError as problem:
         raise StorageError(f"{path}: {problem}") from None
-    fit = followed(pair, joint_centres(subject, found.poses, found.trans))
+    fit = followed(pair, found.poses, joint_centres(subject, found.poses, found.trans))
     return BodyMotion(found.poses, found.trans, subject.betas, found.rate, gender, "by the directions of the segments",
                       rest, found, fit)
