@@ -7,7 +7,6 @@ import numpy as np
 
 from scanprep.geometry import rotations
 
-from ..linear import PointOperator, Subject
 from .retarget import Pairing
 
 # Segments from the hips outwards; "hips" and "shoulders" are the middle between both sides.
@@ -37,14 +36,6 @@ class Followed:
     def distance(self) -> float:
         """Metres, the mean."""
         return float(self.distances.mean())
-
-
-def joint_centres(subject: Subject, poses: np.ndarray, trans: np.ndarray) -> np.ndarray:
-    """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    regressor = subject.skeleton.joint_regressor(subject.template)
-    M, N, _ = subject.basis.shape
-    basis = (regressor @ subject.basis.transpose(1, 0, 2).reshape(N, -1)).reshape(-1, M, 3).transpose(1, 0, 2)
-    return PointOperator(subject.terms, basis.astype(np.float64), subject.origin).evaluate(poses, trans)
 
 
 def followed(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
