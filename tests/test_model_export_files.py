@@ -325,7 +325,7 @@ def exported(files, output, *arguments):
     """Metrics of the report of a run that succeeded."""
     assert run(export, "scape model export", [str(files / "model.npz"), "-o", str(files / output), *arguments]) == 0
     place = files / output
-    report = place / "report.json" if place.is_dir() else place.with_suffix(".report.json")
+    report = place / "report.json" if place.is_dir() else place.with_name(f"{output}.report.json")
     return {m["metric"]: m["value"] for m in json.loads(report.read_text())["metrics"]}
 
 

@@ -30,7 +30,7 @@ from .motions import of_markers, of_motion
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import is_statue, read_statue, statue_folder
 
-PLACES = (".pp", ".json", ".lnd", ".landmarks.txt")
+PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
 SHOWN = ("surface", "picture", "model", "motion", "markers")
 TABLES = (".csv", ".txt", ".bvh")    # not shown of folders: they may hold anything, or be of any body

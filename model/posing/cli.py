@@ -59,7 +59,6 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
 
 def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
               landmarks: Path | None = None, template_landmarks: Path | None = None, unit: Unit | None = None,
-              pictures: bool = True,
               config: CharacterMeshConfig = CharacterMeshConfig()  # noqa: B008
               ) -> Outcome:
     """A character of any triangles as the mean of a model: it moves as people do, betas are offsets from it.
@@ -76,9 +75,12 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
         landmarks: Landmarks of the character; not needed for a mesh with the template's triangles.
         template_landmarks: Landmarks of the template; else those that the model keeps.
         unit: Unit of the character and its landmarks.
-        pictures: Write a picture beside the model.
         config: Settings.
     """
+    from scanprep.pictures.shading import save_png
+
+    from ..report import picture_character
+
     loaded, body = load_model(model), read_mesh(mesh, unit)
     same = np.array_equal(body.faces, loaded.template.faces)
     if landmarks is None and not same:
@@ -89,12 +91,7 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
     with bar("registering") as progress:
         found = register_character(loaded, body, theirs, ours, config, progress)
     found.model.save(output)
-    if pictures:
-        from scanprep.pictures.shading import save_png
-
-        from ..report import picture_character
-
-        save_png(output.with_suffix(".png"), picture_character(found.model))
+    save_png(output.with_suffix(".png"), picture_character(found.model))
     return Outcome(output, _about(loaded, found), {"character": config},
                    judgement=Judgement.of(character_problem(found)))
 
