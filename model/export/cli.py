@@ -17,6 +17,7 @@ from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
+from ..motion.amass import write_amass
 from ..motion.onto import BodyMotion, read_motion
 from .bvh import write_bvh
 from .correctives import motion_correctives, pose_features, spaced, write_body_npz
@@ -26,7 +27,7 @@ from .rig import Rig, joint_places, make_rig
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _TAKES = {"glb": {"betas", "own_body", "motion", "shapes", "correctives", "up"},
-          "bvh": {"betas", "own_body", "motion", "unit", "up"}, "npz": set(), "mesh": {"betas", "own_body"},
+          "bvh": {"betas", "own_body", "motion", "unit", "up"}, "npz": {"motion"}, "mesh": {"betas", "own_body"},
           "folder": {"betas", "own_body", "motion"}}
 
 
@@ -36,7 +37,8 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     """Write a model for other programs; what is written follows from the name of the output.
 
     OUT.glb: a body that hangs on joints, with a morph target for each beta, and its motion. OUT.bvh: the skeleton and
-    its motion. OUT.npz: the whole model as linear blend skinning under the usual array names. OUT.ply, .obj, .stl,
+    its motion. OUT.npz: the whole model as linear blend skinning under the usual array names; with --motion
+    of a model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl,
     .off: the mesh at rest. A folder: the exact mesh of every frame of the motion.
 
     GLB, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from the
@@ -59,9 +61,12 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "shapes": shapes,
                             "correctives": correctives, "unit": unit, "up": up is not None})
     loaded = load_model(model)
-    if kind == "npz":
+    if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded))
     moves = None if motion is None else read_motion(motion, loaded)
+    if kind == "npz":
+        assert moves is not None
+        return Outcome(output, _amass(output, model, loaded, moves))
     person = _person(model, loaded, betas, own_body, moves)
     if kind == "mesh":
         body = loaded.template.with_vertices(loaded.vertices(np.zeros((len(loaded.skeleton.parents), 3)), person))
@@ -134,6 +139,16 @@ def _npz(output: Path, model: BodyModel) -> list[Metric]:
             Metric("measured on", f"{MEASURED} poses of the prior"),
             *_distances("exact body, skinning alone", rig.vertices(poses) - exact),
             *_distances("exact body, with pose directions", rig.vertices(poses, changes=changes) - exact)]
+
+
+def _amass(output: Path, path: Path, model: BodyModel, moves: BodyMotion) -> list[Metric]:
+    family = str(model.info.get("family") or "")
+    if not family:
+        raise ValueError(f"{path}: a motion under the names of AMASS is one of an imported model of the SMPL family "
+                         f"(scape model import); write {output.stem}.bvh, .glb or a folder")
+    write_amass(output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+    return [_size(output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+            Metric("surface_model_type", family)]
 
 
 def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None) -> list[Metric]:
