@@ -58,8 +58,8 @@ def followed(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
             C = _between(their_rest[b] - their_rest[a], bone)
             theirs = np.einsum("tab,bc,tdc,td->ta", frames[a], C, frames[a], theirs)
             apart.append(float(np.degrees(np.linalg.norm(rotations.log(C)))))
-        size = np.linalg.norm(theirs, axis=1, keepdims=True)
-        wanted[b] = wanted[a] + np.linalg.norm(bone) * theirs / np.maximum(size, 1e-12)
+        still = np.linalg.norm(their_rest[b] - their_rest[a])              # a trunk that bends is shorter
+        wanted[b] = wanted[a] + np.linalg.norm(bone) / max(float(still), 1e-12) * theirs
         angles.append(_angles(theirs, here[b] - here[a]))
     places = np.stack([wanted[b] for _, b in ends], axis=1)
     off = np.linalg.norm(np.stack([here[b] for _, b in ends], axis=1) - places, axis=2)

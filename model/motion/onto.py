@@ -10,7 +10,7 @@ from scanprep.geometry.storage import StorageError
 
 from ..body import BodyModel
 from ..linear import Subject
-from .amass import UNCERTAIN, moving_body, with_joints
+from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
 from .error import Followed, followed
 from .files import StoredMotion, betas_for, check_ours, read_motion_file
@@ -63,6 +63,9 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
     if stored.of_family and (stored.made_for or stored.poses.shape[1] != J or family):
         if family:
             return _of_family(path, stored, model, subject)
+        if stored.poses.shape[1] < BODY:
+            raise StorageError(f"{path}: expected at least the {BODY} joints of the body, "
+                               f"found {stored.poses.shape[1]}")
         return _onto(path, moving_body(stored)[0], subject or _mean_person(model), UNCERTAIN, stored.gender)
     check_ours(path, stored)
     if stored.poses.shape[1] != J:
