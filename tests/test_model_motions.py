@@ -82,7 +82,7 @@ def test_our_motion_comes_back_from_bvh(tmp_path, unit, how):
 def test_a_body_without_a_persons_names_gets_its_own_back(tmp_path):
     model, rng = worm_model(), np.random.default_rng(1)
     poses, trans = rng.normal(0, 0.3, (5, 4, 3)), rng.normal(size=(5, 3))
-    rig = make_rig(model)
+    rig = make_rig(model, np.zeros(1))
     write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 25.0, "cm", 0, rig.mesh)
     found = read_motion(tmp_path / "a.bvh", model)
     assert degrees(found.poses, poses) < 1e-4 and np.abs(found.trans - trans).max() < 1e-6
@@ -141,7 +141,7 @@ def test_another_skeleton_points_the_same_way_on_another_body(tmp_path):
     path = elsewhere(tmp_path, poses, trans)
     found = read_motion(path, model)
     mean = model.subject(np.zeros(1))
-    assert degrees(found.poses, poses) < 0.01, "whatever way the file is turned, it faces where the body did at rest"
+    assert degrees(found.poses, poses) < 0.05, "whatever way the file is turned, it faces where the body did at rest"
     assert apart(mean.vertices(found.poses, found.trans), mean.vertices(poses)) < 0.01
     assert found.brought.scale == pytest.approx(2.54, rel=1e-3) and not found.brought.lacking
     assert found.brought.matched["abdomen"] == "LowerBack to Spine" and found.brought.matched["l_shin"] == "LeftLeg"
