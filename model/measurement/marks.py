@@ -24,6 +24,7 @@ PAIRED = {
     "elbow outside": ("{} elbow outside", "elbow (outside) {} arm", "{} olecranon"),
     "elbow inside": ("{} elbow inside", "elbow (inside) {} arm", "{} humeral medial epicn."),
     "shoulder": ("{} shoulder", "shoulder (upper) {} side", "{} acromion"),
+    "armpit": ("{} armpit", "shoulder (bottom) {} side", "{} axilla, ant."),
     "nipple": ("{} nipple", "tit, {}", "{} thelion/bustpoint"), "ear": ("{} ear", "ear, {}", "{} tragion")}
 SIDES = {"left": ("left", "lt."), "right": ("right", "rt.")}
 FRAME = ("top of head", *(f"{side} {name}" for side in SIDES for name in ("toe", "heel")))

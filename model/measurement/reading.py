@@ -12,6 +12,8 @@ from .path import shortest_path
 from .section import Carried, Curve, around, bulge, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
 
+ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
+
 
 class NotMeasured(ValueError):
     """A measurement that cannot be taken of a body, and why."""
@@ -34,8 +36,8 @@ class Reading:
     """One measurement of a body.
 
     `value`, metres; `curve` (m, 3), metres, where the tape runs, its points one after the other; `vertices` (k,) and
-    `force` (k, 3) its derivative by them, of which one may come several times; `slope`, metres per metre, what moving
-    its plane along the part adds, 0 where it has none.
+    `force` (k, 3) its derivative by them, of which one may come several times; `slope`, metres per metre, what sliding
+    its plane along the part, or its landmarks along the skin, changes.
     """
 
     value: float
@@ -91,10 +93,15 @@ def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     curves = section(vertices, found.faces, origin, normal)
     if not curves:
         raise NotMeasured("its plane meets nothing there")
-    curve = min(curves, key=lambda c: float(np.linalg.norm(c.at(vertices).mean(axis=0) - origin)))
+    if found.under_arms and not any(curve.closed for curve in curves):
+        curve = Curve(np.concatenate([c.edges for c in curves]), np.concatenate([c.share for c in curves]), True)
+    else:
+        curve = min(curves, key=lambda c: float(np.linalg.norm(c.at(vertices).mean(axis=0) - origin)))
+    ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
+    if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
+        raise NotMeasured("a hole of the mesh crosses it")
     if not curve.closed:
-        hole = np.isin(curve.edges[[0, -1]], body.mesh.boundary_vertices).any()
-        raise NotMeasured("a hole of the mesh crosses it" if hole else "its plane runs out of the part it goes around")
+        raise NotMeasured("its plane runs out of the part it goes around")
     points = curve.at(vertices) + bulge(vertices, body.mesh.vertex_normals, curve)
     return _Cut(curve, origin, normal, points, tape(points, normal))
 
@@ -147,7 +154,8 @@ def _height(found: Height, body: Standing, tapes: Tapes) -> Reading:
     place = top.at(body.vertices)
     value = float(place @ up - height[floor])
     force = np.concatenate([top.weights[:, None] * up, -up[None]])
-    return Reading(value, np.stack([place - value * up, place]), np.append(top.vertices, floor), force)
+    return Reading(value, np.stack([place - value * up, place]), np.append(top.vertices, floor), force,
+                   0.0 if found.top is None else float(np.linalg.norm(top.weights)))
 
 
 @read.register
@@ -157,7 +165,7 @@ def _straight(found: Straight, body: Standing, tapes: Tapes) -> Reading:
     value = float(np.linalg.norm(way))
     ids = np.concatenate([found.first.vertices, found.second.vertices])
     weights = np.concatenate([-found.first.weights, found.second.weights])
-    return Reading(value, ends, ids, weights[:, None] * (way / value))
+    return Reading(value, ends, ids, weights[:, None] * (way / value), ENDS)
 
 
 @read.register
@@ -193,4 +201,4 @@ def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
         drawn.append(points[::-1])                                        # the way is found from its end
         ids += [curve.edges[:, 0], curve.edges[:, 1]]
         force += [(1 - curve.share)[:, None] * pull, curve.share[:, None] * pull]
-    return Reading(total, np.concatenate(drawn), np.concatenate(ids), np.concatenate(force))
+    return Reading(total, np.concatenate(drawn), np.concatenate(ids), np.concatenate(force), ENDS)

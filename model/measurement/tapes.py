@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -25,12 +26,14 @@ class Girth:
     """A tape around some part: the plane through `centre`, along `up` where there is no axis, else across the axis.
 
     `faces` (F', 3) are the triangles around its place on the template: arms and other legs are none of them.
+    `under_arms`: where they end at the arms the tape runs straight on, under the armpit.
     """
 
     centre: Carried
     axis: tuple[Carried, Carried] | None
     faces: np.ndarray
     ring: Curve                          # on the template
+    under_arms: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +217,7 @@ class _Finder:
         return float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
 
     def keep(self, name: str, plane: tuple[np.ndarray, np.ndarray], axis: tuple[Carried, Carried] | None,
-             band: float = LIMB_BAND) -> Girth:
+             band: float = LIMB_BAND, under_arms: bool = False) -> Girth:
         """The girth in a plane (a point of it, its normal), carried by its centroid."""
         ring = self.loop(*plane)
         centre = ring.centroid(self.mesh.vertices)
@@ -223,9 +226,20 @@ class _Finder:
             ring = self.loop(centre.at(self.mesh.vertices), normal)
             centre = ring.centroid(self.mesh.vertices)
         far, _ = self.graph.nearest(np.unique(ring.edges))
-        near = self.mesh.faces[(far[self.mesh.faces] <= band * self.scale).all(axis=1)]
-        self.done[name] = Girth(centre, axis, near, ring)
+        near = self.mesh.faces[((far <= band * self.scale) & ~(under_arms & self.arms))[self.mesh.faces].all(axis=1)]
+        self.done[name] = Girth(centre, axis, near, ring, under_arms)
         return self.done[name]
+
+    @cached_property
+    def arms(self) -> np.ndarray:
+        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is."""
+        found = np.zeros(len(self.mesh.vertices), dtype=bool)
+        for side in ("left", "right"):
+            elbow, armpit = (self.places.of.get(f"{side} {name}") for name in ("elbow inside", "armpit"))
+            if elbow is not None and armpit is not None:
+                far = self.graph.distances(elbow)
+                found |= far < far[armpit]
+        return found
 
     def girth(self, name: str) -> Girth:
         """One that was found before."""
@@ -252,7 +266,7 @@ class _Finder:
 
     def trunk(self, name: str, height: float) -> Girth:
         """A level girth of the trunk."""
-        return self.keep(name, self.level(self.middle(), height), None, BAND)
+        return self.keep(name, self.level(self.middle(), height), None, BAND, name != "waist_girth")
 
     def middle(self) -> np.ndarray:
         """A point (3,) on the axis of the trunk."""
@@ -292,7 +306,7 @@ class _Finder:
 
     def shin(self, side: str) -> tuple[Carried, Carried]:
         p = self.places
-        return self.limb(f"{side} shin", p.at(f"{side} knee", f"{side} knee inside"), p.at(f"{side} heel"), 0.05, 0.7)
+        return self.limb(f"{side} shin", p.at(f"{side} knee", f"{side} knee inside"), p.at(f"{side} heel"), 0.0, 0.7)
 
     def across(self, name: str, axis: tuple[Carried, Carried], share: float) -> Girth:
         """The girth at a share of the way along an axis."""
