@@ -12,7 +12,6 @@ from .evaluation.errors import shape_errors as shape_errors
 from .evaluation.sampling import sample_bodies as sample_bodies
 from .evaluation.sampling import specificity as specificity
 from .export.bvh import write_bvh as write_bvh
-from .export.bvh_read import read_bvh as read_bvh
 from .export.correctives import write_body_npz as write_body_npz
 from .export.glb import write_skinned_glb as write_skinned_glb
 from .export.rig import make_rig as make_rig
@@ -37,6 +36,7 @@ from .measurement.measure import Measurements as Measurements
 from .measurement.measure import measure as measure
 from .measurement.tapes import find_tapes as find_tapes
 from .measurement.wanted import body_with_measurements as body_with_measurements
+from .motion.bvh import read_bvh as read_bvh
 from .posing.character import CharacterConfig as CharacterConfig
 from .posing.character import character_model as character_model
 from .posing.poses import find_mirror as find_mirror

@@ -28,7 +28,7 @@ from .motions import of_markers, of_motion
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import is_statue, read_statue, statue_folder
 
-PLACES = (".pp", ".json", ".lnd", ".landmarks.txt")
+PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
 SHOWN, TABLES = ("surface", "picture", "model", "motion", "markers"), (".csv", ".txt")     # tables may hold anything
 ENOUGH = 3                           # labels that a recording and a motion have in common

@@ -1,7 +1,6 @@
 """`scape model export`: a model in the files of other programs."""
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -11,35 +10,24 @@ from model.priors import sample_poses
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
 from scanprep.pictures.camera import upright
-from scanprep.ranges import BETAS, Beta
+from scanprep.ranges import Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
+from ..motion.onto import BodyMotion, read_motion
 from .bvh import write_bvh
 from .correctives import motion_correctives, pose_features, spaced, write_body_npz
 from .glb import write_skinned_glb
-from .rig import Rig, check_motion, joint_places, make_rig
+from .rig import Rig, joint_places, make_rig
 
-MOTIONS_OF = "scape"                 # what motion files say they are made for
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _TAKES = {"glb": {"betas", "own_body", "motion", "shapes", "correctives", "up"},
           "bvh": {"betas", "own_body", "motion", "unit", "up"}, "npz": set(), "mesh": {"betas", "own_body"},
           "folder": {"betas", "own_body", "motion"}}
-
-
-@dataclass(frozen=True, eq=False)
-class _Moves:
-    """A motion as its file has it; without one, poses to measure with."""
-
-    poses: np.ndarray
-    trans: np.ndarray
-    betas: np.ndarray | None
-    rate: float
 
 
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
@@ -61,7 +49,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         output: File or folder to write: .glb, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
         betas: Shape in standard deviations, the first of them; else that of the motion, else the mean person.
         own_body: The template's own body.
-        motion: Motion file (.npz), as of scape animate.
+        motion: Motion file of scape animate (.npz), or BVH or AMASS, which is brought onto the body.
         shapes: Morph targets for so many of the first betas; 10 where there are so many.
         correctives: Further morph targets by which the motion comes nearer to the exact one.
         unit: Of the lengths in a BVH file; cm.
@@ -89,31 +77,6 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if kind == "bvh":
         return Outcome(output, _bvh(output, loaded, person, rig, moves, unit or "cm", axis))
     return Outcome(output, _glb(output, loaded, person, rig, moves, correctives, axis))
-
-
-def read_motion(path: Path, model: BodyModel) -> _Moves:
-    """A motion file (`poses`, `trans`, `betas`, `mocap_frame_rate`) of a model's parts, or StorageError."""
-    stored = load_arrays(path, "a motion (.npz)")
-    stored.setdefault("mocap_frame_rate", stored.pop("mocap_framerate", np.array(np.nan)))
-    lacking = [name for name in ("poses", "trans") if name not in stored]
-    if lacking:
-        raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
-    with taking_apart(path, "a whole motion"):
-        made_for = text(stored, "surface_model_type", model.kind)
-        if made_for not in (MOTIONS_OF, model.kind):
-            raise StorageError(f"{path}: expected surface_model_type '{MOTIONS_OF}', found '{made_for}'")
-        J, T = len(model.skeleton.parents), len(np.atleast_1d(stored["poses"]))
-        if not T or stored["poses"].size != T * 3 * J:
-            raise StorageError(f"{path}: expected frames of the model's {J} parts, "
-                               f"found shape {stored['poses'].shape}")
-        betas = stored.get("betas", np.zeros(0))
-        if betas.ndim != 1 or len(betas) > model.n_betas:
-            raise StorageError(f"{path}: expected at most the {model.n_betas} betas of the model, found {betas.shape}")
-        betas = numbers({"betas": betas}, "betas", None).astype(np.float64)
-        BETAS.check(betas, "betas")
-        poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
-        poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
-        return _Moves(poses, trans, betas if betas.size else None, rate)
 
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
@@ -147,7 +110,7 @@ def _refuse_the_rest(kind: str, given: dict[str, object]) -> None:
         raise ValueError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {kind}{hint}")
 
 
-def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: _Moves | None
+def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: BodyMotion | None
             ) -> np.ndarray | None:
     """Betas of the body that is asked for; None is the template's own."""
     if own_body and betas:
@@ -173,7 +136,7 @@ def _npz(output: Path, model: BodyModel) -> list[Metric]:
             *_distances("exact body, with pose directions", rig.vertices(poses, changes=changes) - exact)]
 
 
-def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: _Moves | None) -> list[Metric]:
+def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None) -> list[Metric]:
     if moves is None:
         raise ValueError(f"{output}: expected a motion for a folder of meshes; name it with --motion")
     with bar("writing meshes") as progress:
@@ -182,8 +145,8 @@ def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: _M
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
 
 
-def _bvh(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: _Moves | None, unit: str, up: int
-         ) -> list[Metric]:
+def _bvh(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: BodyMotion | None, unit: str,
+         up: int) -> list[Metric]:
     if moves is None:
         write_bvh(output, rig.skeleton, unit=unit, up=up, body=rig.mesh)
     else:
@@ -197,8 +160,8 @@ def _bvh(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, mo
             *_distances("joints of the exact body", off)]
 
 
-def _glb(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: _Moves | None, count: int, up: int
-         ) -> list[Metric]:
+def _glb(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: BodyMotion | None, count: int,
+         up: int) -> list[Metric]:
     subject = model.subject(person)
     poses, where = _measured(model, moves)
     extra, changes = None, None
@@ -217,7 +180,7 @@ def _glb(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, mo
             *_distances("exact body", rig.vertices(poses, changes=changes) - subject.vertices(poses))]
 
 
-def _measured(model: BodyModel, moves: _Moves | None) -> tuple[np.ndarray, str]:
+def _measured(model: BodyModel, moves: BodyMotion | None) -> tuple[np.ndarray, str]:
     """Poses in which a skinned body is compared with the exact one, and where they are from."""
     if moves is None:
         return sample_poses(model, MEASURED, np.random.default_rng(0)), f"{MEASURED} poses of the prior"

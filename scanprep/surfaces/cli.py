@@ -1,4 +1,4 @@
-"""From range views to a clean mesh: `scape prep views`, `merge`, `fill`, `decimate`, `template`, and `decimate-set`."""
+"""From range views to a clean mesh: `scape prep views`, `merge`, `fill`, `decimate`, `template`."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -9,7 +9,7 @@ import tyro
 
 from ..alignment.views import AlignViewsConfig, align_views, views_problem
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
-from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
+from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..decimation.decimate import DecimateConfig, decimate
@@ -171,19 +171,27 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
-           config: DecimateConfig = DecimateConfig()) -> Outcome:  # noqa: B008
-    """Fewer triangles for the same surface.
+           config: DecimateConfig = DecimateConfig(),  # noqa: B008
+           of_set: DecimateSetConfig = DecimateSetConfig()) -> Outcome:  # noqa: B008
+    """Fewer triangles for the same surface: of a mesh, or of a registered set, whose parts and landmarks stay in step.
 
     Example: scape prep decimate closed.ply --faces 14000 -o template.ply
 
     Args:
-        mesh: Mesh.
-        output: Mesh to write.
+        mesh: Mesh, or folder of a registered set.
+        output: Mesh to write; of a set a folder, which also holds the map between the two in decimation.npz.
         faces: How many triangles are wanted.
-        landmarks: Landmarks of the mesh, whose vertices stay where they are.
+        landmarks: Landmarks of the mesh, whose vertices stay where they are; a set has its own.
         unit: Unit of the mesh and its landmarks.
-        config: Settings.
+        config: Settings for a mesh.
+        of_set: Settings for a set.
     """
+    if mesh.is_dir():
+        wrong = [name for name, given in (("landmarks", landmarks), ("unit", unit),
+                                          ("method", config.method != DecimateConfig().method)) if given]
+        if wrong:
+            raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
+        return _reduce_set(mesh, output, faces, of_set)
     before = read_mesh(mesh, unit)
     keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
     with bar("decimating") as progress:
@@ -192,25 +200,13 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
     return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
 
 
-def reduce_set(registered: SetArg, output: Output, faces: Faces,
-               config: DecimateSetConfig = DecimateSetConfig()  # noqa: B008
-               ) -> Outcome:
-    """A registered set in fewer triangles: template, meshes, skeleton and landmarks stay in step.
-
-    Example: scape prep decimate-set set --faces 5000 -o small_set
-
-    Args:
-        registered: Folder of a registered set.
-        output: Folder of the smaller one, which also holds the map between the two in decimation.npz.
-        faces: How many triangles are wanted.
-        config: Settings.
-    """
-    before = RegisteredSet.load(registered)
+def _reduce_set(folder: Path, output: Path, faces: int, config: DecimateSetConfig) -> Outcome:
+    before = RegisteredSet.load(folder)
     with bar("decimating") as progress:
         after = write_decimated_set(before, output, faces, config, progress)
     return Outcome(output, [
         Metric("meshes", len(after.entries)), Metric("triangles before", len(before.template.faces)),
-        *about_mesh(after.template)], {"decimate-set": config})
+        *about_mesh(after.template)], {"decimate": config})
 
 
 def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:

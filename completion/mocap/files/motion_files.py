@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from model.export.bvh import write_bvh
-from model.linear import PointOperator, Subject
+from model.linear import Subject
+from model.motion.error import joint_centres as centres_of
 from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
 
@@ -33,15 +34,11 @@ def joint_angles(motion: Motion) -> np.ndarray:
 
 def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    regressor = subject.skeleton.joint_regressor(subject.template)
-    M, N, _ = subject.basis.shape
-    basis = (regressor @ subject.basis.transpose(1, 0, 2).reshape(N, -1)).reshape(-1, M, 3).transpose(1, 0, 2)
-    operator = PointOperator(subject.terms, basis.astype(np.float64), subject.origin)
-    return operator.evaluate(motion.poses, motion.trans)
+    return centres_of(subject, motion.poses, motion.trans)
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
-    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and residuals.csv; times are in seconds."""
+    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; times in seconds."""
     names, T = subject.skeleton.names, len(motion.poses)
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
@@ -49,7 +46,8 @@ def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
                 np.c_[motion.times, joint_angles(motion).reshape(T, -1)])
     write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
                 np.c_[motion.times, joint_centres(motion, subject).reshape(T, -1)])
-    write_residuals(folder / "residuals.csv", motion)
+    if motion.labels:
+        write_residuals(folder / "residuals.csv", motion)
 
 
 def write_residuals(path: Path, motion: Motion) -> None:
