@@ -11,8 +11,8 @@ import tyro
 from model.body import BodyModel
 from model.files import load_model
 from model.measurement.catalogue import CATALOGUE
+from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, measure
-from model.measurement.tapes import Tapes, find_tapes
 from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
 from model.posing.transfer import own_body
 from scanprep.cli import MM, Output, Unit
@@ -115,7 +115,8 @@ def judged(names: Sequence[str], found: Sequence[Measurements]) -> Judgement:
     if absurd and len(absurd) == len(names):
         return Judgement.of(absurd[:TOLD])
     told = [*absurd, *doubts]
-    return Judgement.of(check=[*told[:TOLD], *([f"{len(told) - TOLD} more, see the table"] if len(told) > TOLD else [])])
+    more = [f"{len(told) - TOLD} more, see the table"] if len(told) > TOLD else []
+    return Judgement.of(check=[*told[:TOLD], *more])
 
 
 def _figures(names: Sequence[str], found: Sequence[Measurements]) -> list[Metric]:

@@ -9,7 +9,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 
 from .path import shortest_path
-from .section import Carried, Curve, around, bulge, section, tape
+from .section import Carried, Curve, around, bulge, direction, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
 
 ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
@@ -88,8 +88,7 @@ def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     vertices, normal = body.vertices, body.axes[0]
     origin = found.centre.at(vertices)
     if found.axis is not None:
-        normal = found.axis[1].at(vertices) - found.axis[0].at(vertices)
-        normal = normal / np.linalg.norm(normal)
+        normal = direction(found.axis, vertices)
     curves = section(vertices, found.faces, origin, normal)
     if not curves:
         raise NotMeasured("its plane meets nothing there")

@@ -25,6 +25,12 @@ def mean_of(*vertices: int) -> Carried:
     return Carried(np.array(vertices), np.full(len(vertices), 1 / len(vertices)))
 
 
+def direction(axis: tuple[Carried, Carried], body: np.ndarray) -> np.ndarray:
+    """The unit vector (3,) from one carried point to another, on vertices (N, 3)."""
+    way = axis[1].at(body) - axis[0].at(body)
+    return way / np.linalg.norm(way)
+
+
 @dataclass(frozen=True, eq=False)
 class Curve:
     """Points on edges of a mesh, one after the other: `edges` (m, 2) vertices and the place `share` (m,) between them.

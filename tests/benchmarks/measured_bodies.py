@@ -11,6 +11,7 @@ scanned twice, with cameras and noise of their own, and registered twice.
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -95,7 +96,7 @@ def marked(model: BodyModel, person: Person, rng: np.random.Generator) -> dict[s
     places = Surface(rest).closest(layout.skin_points(rest.vertices) + rng.normal(0, PLACING, (len(layout.labels), 3)))
     keys = model.pose_examples[rng.choice(len(model.pose_examples), KEYS, replace=False)]
     frames = []
-    for first, second in zip(keys, keys[1:], strict=False):
+    for first, second in itertools.pairwise(keys):
         for share in np.arange(BETWEEN) / BETWEEN:
             mesh = Mesh(person.posed((1 - share) * first + share * second)[ids], rest.faces)
             corners = mesh.faces[places.faces]

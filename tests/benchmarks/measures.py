@@ -22,19 +22,19 @@ from scans import HELD_MEN
 
 from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
+from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, laid_on, measure
 from model.measurement.section import around, tape
-from model.measurement.tapes import Girth, Tapes, find_tapes
+from model.measurement.tapes import Girth, Tapes
 from model.posing.transfer import own_body
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import Person
 
-
 TRUNK = ("chest_girth", "under_bust_girth", "waist_girth", "hip_girth")
 
 
-def cut(mesh: Mesh, origin: np.ndarray, normal: np.ndarray) -> float:
+def cut(mesh: Mesh, origin: np.ndarray, normal: np.ndarray, all_parts: bool = False) -> float:
     """Tape (metres) around the part of a surface that a plane cuts nearest to a point of it, with trimesh and scipy."""
     import trimesh
     from scipy.sparse import coo_array
@@ -47,6 +47,7 @@ def cut(mesh: Mesh, origin: np.ndarray, normal: np.ndarray) -> float:
     part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(points),) * 2), directed=False)[1]
     mine = min((points[part == p] for p in np.unique(part) if (part == p).sum() > 3),
                key=lambda some: float(np.linalg.norm(0.5 * (some.min(axis=0) + some.max(axis=0)) - origin)))
+    mine = points if all_parts else mine
     flat = mine @ np.linalg.svd(normal[None])[2][1:].T
     return float(ConvexHull(flat).area)                                   # of a polygon in the plane: its perimeter
 
@@ -64,7 +65,8 @@ def true_girths(tapes: Tapes, carriers: np.ndarray, surface: Mesh, axes: np.ndar
             normal = axes[0]
             if found.axis is not None:
                 normal = found.axis[1].at(carriers) - found.axis[0].at(carriers)
-            out[name] = cut(trunk if name in TRUNK else surface, found.centre.at(carriers), normal / np.linalg.norm(normal))
+            normal = normal / np.linalg.norm(normal)
+            out[name] = cut(trunk if name in TRUNK else surface, found.centre.at(carriers), normal, name in TRUNK)
     return out
 
 
