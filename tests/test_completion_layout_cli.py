@@ -91,7 +91,8 @@ def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, mon
     np.testing.assert_allclose(MarkerLayout.load(out, 9380).select(["C7", "LELB"]).place(target),
                                named_layout("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
     assert out.with_suffix(".png").exists() and len(read_mesh(out.with_suffix(".registered.ply")).vertices) == 9380
-    figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "b.layout.report.json").read_text())["metrics"]}
+    told = json.loads((tmp_path / "b.layout.json.report.json").read_text())
+    figures = {m["metric"]: m["value"] for m in told["metrics"]}
     assert figures["target not covered"] == pytest.approx(6) and figures["landmarks"] == 3
 
 

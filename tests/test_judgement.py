@@ -90,7 +90,7 @@ def test_a_command_says_that_its_result_means_nothing(place, capsys, case):
     assert main(command.split()) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if "THE RESULT MEANS NOTHING" in line]
     assert len(said) == 1 and all(word in said[0] for word in words), said
-    told = json.loads(Path("out.report.json").read_text())
+    told = json.loads(Path("out.ply.report.json").read_text())
     assert Path("out.ply").exists() and told["judgement"]["verdict"] == "failed"
     assert told["judgement"]["reasons"][0] in said[0]
     if case == "ten points":                                        # there is nothing to converge to

@@ -9,11 +9,11 @@ from glb_reader import Glb
 from model_bodies import random_poses, worm_model
 
 from model.export.bvh import part_ends, write_bvh
-from model.export.bvh_read import read_bvh
 from model.export.cli import export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
 from model.export.rig import joint_places, make_rig, turn_up
+from model.motion.bvh import read_bvh
 from scanprep.command_line import run
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
@@ -328,7 +328,7 @@ def exported(files, output, *arguments):
     """Metrics of the report of a run that succeeded."""
     assert run(export, "scape model export", [str(files / "model.npz"), "-o", str(files / output), *arguments]) == 0
     place = files / output
-    report = place / "report.json" if place.is_dir() else place.with_suffix(".report.json")
+    report = place / "report.json" if place.is_dir() else place.with_name(f"{output}.report.json")
     return {m["metric"]: m["value"] for m in json.loads(report.read_text())["metrics"]}
 
 
@@ -369,7 +369,7 @@ def test_the_command_refuses_in_one_line(files, arguments, words, capsys, monkey
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.zeros(7)}, "at most the 3 betas"),
+    ({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.ones(7)}, "at most the 3 betas"),
     ({"poses": np.zeros((0, 12))}, "4 parts"), ({"trans": np.zeros((3, 3))}, r"trans: expected shape \(2, 3\)"),
     ({"surface_model_type": np.array("other")}, "surface_model_type 'scape'"),
     ({"mocap_frame_rate": np.array(0.0)}, "rate"), ({}, None)])

@@ -42,7 +42,7 @@ def body(rng, n=200):
 def meshes(draw):
     n = draw(st.integers(3, 12))
     number = st.floats(-4, 4, width=32)
-    vertices = draw(st.lists(st.tuples(number, number, number), min_size=n, max_size=n))
+    vertices = draw(st.lists(st.tuples(number, number, number), min_size=n, max_size=n, unique=True))
     faces = draw(st.lists(st.lists(st.integers(0, n - 1), min_size=3, max_size=3, unique=True), min_size=1,
                           max_size=8))
     return Mesh(np.array(vertices), np.array(faces))

@@ -1,7 +1,7 @@
 """`scape model export`: a model in the files of other programs."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,38 +11,28 @@ from model.priors import sample_poses
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
 from scanprep.pictures.camera import upright
-from scanprep.ranges import BETAS, Beta
+from scanprep.ranges import Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
+from ..motion.amass import write_amass
+from ..motion.onto import BodyMotion, read_motion
 from .bvh import write_bvh
 from .conventions import for_programs, standing
 from .correctives import motion_correctives, off_exact, pose_features, spaced, write_body_npz
 from .glb import write_skinned_glb
 from .names import Names, names_of
-from .rig import Rig, check_motion, joint_places, make_rig
+from .rig import Rig, joint_places, make_rig
 
-MOTIONS_OF = "scape"                 # what motion files say they are made for
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
 _BONES = _PLACED | {"motion", "root", "names"}
-_TAKES = {"glb": _BONES | {"shapes", "correctives"}, "bvh": _BONES | {"unit"}, "npz": set(), "mesh": _PLACED,
+_TAKES = {"glb": _BONES | {"shapes", "correctives"}, "bvh": _BONES | {"unit"}, "npz": {"motion"}, "mesh": _PLACED,
           "folder": {"betas", "own_body", "motion"}}
-
-
-@dataclass(frozen=True, eq=False)
-class _Moves:
-    """A motion as its file has it; without one, poses to measure with."""
-
-    poses: np.ndarray
-    trans: np.ndarray
-    betas: np.ndarray | None
-    rate: float
 
 
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
@@ -52,7 +42,8 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     """Write a model for other programs; what is written follows from the name of the output.
 
     OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
-    and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names. OUT.ply, .obj, .stl,
+    and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names; with --motion of a
+    model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl,
     .off: the mesh at rest. A folder: the exact mesh of every frame of the motion.
 
     GLB, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from the
@@ -65,7 +56,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         output: File or folder to write: .glb, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
         betas: Shape in standard deviations, the first of them; else that of the motion, else the mean person.
         own_body: The template's own body.
-        motion: Motion file (.npz), as of scape animate.
+        motion: Motion file of scape animate (.npz), or BVH or AMASS, which is brought onto the body.
         shapes: Morph targets for so many of the first betas, two for each: 3 standard deviations up and down; 10
             where there are so many.
         correctives: Further morph targets by which the motion comes nearer to the exact one; as many as bring it within
@@ -82,9 +73,12 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
                             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
                             "names": names, "ground": ground, "front": front})
     loaded = load_model(model)
-    if kind == "npz":
+    if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded))
     moves = None if motion is None else read_motion(motion, loaded)
+    if kind == "npz":
+        assert moves is not None
+        return Outcome(output, _amass(output, model, loaded, moves))
     person = _person(model, loaded, betas, own_body, moves)
     if kind == "folder":
         return Outcome(output, _folder(output, loaded, person, moves))
@@ -100,7 +94,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     rig = make_rig(loaded, person, shapes)
     axis = upright(rig.mesh)[0] if up is None else up
     rig, told = _measured_rig(kind, loaded, person, rig, moves, correctives)
-    moves = moves or _Moves(np.zeros((0, len(loaded.skeleton.parents), 3)), np.zeros((0, 3)), person, 30.0)
+    moves = moves or BodyMotion(np.zeros((0, len(loaded.skeleton.parents), 3)), np.zeros((0, 3)), person, 30.0)
     ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, root, names, ground, front)
     if kind == "bvh":
         write_bvh(output, ready.skeleton, poses, trans, moves.rate, unit or "cm", axis, ready.mesh)
@@ -109,31 +103,6 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
     return Outcome(output, [_size(output), *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
                             Metric("frames", len(poses)), *told])
-
-
-def read_motion(path: Path, model: BodyModel) -> _Moves:
-    """A motion file (`poses`, `trans`, `betas`, `mocap_frame_rate`) of a model's parts, or StorageError."""
-    stored = load_arrays(path, "a motion (.npz)")
-    stored.setdefault("mocap_frame_rate", stored.pop("mocap_framerate", np.array(np.nan)))
-    lacking = [name for name in ("poses", "trans") if name not in stored]
-    if lacking:
-        raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
-    with taking_apart(path, "a whole motion"):
-        made_for = text(stored, "surface_model_type", model.kind)
-        if made_for not in (MOTIONS_OF, model.kind):
-            raise StorageError(f"{path}: expected surface_model_type '{MOTIONS_OF}', found '{made_for}'")
-        J, T = len(model.skeleton.parents), len(np.atleast_1d(stored["poses"]))
-        if not T or stored["poses"].size != T * 3 * J:
-            raise StorageError(f"{path}: expected frames of the model's {J} parts, "
-                               f"found shape {stored['poses'].shape}")
-        betas = stored.get("betas", np.zeros(0))
-        if betas.ndim != 1 or len(betas) > model.n_betas:
-            raise StorageError(f"{path}: expected at most the {model.n_betas} betas of the model, found {betas.shape}")
-        betas = numbers({"betas": betas}, "betas", None).astype(np.float64)
-        BETAS.check(betas, "betas")
-        poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
-        poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
-        return _Moves(poses, trans, betas if betas.size else None, rate)
 
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
@@ -167,7 +136,7 @@ def _refuse_the_rest(kind: str, given: dict[str, object]) -> None:
         raise ValueError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {kind}{hint}")
 
 
-def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: _Moves | None
+def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: BodyMotion | None
             ) -> np.ndarray | None:
     """Betas of the body that is asked for; None is the template's own."""
     if own_body and betas:
@@ -194,7 +163,17 @@ def _npz(output: Path, model: BodyModel) -> list[Metric]:
                         np.linalg.norm(rig.vertices(poses, changes=changes) - exact, axis=-1))]
 
 
-def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: _Moves | None) -> list[Metric]:
+def _amass(output: Path, path: Path, model: BodyModel, moves: BodyMotion) -> list[Metric]:
+    family = str(model.info.get("family") or "")
+    if not family:
+        raise ValueError(f"{path}: a motion under the names of AMASS is one of an imported model of the SMPL family "
+                         f"(scape model import); write {output.stem}.bvh, .glb or a folder")
+    write_amass(output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+    return [_size(output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+            Metric("surface_model_type", family)]
+
+
+def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None) -> list[Metric]:
     if moves is None:
         raise ValueError(f"{output}: expected a motion for a folder of meshes; name it with --motion")
     with bar("writing meshes") as progress:
@@ -211,7 +190,7 @@ def _bones(rig: Rig, ready: Rig, names: Names | None) -> list[Metric]:
             *([Metric(f"parts without a name of {names}", ", ".join(kept))] if names and kept else [])]
 
 
-def _measured_rig(kind: str, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: _Moves | None,
+def _measured_rig(kind: str, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: BodyMotion | None,
                   count: int | None) -> tuple[Rig, list[Metric]]:
     """The rig, for GLB with the correctives of the motion, and how far it is from the exact body."""
     subject = model.subject(person)

@@ -18,10 +18,12 @@ from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
-from ..export.cli import read_motion, write_frames
+from ..export.cli import write_frames
 from ..export.conventions import standing
 from ..files import load_model
 from ..linear import Subject
+from ..motion.files import betas_for
+from ..motion.onto import read_motion
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
@@ -37,7 +39,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
     Args:
         model: Model file.
         body: Mesh with the triangles of the model.
-        poses: Motion file (.npz), as of scape animate; its betas are not used.
+        poses: Motion file of scape animate (.npz), BVH or AMASS; its betas are not used.
         output: Folder for the meshes.
         unit: Unit of the body.
     """
@@ -59,7 +61,6 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
 
 def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
               landmarks: Path | None = None, template_landmarks: Path | None = None, unit: Unit | None = None,
-              pictures: bool = True,
               config: CharacterMeshConfig = CharacterMeshConfig()  # noqa: B008
               ) -> Outcome:
     """A character of any triangles as the mean of a model: it moves as people do, betas are offsets from it.
@@ -76,9 +77,12 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
         landmarks: Landmarks of the character; not needed for a mesh with the template's triangles.
         template_landmarks: Landmarks of the template; else those that the model keeps.
         unit: Unit of the character and its landmarks.
-        pictures: Write a picture beside the model.
         config: Settings.
     """
+    from scanprep.pictures.shading import save_png
+
+    from ..report import picture_character
+
     loaded, body = load_model(model), read_mesh(mesh, unit)
     same = np.array_equal(body.faces, loaded.template.faces)
     if landmarks is None and not same:
@@ -89,12 +93,7 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
     with bar("registering") as progress:
         found = register_character(loaded, body, theirs, ours, config, progress)
     found.model.save(output)
-    if pictures:
-        from scanprep.pictures.shading import save_png
-
-        from ..report import picture_character
-
-        save_png(output.with_suffix(".png"), picture_character(found.model))
+    save_png(output.with_suffix(".png"), picture_character(found.model))
     return Outcome(output, _about(loaded, found), {"character": config},
                    judgement=Judgement.of(character_problem(found)))
 
@@ -169,10 +168,8 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     if given is None:
         return model.subject(None)
     if given.suffix in (".json", ".npz"):
-        betas = _read_betas(given)
-        if len(betas) > model.n_betas:
-            raise ValueError(f"{given}: expected at most the {model.n_betas} betas of the model, found {len(betas)}")
-        return model.subject(betas if len(betas) else None)
+        betas = betas_for(given, _read_betas(given), model)
+        return model.subject(betas if betas is not None and len(betas) else None)
     person = read_mesh(given, unit)
     if not np.array_equal(person.faces, model.template.faces):
         raise ValueError(f"{given}: expected the triangles of the model ({model.template}), found {person}; "
@@ -187,7 +184,7 @@ def _read_betas(path: Path) -> np.ndarray:
         found = read_json(path, wanted)
         found = found.get("betas") if isinstance(found, dict) else found
     else:
-        found = load_arrays(path).get("betas")
+        found = load_arrays(path, only=("betas",)).get("betas")
     try:
         betas = np.array(found, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -24,8 +24,8 @@ from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
 
-from ..export.cli import read_motion
 from ..files import load_model
+from ..motion.onto import read_motion
 from .cli import LevelArg, MotionArg, StatueArg
 from .control.files import humanoid, read_control
 from .control.model import ControlModel, Statue

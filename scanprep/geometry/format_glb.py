@@ -43,10 +43,12 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
+    objects: list[tuple[str, int]] = []
     start, most = 0, 10**6 + 4 * len(binary)    # many nodes may show one mesh, but not without end
-    for _, node, matrix in nodes_of(tree):
+    for number, node, matrix in nodes_of(tree):
         if "mesh" not in node:
             continue
+        before = len(faces)
         matrix = np.eye(4) if "skin" in node else matrix
         placed: dict[int, int] = {}                      # primitives may share their vertices
         for primitive in item(tree["meshes"], node["mesh"])["primitives"]:
@@ -67,11 +69,14 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             most -= count + 3 * len(corners) + 1
             if most < 0:
                 raise ValueError("it shows its meshes too often")
+        if len(faces) > before:
+            name = node.get("name") or tree["meshes"][node["mesh"]].get("name") or f"node {number}"
+            objects.append((str(name), sum(map(len, faces[before:]))))
     if not faces:
         raise MeshFileError(f"{path}: expected a mesh, found a GLB file without triangles")
     shades = [c for c in colors if c is not None]
     return Contents(np.concatenate(vertices) @ turn_up(up_of(tree)), np.concatenate(faces), None,
-                    np.concatenate(shades) if len(shades) == len(colors) else None)
+                    np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects))
 
 
 def turn_up(up: int) -> np.ndarray:
