@@ -21,6 +21,7 @@ from .mesh import Mesh
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 VERTICES, _INDICES = 34962, 34963     # what a graphics card will use the numbers for
 _NUMBERS = {np.dtype(kind).str: number for number, kind in _COMPONENTS.items()}
+GENERATOR = "scapekit"
 _TURNS = {"x": 0, "y": 1, "z": 2}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
@@ -105,8 +106,10 @@ def tallest(vertices: np.ndarray) -> int:
 
 def up_of(tree: dict[str, Any]) -> int:
     """The axis of the body that was turned to y, as the file says; 1, none was turned, where it does not."""
-    told = tree.get("asset", {}).get("extras")
-    return _TURNS.get(str(told.get("up")), 1) if isinstance(told, dict) else 1
+    asset = tree.get("asset")
+    if not isinstance(asset, dict) or asset.get("generator") != GENERATOR or not isinstance(asset.get("extras"), dict):
+        return 1
+    return _TURNS.get(str(asset["extras"].get("up")), 1)
 
 
 def item(values: list[Any], number: Any) -> Any:
@@ -277,7 +280,7 @@ class Glb:
 
     def pack(self, document: dict[str, Any], up: int) -> bytes:
         """The file: header, JSON, buffer; its vertices have been turned by `turn_up(up)`."""
-        asset = {"version": "2.0", "generator": "scapekit", "extras": {"up": "xyz"[up]}}
+        asset = {"version": "2.0", "generator": GENERATOR, "extras": {"up": "xyz"[up]}}
         document = {"asset": asset, **document,
                     "buffers": [{"byteLength": len(self._data)}], "bufferViews": self._views,
                     "accessors": self._accessors}
