@@ -130,7 +130,7 @@ def _kind(output: Path) -> str:
     if output.suffix.lower() in (".glb", ".bvh", ".npz"):
         return output.suffix.lower()[1:]
     if output.suffix and not output.is_dir():
-        raise ValueError(f"{output}: expected a name ending in .glb, .usd, .bvh, .npz, {', '.join(_MESHES)}, "
+        raise ValueError(f"{output}: expected a name ending in .glb, .bvh, .npz, .usd, {', '.join(_MESHES)}, "
                          "or a folder")
     return "folder"
 
