@@ -103,7 +103,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     elif kind == "usd":
         write_skinned_usd(output, ready, poses, trans, moves.rate, axis)
     else:
-        write_skinned_glb(output, ready, poses, trans, moves.rate, axis)
+        write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
     return Outcome(output, [_size(output), *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
                             Metric("frames", len(poses)), *told])
 

@@ -63,7 +63,7 @@ def motion_correctives(rig: Rig, subject: Subject, poses: np.ndarray, count: int
     ids = farthest_points(rig.mesh.vertices, min(POINTS, len(rig.mesh.vertices)))
     few = replace(rig, mesh=Mesh(rig.mesh.vertices[ids], np.zeros((0, 3))), weights=rig.weights[ids],
                   shapes=np.zeros((0, len(ids), 3)), correctives=None)
-    solve = np.linalg.pinv(basis[:, ids].reshape(len(basis), -1))
+    solve = np.linalg.pinv(basis[:, ids].reshape(len(basis), 3 * len(ids)))
     points, weights = subject.points(ids), np.empty((len(poses), len(basis)))
     for start in range(0, len(poses), AT_ONCE):
         some = poses[start:start + AT_ONCE]
@@ -82,7 +82,7 @@ def body_correctives(rig: Rig, poses: np.ndarray, trans: np.ndarray, bodies: Cal
     lacking = np.concatenate([rest_corrections(rig, poses[some], bodies(some) - trans[some, None])
                               for some in np.array_split(frames, -(-len(frames) // SEEN))])
     mean, basis = _directions(lacking[spaced(len(frames), SEEN)], count)
-    weights = (lacking - mean).reshape(len(frames), -1) @ basis.reshape(len(basis), -1).T
+    weights = (lacking - mean).reshape(len(frames), -1) @ basis.reshape(len(basis), mean.size).T
     return _scaled(mean, basis, weights, frames)
 
 
@@ -106,7 +106,7 @@ def _directions(lacking: np.ndarray, count: int | None) -> tuple[np.ndarray, np.
     kept = order[:wanted][power[:wanted] > 1e-12 * max(float((lacking**2).sum()), 1e-12)]
     basis = modes[:, kept].T @ changes
     basis /= np.linalg.norm(basis, axis=1, keepdims=True)
-    return mean, basis.reshape(-1, *mean.shape)
+    return mean, basis.reshape(len(basis), *mean.shape)
 
 
 def _scaled(mean: np.ndarray, basis: np.ndarray, weights: np.ndarray, frames: np.ndarray) -> Correctives:

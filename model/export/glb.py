@@ -51,7 +51,7 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
     path : str or Path
     rig : Rig
     poses : (T, J, 3) float, radians, optional
-        A motion: rotations of all joints and places of the root. No frames are no motion.
+        A motion: rotations of all joints and places of the root.
     trans : (T, 3) float, metres, optional
     rate : float, frames a second
     up : int
@@ -62,8 +62,8 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
     Raises
     ------
     ValueError
-        A motion of other parts, not finite or of another length than the correctives; a rate that is not positive; an
-        axis that does not exist.
+        A motion of other parts, empty, not finite or of another length than the correctives; a rate that is
+        not positive; an axis that does not exist.
     """
     data = skinned_glb(rig, poses, trans, rate, up, material)
     with writing(path) as beside:
@@ -84,7 +84,7 @@ def skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | N
         mesh |= {"weights": [0] * len(names), "extras": {"targetNames": names}}
     document = {"scene": 0, "scenes": [{"nodes": [0, 1]}], "nodes": _nodes(rig), "meshes": [mesh],
                 "skins": [_skin(glb, rig)], **_materials(glb, material, rig.mesh.colors is not None)}
-    if poses is not None and len(poses):
+    if poses is not None:
         poses, trans = check_motion(rig.skeleton, poses, trans, rate)
         document["animations"] = [_animation(glb, rig, poses @ U, trans @ U, rate, len(names))]
     elif rig.correctives is not None:
