@@ -20,6 +20,7 @@ MOST = 10.0                          # degrees that segments may be off, on aver
 class Followed:
     """How well a body follows a motion."""
 
+    names: tuple[str, ...]           # of the ends of the S segments
     angles: np.ndarray               # (T, S) degrees between the segments of the body and of the motion
     distances: np.ndarray            # (T, S) metres, of the joint centres at their ends, where bones are as ours
     wanted: np.ndarray               # (T, S, 3) metres, where those would be
@@ -61,7 +62,7 @@ def followed(pair: Pairing, centres: np.ndarray) -> Followed:
         angles.append(np.degrees(np.arctan2(sine, (theirs * ours).sum(axis=1))))
     places = np.stack([wanted[b] for _, b in ends], axis=1)
     off = np.linalg.norm(np.stack([here[b] for _, b in ends], axis=1) - places, axis=2)
-    return Followed(np.stack(angles, axis=1), off, places)
+    return Followed(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places)
 
 
 def _nodes(joints: np.ndarray, roles: dict[str, int]) -> dict[str, np.ndarray]:

@@ -37,6 +37,7 @@ class Retargeted:
     rate: float                      # frames a second
     matched: dict[str, str]          # {part of the body: joint that it follows}
     lacking: tuple[str, ...] = ()    # parts that go with the one above them: the motion has no such joint
+    scale: float = 1.0               # of the travel: how much longer our legs are
 
 
 class Pairing:
@@ -218,7 +219,8 @@ def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2) -> Ret
     V = pair.world(aligned)
     R = V @ M @ np.swapaxes(pair.P, -1, -2)
     poses = skeleton.pose_of(R)
-    return Retargeted(poses, _travel(pair, V, poses), moving.rate, matched, tuple(lacking))
+    scale = _leg(skeleton.joints, pair.ours, pair.theirs) / _leg(moving.rest, pair.theirs, pair.ours)
+    return Retargeted(poses, _travel(pair, V, poses, scale), moving.rate, matched, tuple(lacking), scale)
 
 
 def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
@@ -240,7 +242,8 @@ def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSke
     trans = scale * moving.places[:, order[0]] @ Q - skeleton.joints[0]
     if np.abs(scale * theirs @ Q - ours).max() > SAME:                  # another person: soles where theirs would be
         trans = trans + lift(vertices, poses, trans, Q.T @ [0, 1, 0]) * (Q.T @ [0, 1, 0])
-    return Retargeted(poses, trans, moving.rate, dict(zip(skeleton.names, skeleton.names, strict=True)))
+    return Retargeted(poses, trans, moving.rate, dict(zip(skeleton.names, skeleton.names, strict=True)), (),
+                      float(scale))
 
 
 def _turn(ours: np.ndarray, theirs: np.ndarray, usual: np.ndarray) -> np.ndarray | None:
@@ -273,12 +276,11 @@ def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
 
 
-def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray, scale: float) -> np.ndarray:
     """(T, 3) travel of the root's joint, with the middle between the hips where that of the motion is, scaled."""
     skeleton, joints = pair.skeleton, pair.skeleton.joints
     ours = [pair.ours["l_hip"], pair.ours["r_hip"]]
     theirs = [pair.theirs["l_hip"], pair.theirs["r_hip"]]
-    scale = _leg(joints, pair.ours, pair.theirs) / _leg(pair.moving.rest, pair.theirs, pair.ours)
     place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
     place = place - place[0] + joints[ours].mean(axis=0)
     trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)

@@ -1,4 +1,4 @@
-"""One marker file: whose body, its motion, and all that is written of it, with the page."""
+"""One file of markers or of a motion: whose body, its motion, and all that is written of it, with the page."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -38,6 +38,7 @@ from ..pose.robust import hardly_believed, markers_told, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
+from .motions import bring, holds_motion
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 MEAN_ERROR = "distance of markers, mean"
@@ -59,10 +60,22 @@ class Work:
     person: PersonConfig
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
-        """Follow the markers of a file, write everything into the folder of a room, and return the figures.
-
-        The first says what the motion is worth.
+        """Follow the markers of a file, or bring its motion onto the body, write everything into the folder of a room,
+        and return the figures; the first says what the motion is worth.
         """
+        if holds_motion(path):
+            metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, room)
+        else:
+            metrics, motion, body, page = self._followed(path, room)
+        if self.retarget_to is not None:
+            metrics += _other_person(self, self.retarget_to, room.folder, motion, body, page)
+        if self.betas_to is not None:
+            metrics += _changing_body(self, self.betas_to, room.folder, motion, body, page)
+        page.write(room.folder / "report.html")
+        return metrics
+
+    def _followed(self, path: Path, room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
+        """The motion of the markers of a file."""
         sequence = read_markers(path, self.unit, self.who)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
@@ -86,13 +99,7 @@ class Work:
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body)
         metrics += write_glb(output / "animation.glb", motion, body)
-        page = motion_page(motion, body, sequence, path.name, rows(metrics))
-        if self.retarget_to is not None:
-            metrics += _other_person(self, self.retarget_to, output, motion, body, page)
-        if self.betas_to is not None:
-            metrics += _changing_body(self, self.betas_to, output, motion, body, page)
-        page.write(output / "report.html")
-        return metrics
+        return metrics, motion, body, motion_page(motion, body, sequence, path.name, rows(metrics))
 
     def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: Room
                 ) -> tuple[MarkerSequence, PersonFit, Worn]:

@@ -45,7 +45,7 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
-    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and residuals.csv; times are in seconds."""
+    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; times in seconds."""
     names, T = subject.skeleton.names, len(motion.poses)
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
@@ -53,7 +53,8 @@ def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
                 np.c_[motion.times, joint_angles(motion).reshape(T, -1)])
     write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
                 np.c_[motion.times, joint_centres(motion, subject).reshape(T, -1)])
-    write_residuals(folder / "residuals.csv", motion)
+    if motion.labels:
+        write_residuals(folder / "residuals.csv", motion)
 
 
 def write_residuals(path: Path, motion: Motion) -> None:
