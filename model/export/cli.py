@@ -19,6 +19,7 @@ from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
+from ..motion.amass import write_amass
 from ..motion.onto import BodyMotion, read_motion
 from .bvh import write_bvh
 from .conventions import for_programs, standing
@@ -33,7 +34,7 @@ _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
 _BONES = _PLACED | {"motion", "root", "names"}
 _TAKES = {"glb": _BONES | {"shapes", "correctives"}, "usd": _BONES | {"shapes", "correctives"},
-          "point cache": {"betas", "own_body", "motion", "up"}, "bvh": _BONES | {"unit"}, "npz": set(),
+          "point cache": {"betas", "own_body", "motion", "up"}, "bvh": _BONES | {"unit"}, "npz": {"motion"},
           "mesh": _PLACED, "folder": {"betas", "own_body", "motion"}}
 
 
@@ -44,9 +45,10 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     """Write a model for other programs; what is written follows from the name of the output.
 
     OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
-    and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names. OUT.ply, .obj, .stl,
-    .off: the mesh at rest. A folder: the exact mesh of every frame of the motion. OUT.usd, .usda, .usdc, .usdz: as GLB,
-    in UsdSkel. OUT.points.usd: the exact mesh of every frame in one file.
+    and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names; with --motion of a
+    model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl, .off: the mesh at rest. A folder: the
+    exact mesh of every frame of the motion. OUT.usd, .usda, .usdc, .usdz: as GLB, in UsdSkel. OUT.points.usd: the exact
+    mesh of every frame in one file.
 
     GLB, USD, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from
     the model's own. In GLB and USD further morph targets bring a motion to it.
@@ -75,9 +77,12 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
                             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
                             "names": names, "ground": ground, "front": front})
     loaded = load_model(model)
-    if kind == "npz":
+    if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded))
     moves = None if motion is None else read_motion(motion, loaded)
+    if kind == "npz":
+        assert moves is not None
+        return Outcome(output, _amass(output, model, loaded, moves))
     person = _person(model, loaded, betas, own_body, moves)
     if kind == "folder":
         return Outcome(output, _folder(output, loaded, person, moves))
@@ -167,6 +172,16 @@ def _npz(output: Path, model: BodyModel) -> list[Metric]:
             *_distances("exact body, skinning alone", np.linalg.norm(rig.vertices(poses) - exact, axis=-1)),
             *_distances("exact body, with pose directions",
                         np.linalg.norm(rig.vertices(poses, changes=changes) - exact, axis=-1))]
+
+
+def _amass(output: Path, path: Path, model: BodyModel, moves: BodyMotion) -> list[Metric]:
+    family = str(model.info.get("family") or "")
+    if not family:
+        raise ValueError(f"{path}: a motion under the names of AMASS is one of an imported model of the SMPL family "
+                         f"(scape model import); write {output.stem}.bvh, .glb or a folder")
+    write_amass(output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+    return [_size(output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+            Metric("surface_model_type", family)]
 
 
 def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None) -> list[Metric]:

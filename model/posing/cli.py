@@ -22,6 +22,7 @@ from ..export.cli import write_frames
 from ..export.conventions import standing
 from ..files import load_model
 from ..linear import Subject
+from ..motion.files import betas_for
 from ..motion.onto import read_motion
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
@@ -167,10 +168,8 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     if given is None:
         return model.subject(None)
     if given.suffix in (".json", ".npz"):
-        betas = _read_betas(given)
-        if len(betas) > model.n_betas:
-            raise ValueError(f"{given}: expected at most the {model.n_betas} betas of the model, found {len(betas)}")
-        return model.subject(betas if len(betas) else None)
+        betas = betas_for(given, _read_betas(given), model)
+        return model.subject(betas if betas is not None and len(betas) else None)
     person = read_mesh(given, unit)
     if not np.array_equal(person.faces, model.template.faces):
         raise ValueError(f"{given}: expected the triangles of the model ({model.template}), found {person}; "
@@ -185,7 +184,7 @@ def _read_betas(path: Path) -> np.ndarray:
         found = read_json(path, wanted)
         found = found.get("betas") if isinstance(found, dict) else found
     else:
-        found = load_arrays(path).get("betas")
+        found = load_arrays(path, only=("betas",)).get("betas")
     try:
         betas = np.array(found, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -12,8 +12,7 @@ from model.export.conventions import aimed
 from model.export.correctives import body_correctives, motion_correctives, off_exact
 from model.export.glb import write_skinned_glb
 from model.export.rig import subject_rig
-from model.linear import Subject
-from model.motion.error import joint_centres as centres_of
+from model.linear import PointOperator, Subject
 from scanprep.console import Metric
 from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
@@ -41,7 +40,11 @@ def joint_angles(motion: Motion) -> np.ndarray:
 
 def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    return centres_of(subject, motion.poses, motion.trans)
+    regressor = subject.skeleton.joint_regressor(subject.template)
+    M, N, _ = subject.basis.shape
+    basis = (regressor @ subject.basis.transpose(1, 0, 2).reshape(N, -1)).reshape(-1, M, 3).transpose(1, 0, 2)
+    operator = PointOperator(subject.terms, basis.astype(np.float64), subject.origin)
+    return operator.evaluate(motion.poses, motion.trans)
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
