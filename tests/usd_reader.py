@@ -20,6 +20,15 @@ def complaints(path):
     return [f"{error.GetName()}: {error.GetMessage()}" for error in found]
 
 
+def shown(path, times):
+    """(n, N, 3) the mesh of a file at some time codes, skinned or not."""
+    stage = Usd.Stage.Open(str(path))
+    if stage.GetDefaultPrim().IsA(UsdSkel.Root):
+        return skinned(path, times)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/body/mesh"))
+    return np.array([mesh.GetPointsAttr().Get(float(time)) for time in times])
+
+
 def skinned(path, times):
     """(n, N, 3) the mesh of a file at some time codes, by UsdSkel's own queries for skinning and blend shapes."""
     stage = Usd.Stage.Open(str(path))
