@@ -57,6 +57,8 @@ def names_of(parts: tuple[str, ...], kind: Names) -> dict[str, str]:
 
 def _kind_and_side(part: str, parts: tuple[str, ...]) -> tuple[str, str]:
     """What kind of part it is, and "left", "right" or ""; limbs of more segments than have names are numbered."""
+    if part[:2] in ("l_", "r_"):                                             # of the synthetic people
+        return part[2:], "left" if part[0] == "l" else "right"
     plain, _, side = part.rpartition("_")
     if side not in ("left", "right"):
         return part, ""
