@@ -7,7 +7,7 @@ import numpy as np
 
 
 def shown(path, frames, rate, folder):
-    """Vertices (n, N, 3) of the only mesh of a GLB, FBX or USD file at some frames, and joints {name: (n, 3)}."""
+    """Vertices (n, N, 3) of the only mesh of an FBX or USD file at some frames, and joints {name: (n, 3)}."""
     subprocess.run([sys.executable, __file__, str(path), json.dumps([*map(float, frames)]), str(rate), str(folder)],
                    check=True, capture_output=True, timeout=200)
     found = np.load(folder / "shown.npz")
@@ -20,10 +20,11 @@ def _main(path, frames, rate, folder):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.fps, scene.render.fps_base = round(float(rate)), round(float(rate)) / float(rate)
-    {"glb": lambda: bpy.ops.import_scene.gltf(filepath=path),
-     "fbx": lambda: bpy.ops.import_scene.fbx(filepath=path, anim_offset=0.0)
-     }.get(path.rpartition(".")[2], lambda: bpy.ops.wm.usd_import(filepath=path))()
-    (mesh,) = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.name != "Icosphere"]
+    if path.endswith(".fbx"):
+        bpy.ops.import_scene.fbx(filepath=path, anim_offset=0.0)
+    else:
+        bpy.ops.wm.usd_import(filepath=path)
+    (mesh,) = [thing for thing in bpy.data.objects if thing.type == "MESH"]
     armatures = [thing for thing in bpy.data.objects if thing.type == "ARMATURE"]
     vertices, joints = [], {}
     for frame in json.loads(frames):
