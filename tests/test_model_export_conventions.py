@@ -8,6 +8,7 @@ from bvh_reader import Bvh
 from glb_reader import Glb
 from model_bodies import random_poses, worm_model
 
+from model.export.bvh import write_bvh
 from model.export.cli import export
 from model.export.conventions import aimed, for_programs
 from model.export.correctives import motion_correctives
@@ -226,3 +227,27 @@ def test_joints_of_a_rerooted_motion_stand_where_they_stood(rig, motion):
     now, before = joint_places(other.skeleton, poses, trans), joint_places(rig.skeleton, *motion)
     for j in range(1, 4):
         assert np.abs(now[:, 1:] - before[:, [j]]).max(axis=(0, 2)).min() < 1e-12
+
+
+def test_blender_shows_the_same(tmp_path):
+    """The whole motion of surface and joints, with correctives, other root, other names."""
+    pytest.importorskip("bpy", reason="Blender as a module (pip install bpy)")
+    from blender_reader import evaluated
+
+    poses, trans = swaying(worm_rig := make_rig(worm_model(), np.array([0.5, -1.0]), 2))
+    subject = worm_model().subject(np.array([0.5, -1.0]))
+    made = replace(worm_rig, correctives=motion_correctives(worm_rig, subject, poses))
+    made, turns, places = for_programs(made, poses, trans, 2, "part2")
+    write_skinned_glb(tmp_path / "a.glb", made, turns, places, 4.0)
+    write_bvh(tmp_path / "a.bvh", made.skeleton, turns, places, 4.0, body=made.mesh)
+    times, U = np.arange(6) / 4, turn_up(2).T
+    off = np.linalg.norm(evaluated(tmp_path / "a.glb", times) - subject.vertices(poses, trans) @ U, axis=2)
+    assert off.mean() < 1e-3 and np.linalg.norm(rig_off(worm_rig, subject, poses), axis=2).mean() > 3 * off.mean()
+    shown = evaluated(tmp_path / "a.glb", times, made.skeleton.names)
+    joints = joint_places(made.skeleton, turns, places) @ U
+    assert np.abs(shown - joints).max() < 1e-5
+    assert np.abs(evaluated(tmp_path / "a.bvh", times, made.skeleton.names) - joints).max() < 1e-4
+
+
+def rig_off(rig, subject, poses):
+    return rig.vertices(poses) - subject.vertices(poses)

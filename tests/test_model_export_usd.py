@@ -21,6 +21,7 @@ from scanprep.geometry.format_glb import turn_up
 BETAS = np.array([0.5, -1.0])
 TIMES = np.arange(10)
 RATE = 12.5
+UP = turn_up(2)
 
 
 @pytest.fixture(scope="module")
@@ -130,40 +131,33 @@ def test_commands(tmp_path, model, motion, capsys, monkeypatch):
         assert (tmp_path / f"{name}.report.json").exists()
 
 
-def blender(path, folder):
-    pytest.importorskip("bpy", reason="Blender's own library is not installed")
-    from blender_frames import shown
-
-    return shown(path, TIMES, RATE, folder)
-
-
 @pytest.mark.parametrize("kind", ["skinned", "points"])
 def test_blender_shows_the_same(tmp_path, usd, rig, subject, motion, kind):
+    pytest.importorskip("bpy", reason="Blender as a module (pip install bpy)")
+    from blender_reader import evaluated
+
     expected = rig.vertices(*motion, rig.correctives.changes(TIMES))
     if kind == "skinned":
         write_skinned_usd(tmp_path / "a.usd", rig, *motion, RATE)
     else:
         expected = subject.vertices(*motion)
         write_points_usd(tmp_path / "a.usd", subject.template, expected, 10, RATE)
-    vertices, joints = blender(tmp_path / "a.usd", tmp_path)
-    assert np.abs(vertices - expected).max() < 5e-5
+    assert np.abs(evaluated(tmp_path / "a.usd", TIMES / RATE, None, RATE) - expected @ UP.T).max() < 5e-5
     if kind == "skinned":
-        places = joint_places(rig.skeleton, *motion)
-        for j, name in enumerate(rig.skeleton.names):
-            assert np.abs(joints[name] - places[:, j]).max() < 1e-5
+        joints = joint_places(rig.skeleton, *motion) @ UP.T
+        assert np.abs(evaluated(tmp_path / "a.usd", TIMES / RATE, rig.skeleton.names, RATE) - joints).max() < 1e-5
 
 
 def test_the_way_to_fbx_of_the_readme(tmp_path, rig, motion):
     """The command of model/README.md, as it stands there but for the rate, makes an FBX file of the same motion."""
-    pytest.importorskip("bpy", reason="Blender's own library is not installed")
+    pytest.importorskip("bpy", reason="Blender as a module (pip install bpy)")
+    from blender_reader import evaluated
+
     told = re.search(r'blender --background --python-expr "(.*?)"', Path("model/README.md").read_text(), re.S)[1]
     assert "fps = 30" in told
     write_skinned_glb(tmp_path / "walk.glb", rig, *motion, 30.0)
     subprocess.run([sys.executable, "-c", told], cwd=tmp_path, check=True, capture_output=True, timeout=200)
-    from blender_frames import shown
-
-    vertices, joints = shown(tmp_path / "walk.fbx", TIMES, 30.0, tmp_path)
-    assert np.abs(vertices - rig.vertices(*motion, rig.correctives.changes(TIMES))).max() < 1e-4
-    places = joint_places(rig.skeleton, *motion)
-    for j, name in enumerate(rig.skeleton.names):
-        assert np.abs(joints[name] - places[:, j]).max() < 1e-4
+    expected = rig.vertices(*motion, rig.correctives.changes(TIMES)) @ UP.T
+    assert np.abs(evaluated(tmp_path / "walk.fbx", TIMES / 30, None, 30.0) - expected).max() < 1e-4
+    joints = joint_places(rig.skeleton, *motion) @ UP.T
+    assert np.abs(evaluated(tmp_path / "walk.fbx", TIMES / 30, rig.skeleton.names, 30.0) - joints).max() < 1e-4

@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 
 FRAMES = 10
-Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])         # Blender has z up, GLB and BVH y
 
 
 def cases(model_file, motion_file, folder):
@@ -42,7 +41,7 @@ def cases(model_file, motion_file, folder):
     from model.export.rig import joint_places, make_rig, subject_rig
     from model.files import load_model
     from scanprep.geometry.files import write_mesh
-    from scanprep.geometry.format_glb import turn_up
+    from scanprep.geometry.format_glb import tallest, turn_up
     from scanprep.pictures.camera import upright
 
     model, motion = load_model(model_file), Motion.load(motion_file)
@@ -69,7 +68,6 @@ def cases(model_file, motion_file, folder):
     found["skinned.glb"] = plain.vertices(motion.poses[frames], motion.trans[frames]) @ U, times, None
     body = subject.template.with_vertices(exact[0])
     write_mesh(path("mesh.glb"), body)
-    from scanprep.geometry.format_glb import tallest
     found["mesh.glb"] = exact[:1] @ turn_up(tallest(body.vertices)).T, times[:1], None
     write_motion_bvh(path("motion.bvh"), motion, subject)
     joints = joint_places(plain.skeleton, motion.poses[frames], motion.trans[frames]) @ U
@@ -88,66 +86,25 @@ def cases(model_file, motion_file, folder):
     return {name: (path(name), *rest) for name, rest in found.items()}
 
 
-def with_fbx(asked, cases, folder, rate):
+def with_fbx(asked, cases, folder):
     """The cases with the FBX file that Blender makes of a GLB, by the command of model/README.md."""
     told = (Path(__file__).parents[2] / "model/README.md").read_text()
-    told = re.search(r'--python-expr "(.*?)"', told, re.S)[1].replace("fps = 30", f"fps = {rate:g}")
+    told = re.search(r'--python-expr "(.*?)"', told, re.S)[1].replace("fps = 30", f"fps = {asked.rate:g}")
     told = told.replace("walk.glb", "rerooted.glb").replace("walk.fbx", "rerooted.fbx")
     subprocess.run([asked.bpy, "-c", told], cwd=folder, check=True, stdout=subprocess.DEVNULL,
                    stderr=subprocess.DEVNULL)
     return cases | {"rerooted.fbx": (folder / "rerooted.fbx", *cases["rerooted.glb"][1:])}
 
 
-# ---- Blender: this file runs itself in the Python that has bpy
-
 def blender(asked, cases, folder):
-    """{file: (T, n, 3) metres in the axes of the file} by Blender."""
+    """{file: (T, n, 3) metres by the axes of the file} by Blender."""
     jobs = [{"file": str(path.resolve()), "times": times.tolist(), "names": names, "rate": asked.rate,
              "out": str(folder / f"{name}.npy")} for name, (path, _, times, names) in cases.items()]
     (folder / "jobs.json").write_text(json.dumps(jobs))
-    subprocess.run([asked.bpy, __file__, "--inside-blender", str(folder / "jobs.json")], check=True,
-                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return {name: np.load(folder / f"{name}.npy") @ Y_UP.T for name in cases}
-
-
-def inside_blender(jobs):
-    import bpy
-
-    for job in json.loads(Path(jobs).read_text()):
-        bpy.ops.wm.read_factory_settings(use_empty=True)
-        scene = bpy.context.scene
-        if job["file"].endswith(".glb"):
-            bpy.ops.import_scene.gltf(filepath=job["file"])
-        elif job["file"].endswith(".fbx"):
-            bpy.ops.import_scene.fbx(filepath=job["file"], anim_offset=0.0)
-        elif job["file"].endswith(".usdc"):
-            scene.render.fps, scene.render.fps_base = round(job["rate"]), round(job["rate"]) / job["rate"]
-            bpy.ops.wm.usd_import(filepath=job["file"])
-        else:
-            bpy.ops.import_anim.bvh(filepath=job["file"], global_scale=0.01, update_scene_fps=True)
-        out = []
-        first = 1.0 if job["file"].endswith(".bvh") else 0.0                 # BVH begins at frame 1
-        for time in job["times"]:
-            frame = first + time * scene.render.fps / scene.render.fps_base
-            scene.frame_set(int(np.floor(frame)), subframe=float(frame - np.floor(frame)))
-            out.append(_vertices(bpy) if job["names"] is None else _heads(bpy, job["names"]))
-        np.save(job["out"], np.array(out))
-
-
-def _vertices(bpy):
-    (thing,) = (each for each in bpy.data.objects if each.type == "MESH" and not each.name.startswith("Icosphere"))
-    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    mesh = evaluated.to_mesh()
-    points = np.empty(3 * len(mesh.vertices))
-    mesh.vertices.foreach_get("co", points)
-    M = np.array(evaluated.matrix_world)
-    return points.reshape(-1, 3) @ M[:3, :3].T + M[:3, 3]
-
-
-def _heads(bpy, names):
-    (thing,) = (each for each in bpy.data.objects if each.type == "ARMATURE")
-    thing = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    return [thing.matrix_world @ thing.pose.bones[name].head for name in names]
+    reader = Path(__file__).parents[1] / "blender_reader.py"
+    subprocess.run([asked.bpy, str(reader), str(folder / "jobs.json")], check=True, stdout=subprocess.DEVNULL,
+                   stderr=subprocess.DEVNULL)
+    return {name: np.load(folder / f"{name}.npy") for name in cases}
 
 
 # ---- three.js in a browser
@@ -248,7 +205,7 @@ def main():
     made = cases(asked.model, asked.motion, asked.output)
     asked.rate = float(np.load(asked.motion)["mocap_frame_rate"])
     if asked.bpy is not None:
-        made = with_fbx(asked, made, asked.output, asked.rate)
+        made = with_fbx(asked, made, asked.output)
     rows = {name: {"size_MB": path.stat().st_size / 1e6} for name, (path, *_) in made.items()}
     for program, (evaluate, needs) in PROGRAMS.items():
         if getattr(asked, needs) is None:
@@ -264,4 +221,4 @@ def main():
 
 
 if __name__ == "__main__":
-    inside_blender(sys.argv[2]) if sys.argv[1:2] == ["--inside-blender"] else main()
+    main()
