@@ -15,6 +15,7 @@ from model.export.correctives import motion_correctives
 from model.export.glb import skinned_glb, write_skinned_glb
 from model.export.names import names_of
 from model.export.rig import carried, joint_places, make_rig, rerooted
+from model.motion.roles import find_roles
 from model.posing.cli import mesh
 from model.statue.control.files import humanoid, read_control
 from scanprep.command_line import run
@@ -22,6 +23,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import stance
+from scanprep.skeleton.tree import Skeleton
 
 
 @pytest.fixture(scope="module")
@@ -114,27 +116,43 @@ def test_bones_point_along_the_limbs(person):
     assert rig.axes[names.index("skullbase")][:, 1] @ vertical > 0.9, "a leaf points to the end of its surface"
 
 
+def chain(*names, places=()):
+    """A skeleton of parts in a row along x, at some places or 1 m apart, metres."""
+    n = len(names)
+    x = np.array(places) if places else np.arange(n)
+    return Skeleton(np.arange(n), np.arange(-1, n - 1), np.c_[x, 0 * x, 0 * x], names)
+
+
 def test_names_of_other_programs():
-    parts = ("pelvis", "abdomen", "chest", "head", "upper_arm_left", "hand_right", "thigh_right", "shin_left", "tail")
+    parts = chain("pelvis", "abdomen", "chest", "head", "upper_arm_left", "hand_right", "thigh_right", "shin_left",
+                  "tail")
     assert names_of(parts, "mixamo") == {
         "pelvis": "mixamorig:Hips", "abdomen": "mixamorig:Spine", "chest": "mixamorig:Spine1",
         "head": "mixamorig:Head", "upper_arm_left": "mixamorig:LeftArm", "hand_right": "mixamorig:RightHand",
         "thigh_right": "mixamorig:RightUpLeg", "shin_left": "mixamorig:LeftLeg"}
-    assert list(names_of(parts, "vrm").values()) == [
-        "hips", "spine", "chest", "head", "leftUpperArm", "rightHand", "rightUpperLeg", "leftLowerLeg"]
-    assert list(names_of(parts, "h-anim").values()) == [
-        "sacroiliac", "vl5", "vt12", "skullbase", "l_shoulder", "r_radiocarpal", "r_hip", "l_knee"]
     assert names_of(parts, "opensim") == {
         "pelvis": "pelvis", "chest": "torso", "head": "head", "upper_arm_left": "humerus_l", "hand_right": "hand_r",
         "thigh_right": "femur_r", "shin_left": "tibia_l"}
-    four = [f"{limb}{k}_left" for limb in ("arm", "leg") for k in (1, 2, 3, 4)]
-    assert names_of(tuple(four), "vrm") == dict(zip([*four[:5], *four[6:]], [
-        "leftShoulder", "leftUpperArm", "leftLowerArm", "leftHand", "leftUpperLeg", "leftLowerLeg", "leftFoot"],
-        strict=True))
-    for kind in ("mixamo", "vrm", "h-anim", "opensim"):
-        assert len(set(names_of(parts, kind).values())) == len(names_of(parts, kind))
+    four = chain("pelvis", *(f"{limb}{k}_left" for limb in ("arm", "leg") for k in (1, 2, 3, 4)),
+                 places=(0, 0.1, 0.2, 0.5, 0.8, 1.0, 1.2, 1.45, 1.9))                # a clavicle, a thigh in two pieces
+    assert names_of(four, "vrm") == dict(zip((n for n in four.names if n != "leg2_left"), [
+        "hips", "leftShoulder", "leftUpperArm", "leftLowerArm", "leftHand", "leftUpperLeg", "leftLowerLeg",
+        "leftFoot"], strict=True))
     with pytest.raises(ValueError, match=r"names: expected a person's parts .* found part0, part1"):
-        names_of(("part0", "part1"), "vrm")
+        names_of(chain("part0", "part1"), "vrm")
+
+
+@pytest.mark.parametrize("kind", ["mixamo", "vrm", "h-anim", "opensim"])
+def test_names_are_read_as_the_same_joints(kind):
+    """What we read other programs' skeletons by finds the same joints under the new names."""
+    limbs = [f"{part}_{side}" for side in ("left", "right")
+             for part in ("shoulder", "upper_arm", "forearm", "hand", "thigh", "shin", "foot")]
+    parts = chain("pelvis", "abdomen", "chest", "neck", "head", *limbs)
+    named = names_of(parts, kind)
+    assert len(set(named.values())) == len(named)
+    before, after = find_roles(parts.names), find_roles([named.get(name, name) for name in parts.names])
+    assert {role: j for role, j in after.items() if role != "vl5"} == {
+        role: j for role, j in before.items() if role != "vl5"}
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.1, -2.5])

@@ -23,6 +23,7 @@ from scanprep.geometry.files import (
 )
 from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
+from scanprep.synthetic.people import BodyShape, Person
 
 TETRAHEDRON = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 EXACT = {".ply": 0, ".ply.gz": 0, ".obj": 1e-11, ".off": 1e-11, ".glb": 1e-6}
@@ -127,6 +128,15 @@ def test_glb_has_y_up_and_comes_back_as_it_was(tmp_path, up):
     data = (tmp_path / "a.glb").read_bytes()                # from elsewhere, or from before there was a mark
     (tmp_path / "b.glb").write_bytes(data.replace(b'"up"', b'"xx"'))
     assert np.array_equal(read_mesh(tmp_path / "b.glb", "m").vertices, shown)
+
+
+def test_arms_spread_wider_than_a_body_is_tall_do_not_lay_it_over():
+    person = Person(BodyShape()).mesh.vertices
+    width, _, height = np.ptp(person, axis=0)
+    for wide in (0.9, 1.0, 1.1):
+        assert tallest(person * [wide * height / width, 1, 1]) == 2
+        assert tallest(np.roll(person * [wide * height / width, 1, 1], 1, axis=1)) == 0
+    assert tallest(person * [2 * height / width, 1, 1]) == 0
 
 
 def test_glb_places_every_mesh_by_its_node(tmp_path):

@@ -212,7 +212,7 @@ def _points(output: Path, model: BodyModel, person: np.ndarray | None, moves: Bo
 
 def _bones(rig: Rig, ready: Rig, names: Names | None) -> list[Metric]:
     """What became of the skeleton; parts that keep their names although others were asked for."""
-    known = {} if names is None else names_of(rig.skeleton.names, names)
+    known = {} if names is None else names_of(rig.skeleton, names)
     kept = [name for name in rig.skeleton.names if name not in known]
     return [Metric("joints", len(ready.skeleton.names)), Metric("root", ready.skeleton.names[0]),
             *([Metric(f"parts without a name of {names}", ", ".join(kept))] if names and kept else [])]

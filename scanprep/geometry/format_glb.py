@@ -90,8 +90,17 @@ def turn_up(up: int) -> np.ndarray:
 
 
 def tallest(vertices: np.ndarray) -> int:
-    """The axis of the largest extent, which is probably up."""
-    return int(np.ptp(vertices, axis=0).argmax())
+    """The axis that is probably up: that of the largest extent.
+
+    Where the next one is nearly as large, as of somebody with the arms spread, it is the next one if the body is alike
+    on both sides of the first, and not of that.
+    """
+    extent = np.ptp(vertices, axis=0)
+    first, second = np.argsort(-extent, kind="stable")[:2]
+    sided = [np.histogram(vertices[:, axis], 10)[0] for axis in (first, second)]
+    here, there = (np.abs(count - count[::-1]).sum() / len(vertices) for count in sided)
+    spread = extent[second] > 0.85 * extent[first] and here < 0.25 and here < 0.5 * there
+    return int(second if spread else first)
 
 
 def up_of(tree: dict[str, Any]) -> int:

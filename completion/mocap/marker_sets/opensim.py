@@ -34,7 +34,7 @@ def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dic
     ValueError
         A skeleton without the parts of a person.
     """
-    named = names_of(skeleton.names, "opensim")
+    named = names_of(skeleton, "opensim")
     frames = _frames({name: skeleton.joints[skeleton.names.index(part)] for part, name in named.items()
                       if name not in _WITH}, *stance(body))
     parts = skeleton.part_of_vertex(body)[layout.nearest]
