@@ -1,6 +1,6 @@
-"""What Blender makes of GLB and BVH files, for tests and benchmarks; in a Python that has `bpy`.
+"""What Blender makes of GLB, BVH, USD and FBX files, for tests and benchmarks; in a Python that has `bpy`.
 
-    python tests/blender_reader.py JOBS.json      where bpy has a Python of its own: [{file, times, names, out}]
+    python tests/blender_reader.py JOBS.json      where bpy has a Python of its own: [{file, times, names, rate, out}]
 """
 import json
 import sys
@@ -9,18 +9,26 @@ from pathlib import Path
 import numpy as np
 
 
-def evaluated(path, times, names=None):
-    """Vertices of the one mesh, or the joints of these names: (T, n, 3) metres, with y up as in the file."""
+def evaluated(path, times, names=None, rate=24.0):
+    """Vertices of the one mesh, or the joints of these names: (T, n, 3) metres, with y up as in the file.
+
+    `rate` is that of the frames in USD and FBX.
+    """
     import bpy
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    if str(path).endswith(".glb"):
-        bpy.ops.import_scene.gltf(filepath=str(Path(path).resolve()))
-        first = 0.0
-    else:
-        bpy.ops.import_anim.bvh(filepath=str(Path(path).resolve()), global_scale=0.01, update_scene_fps=True)
+    scene.render.fps, scene.render.fps_base = round(rate), round(rate) / rate
+    file, ending, first = str(Path(path).resolve()), Path(path).suffix, 0.0
+    if ending == ".glb":
+        bpy.ops.import_scene.gltf(filepath=file, disable_bone_shape=True)
+    elif ending == ".fbx":
+        bpy.ops.import_scene.fbx(filepath=file, anim_offset=0.0)
+    elif ending == ".bvh":
+        bpy.ops.import_anim.bvh(filepath=file, global_scale=0.01, update_scene_fps=True)
         first = 1.0                                                        # the frame that BVH begins at
+    else:
+        bpy.ops.wm.usd_import(filepath=file)
     out = []
     for time in times:
         frame = first + time * scene.render.fps / scene.render.fps_base
@@ -30,7 +38,7 @@ def evaluated(path, times, names=None):
 
 
 def _vertices(bpy):
-    (thing,) = (each for each in bpy.data.objects if each.type == "MESH" and not each.name.startswith("Icosphere"))
+    (thing,) = (each for each in bpy.data.objects if each.type == "MESH")
     thing = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = thing.to_mesh()
     points = np.empty(3 * len(mesh.vertices))
@@ -47,4 +55,4 @@ def _heads(bpy, names):
 
 if __name__ == "__main__":
     for job in json.loads(Path(sys.argv[1]).read_text()):
-        np.save(job["out"], evaluated(job["file"], job["times"], job["names"]))
+        np.save(job["out"], evaluated(job["file"], job["times"], job["names"], job["rate"]))

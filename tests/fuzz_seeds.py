@@ -302,7 +302,7 @@ def _add_tables(body: Mesh, place: Any, add: Any, text: Any) -> None:
     text("pose.json", '{"part1": [0, 0.5, 0], "part2": [1, 0, 0]}', _read_turns,
          lambda found: finite(*found.values()))
     write_mesh(place("views/a.ply"), body)
-    text("cameras.json", '{"a": [0, 1, 2.5]}', lambda path: _read_views(path.parent / "views", path, None),
+    text("views/cameras.json", '{"a": [0, 1, 2.5]}', lambda path: _read_views(path.parent, None),
          lambda found: finite(*(camera for _, camera in found)))
     marked = np.arange(len(body.vertices)) % 3 == 0
     np.save(path := place("mask.npy"), marked)

@@ -14,7 +14,7 @@ from model.posing.cli import read_subject
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
-from scanprep.judgement import Judgement
+from scanprep.judgement import Judgement, extent, unit_problem
 from scanprep.ranges import Positive
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
@@ -81,7 +81,14 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, rows(metrics), frames.name), write)
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
-                   Judgement.of(tracking_problem(motion)))
+                   Judgement.of(wrong_size(found, person) or tracking_problem(motion)))
+
+
+def wrong_size(frames: FrameFolder, person: Subject) -> str | None:
+    """Why frames cannot show the body, by the largest of a few of them; None where they can."""
+    some = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
+    spans = [extent(np.concatenate([np.zeros((0, 3)), *(view.points for view in frames[t])])) for t in some]
+    return unit_problem(float(np.fmax.reduce(spans)), extent(person.template.vertices), "the frames are", 0.1)
 
 
 def _figures(motion: Motion) -> list[Metric]:

@@ -1,6 +1,7 @@
 """`scape model export`: a model in the files of other programs."""
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -26,13 +27,15 @@ from .correctives import motion_correctives, off_exact, pose_features, spaced, w
 from .glb import write_skinned_glb
 from .names import Names, names_of
 from .rig import Rig, joint_places, make_rig
+from .usd import USD, write_points_usd, write_skinned_usd
 
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
 _BONES = _PLACED | {"motion", "root", "names"}
-_TAKES = {"glb": _BONES | {"shapes", "correctives"}, "bvh": _BONES | {"unit"}, "npz": {"motion"}, "mesh": _PLACED,
-          "folder": {"betas", "own_body", "motion"}}
+_TAKES = {"glb": _BONES | {"shapes", "correctives"}, "usd": _BONES | {"shapes", "correctives"},
+          "point cache": {"betas", "own_body", "motion", "up"}, "bvh": _BONES | {"unit"}, "npz": {"motion"},
+          "mesh": _PLACED, "folder": {"betas", "own_body", "motion"}}
 
 
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
@@ -43,17 +46,18 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
 
     OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
     and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names; with --motion of a
-    model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl,
-    .off: the mesh at rest. A folder: the exact mesh of every frame of the motion.
+    model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl, .off: the mesh at rest. A folder: the
+    exact mesh of every frame of the motion. OUT.usd, .usda, .usdc, .usdz: as GLB, in UsdSkel. OUT.points.usd: the exact
+    mesh of every frame in one file.
 
-    GLB, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from the
-    model's own. In GLB further morph targets bring a motion to it.
+    GLB, USD, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from
+    the model's own. In GLB and USD further morph targets bring a motion to it.
 
     Example: scape model export model.npz --motion walk/motion.npz --root pelvis --names mixamo --ground -o walk.glb
 
     Args:
         model: Model file.
-        output: File or folder to write: .glb, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
+        output: File or folder to write: .glb, .usd, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
         betas: Shape in standard deviations, the first of them; else that of the motion, else the mean person.
         own_body: The template's own body.
         motion: Motion file of scape animate (.npz), or BVH or AMASS, which is brought onto the body.
@@ -62,11 +66,11 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         correctives: Further morph targets by which the motion comes nearer to the exact one; as many as bring it within
             half a millimetre, at most 48; 0 for plain skinning.
         unit: Of the lengths in a BVH file; cm.
-        up: Axis of the model that points up, which GLB and BVH turn to y; else that of the largest extent.
+        up: Axis of the model that points up, which GLB, USD and BVH turn to y; else that of the largest extent.
         root: Part that the skeleton hangs on, as pelvis.
         names: Whose names the bones of a person have: mixamo, vrm, h-anim or opensim.
         ground: Soles on height 0, of the body and of the lowest frame.
-        front: Face to the viewer: +z in GLB and BVH, -y of a mesh with z up.
+        front: Face to the viewer: +z in GLB, USD and BVH, -y of a mesh with z up.
     """
     kind = _kind(output)
     _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "shapes": shapes,
@@ -82,6 +86,8 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     person = _person(model, loaded, betas, own_body, moves)
     if kind == "folder":
         return Outcome(output, _folder(output, loaded, person, moves))
+    if kind == "point cache":
+        return Outcome(output, _points(output, loaded, person, moves, up))
     if kind == "mesh":
         rest = np.zeros((len(loaded.skeleton.parents), 3))
         body = loaded.template.with_vertices(loaded.vertices(rest, person))
@@ -99,6 +105,8 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if kind == "bvh":
         write_bvh(output, ready.skeleton, poses, trans, moves.rate, unit or "cm", axis, ready.mesh)
         told.insert(0, Metric("unit", unit or "cm"))
+    elif kind == "usd":
+        write_skinned_usd(output, ready, poses, trans, moves.rate, axis)
     else:
         write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
     return Outcome(output, [_size(output), *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
@@ -122,10 +130,13 @@ def _kind(output: Path) -> str:
     ending = "".join(output.suffixes).lower()
     if ending.endswith(_MESHES):
         return "mesh"
+    if output.suffix.lower() in USD:
+        return "point cache" if ".points" in ending else "usd"
     if output.suffix.lower() in (".glb", ".bvh", ".npz"):
         return output.suffix.lower()[1:]
     if output.suffix and not output.is_dir():
-        raise ValueError(f"{output}: expected a name ending in .glb, .bvh, .npz, {', '.join(_MESHES)}, or a folder")
+        raise ValueError(f"{output}: expected a name ending in .glb, .bvh, .npz, .usd, {', '.join(_MESHES)}, "
+                         "or a folder")
     return "folder"
 
 
@@ -180,6 +191,23 @@ def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: Bo
         paths = write_frames(output, model.subject(person), moves.poses, moves.trans, progress=progress)
     return [Metric("meshes", len(paths)), Metric("rate", moves.rate, "1/s"),
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
+
+
+def _points(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None, up: int | None
+            ) -> list[Metric]:
+    if moves is None:
+        raise ValueError(f"{output}: expected a motion for the points of its frames; name it with --motion")
+    subject, count = model.subject(person), len(moves.poses)
+    rest = model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
+    axis = upright(rest)[0] if up is None else up
+    with bar("writing meshes") as progress:
+        def frames() -> Iterator[np.ndarray]:
+            for t in range(count):
+                yield subject.vertices(moves.poses[t], moves.trans[t])
+                progress(t + 1, count)
+
+        write_points_usd(output, rest, frames(), count, moves.rate, axis)
+    return [_size(output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
 
 
 def _bones(rig: Rig, ready: Rig, names: Names | None) -> list[Metric]:

@@ -3,17 +3,21 @@
     python tests/benchmarks/other_programs.py MODEL.npz MOTION.npz -o DIR --bpy /path/of/python/with/bpy \
         --npm /folder/with/node_modules
 
-The motion is exported as GLB and BVH, a body at rest as static GLB; every file is opened in Blender (`bpy`, in a Python
-of its own), three.js (`npm install three`, in headless Chromium, skinned on the processor) and checked by the Khronos
-validator (`npm install gltf-validator`). Programs that are not there are left out. `results.json` holds a row for each
-file and program; a new file is a new entry of `cases`, a new program a new entry of `PROGRAMS`.
+The motion is exported as GLB, BVH, USD (skinned, and as points) and, by the command of model/README.md, FBX, a body at
+rest as static GLB. Every file is opened in Blender (`bpy`, in a Python of its own), USD in usd-core too, GLB in
+three.js (`npm install three`, in headless Chromium, skinned on the processor); the Khronos validator (`npm install
+gltf-validator`) checks GLB. Programs that are not there are left out. `results.json` holds a row for each file and
+program; a new file is a new entry of `cases`, a new program a new entry of `PROGRAMS`.
 """
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
+import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -71,13 +75,31 @@ def cases(model_file, motion_file, folder):
     write_bvh(path("rerooted.bvh"), ready.skeleton, poses, trans, motion.rate, "cm", up, ready.mesh)
     joints = joint_places(ready.skeleton, poses[frames], trans[frames]) @ U
     found["rerooted.bvh"] = joints, times, ready.skeleton.names
+    if importlib.util.find_spec("pxr"):
+        from model.export.usd import write_points_usd, write_skinned_usd
+
+        write_skinned_usd(path("rerooted.usdc"), ready, poses, trans, motion.rate, up)
+        found["rerooted.usdc"] = found["rerooted.glb"]
+        every = (motion.vertices(subject, np.array([t]))[0] for t in range(len(motion.poses)))
+        write_points_usd(path("motion.points.usdc"), subject.template, every, len(motion.poses), motion.rate, up)
+        found["motion.points.usdc"] = found["rerooted.glb"]
     return {name: (path(name), *rest) for name, rest in found.items()}
+
+
+def with_fbx(asked, cases, folder):
+    """The cases with the FBX file that Blender makes of a GLB, by the command of model/README.md."""
+    told = (Path(__file__).parents[2] / "model/README.md").read_text()
+    told = re.search(r'--python-expr "(.*?)"', told, re.S)[1].replace("fps = 30", f"fps = {asked.rate:g}")
+    told = told.replace("walk.glb", "rerooted.glb").replace("walk.fbx", "rerooted.fbx")
+    subprocess.run([asked.bpy, "-c", told], cwd=folder, check=True, stdout=subprocess.DEVNULL,
+                   stderr=subprocess.DEVNULL)
+    return cases | {"rerooted.fbx": (folder / "rerooted.fbx", *cases["rerooted.glb"][1:])}
 
 
 def blender(asked, cases, folder):
     """{file: (T, n, 3) metres by the axes of the file} by Blender."""
-    jobs = [{"file": str(path.resolve()), "times": times.tolist(), "names": names, "out": str(folder / f"{name}.npy")}
-            for name, (path, _, times, names) in cases.items()]
+    jobs = [{"file": str(path.resolve()), "times": times.tolist(), "names": names, "rate": asked.rate,
+             "out": str(folder / f"{name}.npy")} for name, (path, _, times, names) in cases.items()]
     (folder / "jobs.json").write_text(json.dumps(jobs))
     reader = Path(__file__).parents[1] / "blender_reader.py"
     subprocess.run([asked.bpy, str(reader), str(folder / "jobs.json")], check=True, stdout=subprocess.DEVNULL,
@@ -157,7 +179,18 @@ def validated(asked, path):
             "messages": sorted({each["code"] for each in issues["messages"] if each["severity"] < 2})}
 
 
-PROGRAMS = {"Blender": (blender, "bpy"), "three.js": (three, "npm")}
+def usd_core(asked, cases, folder):
+    """As `blender`, by the queries of UsdSkel and UsdGeom."""
+    if not importlib.util.find_spec("pxr"):
+        return {}
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from usd_reader import shown
+
+    return {name: shown(path, times * asked.rate) for name, (path, _, times, _) in cases.items()
+            if path.suffix == ".usdc"}
+
+
+PROGRAMS = {"usd-core": (usd_core, "output"), "Blender": (blender, "bpy"), "three.js": (three, "npm")}
 
 
 def main():
@@ -170,6 +203,9 @@ def main():
     asked = parser.parse_args()
     asked.output.mkdir(parents=True, exist_ok=True)
     made = cases(asked.model, asked.motion, asked.output)
+    asked.rate = float(np.load(asked.motion)["mocap_frame_rate"])
+    if asked.bpy is not None:
+        made = with_fbx(asked, made, asked.output)
     rows = {name: {"size_MB": path.stat().st_size / 1e6} for name, (path, *_) in made.items()}
     for program, (evaluate, needs) in PROGRAMS.items():
         if getattr(asked, needs) is None:

@@ -34,7 +34,7 @@ from ..files.motion_files import write_glb, write_motion
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import hardly_believed, markers_told, motion_problem
+from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
@@ -95,7 +95,7 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        judgement = Judgement.of(problem, (*worn.doubts(), *hardly_believed([motion])))
+        judgement = Judgement.of(problem, (*worn.doubts(), *hardly_seen([motion]), *hardly_believed([motion])))
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body)
         metrics += write_glb(output / "animation.glb", motion, body)

@@ -27,7 +27,7 @@ from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion, write_residuals
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.robust import hardly_believed, markers_told, motion_problem
+from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
@@ -74,7 +74,8 @@ class Work:
             figures[take.name] = _write(self, found, take, room, settings)
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
         problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
-        doubts = (*found.result.worn.doubts(), *hardly_believed([take.motion for take in found.takes]))
+        motions = [take.motion for take in found.takes]
+        doubts = (*found.result.worn.doubts(), *hardly_seen(motions), *hardly_believed(motions))
         metrics = [judgement_row(Judgement.of(problems, doubts)), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
@@ -165,7 +166,7 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, take_picture(take))
-        doubts = (*found.result.worn.doubts(), *hardly_believed([take.motion]))
+        doubts = (*found.result.worn.doubts(), *hardly_seen([take.motion]), *hardly_believed([take.motion]))
         judgement = Judgement.of(found.problem(take), doubts)
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
