@@ -197,10 +197,11 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2) -> Retargeted:
+def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
     """The motion of the pair's skeleton on its body; `aligned`: the body rests as that skeleton does.
 
     Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' angle above the level.
+    Travel is scaled as the legs are, about the origin of the file; `here`: it begins where the body stands at rest.
     """
     moving, skeleton = pair.moving, pair.skeleton
     A = pair.alignment(aligned)
@@ -227,7 +228,7 @@ def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2) -> Ret
     R = V @ M @ np.swapaxes(pair.P, -1, -2)
     poses = skeleton.pose_of(R)
     scale = _leg(skeleton.joints, pair.ours, pair.theirs) / _leg(moving.rest, pair.theirs, pair.ours)
-    return Retargeted(poses, _travel(pair, V, poses, scale), moving.rate, matched, tuple(lacking), scale)
+    return Retargeted(poses, _travel(pair, V, poses, scale, here), moving.rate, matched, tuple(lacking), scale)
 
 
 def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
@@ -287,13 +288,14 @@ def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
 
 
-def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray, scale: float) -> np.ndarray:
+def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray, scale: float, here: bool) -> np.ndarray:
     """(T, 3) travel of the root's joint, with the middle between the hips where that of the motion is, scaled."""
     skeleton, joints = pair.skeleton, pair.skeleton.joints
     ours = [pair.ours["l_hip"], pair.ours["r_hip"]]
     theirs = [pair.theirs["l_hip"], pair.theirs["r_hip"]]
     place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
-    place = place - place[0] + joints[ours].mean(axis=0)
+    if here:
+        place = place - place[0] + joints[ours].mean(axis=0)
     trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)
     return trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
 

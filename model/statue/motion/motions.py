@@ -99,7 +99,7 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
                        joint_places(skeleton, poses, trans), rate)
-    return retargeted(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle)
+    return retargeted(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
 
 
 def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> Retargeted:
@@ -112,7 +112,7 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> 
     ValueError for names that say too little.
     """
     same = copied(control.skeleton, control.mesh, control.rig.vertices, bvh)
-    return same or retargeted(Pairing(control.skeleton, control.rig.vertices, bvh, pose))
+    return same or retargeted(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
 
 
 @lru_cache(maxsize=1)
