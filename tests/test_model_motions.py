@@ -159,7 +159,7 @@ def test_the_error_that_is_told_is_that_of_the_joints(tmp_path):
     write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, rate=30.0, body=rig.mesh)
     pair = Pairing(rig.skeleton, rig.vertices, read_bvh(tmp_path / "a.bvh", "cm"))
     exact = followed(pair, poses, joint_places(rig.skeleton, poses))
-    assert exact.angle < 1e-4 and exact.distance < 1e-7 and exact.apart < 1e-4
+    assert exact.angle < 1e-4 and exact.distance < 1e-7 and exact.lean < 1e-4
     bent, elbow = poses.copy(), rig.skeleton.names.index("l_elbow")
     R = rotations.exp(poses[:, elbow]) @ rotations.exp(np.array([0, 0, np.radians(20)]))
     bent[:, elbow] = rotations.log(R)

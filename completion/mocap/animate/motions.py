@@ -8,7 +8,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from model.motion.error import MOST, Followed
+from model.motion.error import LEAN, MOST, Followed
 from model.motion.files import is_motion
 from model.motion.onto import BodyMotion, read_motion
 from scanprep.batch.room import Room
@@ -54,12 +54,15 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
 
 def judged(fit: Followed | None) -> Judgement:
     """What a motion is worth that was brought onto a body."""
-    if fit is None or fit.angle <= MOST:
-        return Judgement()
-    worst = int(fit.angles.mean(axis=0).argmax())
-    return Judgement.of(None, [f"segments point {fit.angle:.0f} degrees off on average, that to {fit.names[worst]} "
-                               f"{fit.angles[:, worst].mean():.0f}; is the skeleton of the motion a person who stands "
-                               "upright at rest?"])
+    reasons = []
+    if fit is not None and fit.angle > MOST:
+        worst = int(fit.angles.mean(axis=0).argmax())
+        reasons.append(f"segments point {fit.angle:.0f} degrees off on average, that to {fit.names[worst]} "
+                       f"{fit.angles[:, worst].mean():.0f}")
+    if fit is not None and fit.lean > LEAN:
+        reasons.append(f"the trunk of the motion's skeleton leans {fit.lean:.0f} degrees otherwise at rest; does it "
+                       "stand upright there?")
+    return Judgement.of(None, reasons)
 
 
 def figures(found: BodyMotion) -> list[Metric]:
@@ -78,7 +81,7 @@ def figures(found: BodyMotion) -> list[Metric]:
                 Metric("distance of joint centres, 95th percentile", float(np.percentile(distance, 95)), "mm"),
                 Metric("angle of segments, mean", found.fit.angle, "°"),
                 Metric("angle of segments, 95th percentile", float(np.percentile(found.fit.angles, 95)), "°"),
-                Metric("trunks that rest differently, allowed for", found.fit.apart, "°")]
+                Metric("trunk leans otherwise at rest, allowed for", found.fit.lean, "°")]
     return out
 
 
