@@ -32,6 +32,10 @@ from .learning.sexes import learn_by_sex as learn_by_sex
 from .learning.skinning import SkinConfig as SkinConfig
 from .learning.skinning import learn_skinning as learn_skinning
 from .linear import Subject as Subject
+from .measurement.find import find_tapes as find_tapes
+from .measurement.measure import Measurements as Measurements
+from .measurement.measure import measure as measure
+from .measurement.wanted import body_with_measurements as body_with_measurements
 from .motion.bvh import read_bvh as read_bvh
 from .posing.character import CharacterConfig as CharacterConfig
 from .posing.character import character_model as character_model

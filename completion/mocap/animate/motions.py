@@ -40,7 +40,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     motion = Motion.of(found)
     metrics = [judgement_row(judged(found.fit)), Metric("model", name), *figures(found)]
     write_motion(room.folder, motion, body)
-    write_glb(room.folder / "animation.glb", motion, body)
+    metrics += write_glb(room.folder / "animation.glb", motion, body)
     page = Page(f"{path.name}, on the body", "The body in motion" + (
         ", with dots where the joint centres of the motion's own skeleton would be with bones as long as these."
         if found.fit else "."))
