@@ -15,7 +15,8 @@ from .bvh import read_bvh
 from .error import Followed, followed
 from .files import StoredMotion, betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
-from .retarget import AT_ONCE, Pairing, Retargeted, copied, retargeted
+from .retarget import AT_ONCE, Pairing, Retargeted, retargeted
+from .same import copied
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,8 @@ from ...motion.amass import moving_body
 from ...motion.bvh import read_bvh
 from ...motion.files import read_motion_file
 from ...motion.moving import MovingSkeleton
-from ...motion.retarget import Pairing, Retargeted, copied, retargeted
+from ...motion.retarget import Pairing, Retargeted, retargeted
+from ...motion.same import copied
 from ..control.model import ControlModel, Statue
 from ..detail.reconstruction import Reconstruction
 from ..detail.subdivision import subdivide
