@@ -20,6 +20,7 @@ from model.motion.error import followed
 from model.motion.files import read_motion_file
 from model.motion.onto import read_motion
 from model.motion.retarget import Pairing
+from model.motion.standing import standing_rest
 from model.motion.trunks import nearest_starts
 from model.posing.cli import read_subject
 from model.skinning import SkinningModel
@@ -351,3 +352,34 @@ def test_a_trunk_of_any_number_of_joints_brings_the_shoulders_there(tmp_path, jo
     assert chest < (0.1 if joints <= 3 else 3), "of more joints the chest has those above its own start"
     limbs = [k for k, name in enumerate(found.fit.names) if name[2:] in ("wrist", "knee", "ankle")]
     assert found.fit.angles[:, limbs].max() < 3
+
+
+def test_a_file_whose_bones_lie_along_one_axis_is_read_from_a_frame_that_stands(tmp_path):
+    model, poses = small_people(), np.concatenate([random_poses(), np.zeros((1, 16, 3))])
+    path = elsewhere(tmp_path, poses, np.zeros((9, 3)))
+    usual = read_bvh(path, "cm")
+    size = np.linalg.norm(usual.offsets, axis=1)
+    along = usual.offsets.copy()
+    along[1:] = size[1:, None] * [1, 0, 0]
+    turn = np.tile(np.eye(3), (len(along), 1, 1))                # of each joint, that its next bone lies along x
+    for j, p in enumerate(usual.parents):
+        if p >= 0:
+            axis = np.cross(usual.offsets[j], [1, 0, 0])
+            angle = np.arctan2(np.linalg.norm(axis), usual.offsets[j][0])
+            turn[p] = rotations.exp(angle * axis / max(np.linalg.norm(axis), 1e-9))
+    lying = np.array(usual.offsets)
+    for j, p in enumerate(usual.parents):
+        lying[j] = turn[p] @ usual.offsets[j] if p >= 0 else usual.offsets[j]
+    moving = replace(usual, offsets=lying, rotations=usual.rotations @ np.swapaxes(turn, -1, -2))
+    found, frame = standing_rest(moving)
+    assert frame == 8 and np.abs(found.places - usual.places).max() == 0
+    again = np.einsum("tjab,jb->tja", found.rotations[:, found.parents[1:]], found.offsets[1:])
+    assert np.abs(again - (usual.places[:, 1:] - usual.places[:, usual.parents[1:]])).max() < 1e-9
+    tree = Skeleton(np.arange(len(lying)), usual.parents, moving.rest, usual.names)
+    write_bvh(tmp_path / "lying.bvh", tree, tree.pose_of(moving.rotations), usual.places[:, 0] - usual.places[:1, 0],
+              24.0, "m", 1)
+    read = read_motion(tmp_path / "lying.bvh", model)
+    assert "frame 8, in which it stands" in read.rest
+    mean = model.subject(np.zeros(1))
+    assert apart(mean.vertices(read.poses, read.trans), mean.vertices(poses)) < 1
+    assert standing_rest(usual) == (usual, None)

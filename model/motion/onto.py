@@ -17,6 +17,7 @@ from .files import StoredMotion, betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
 from .retarget import AT_ONCE, Pairing, Retargeted, retargeted
 from .same import copied
+from .standing import standing_rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +98,9 @@ def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, 
     if same is not None:
         return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,
                           "part by part, of the same skeleton", brought=same)
+    moving, frame = standing_rest(moving)
+    if frame is not None:
+        uncertain = f"that of frame {frame}, in which it stands: the file has none of a person who does"
     try:
         pair = Pairing(skeleton, subject.vertices, moving)
         found = retargeted(pair)
