@@ -62,7 +62,7 @@ def test_a_bvh_becomes_a_motion_of_the_body_with_its_error(place, tmp_path):
     assert rows["judgement"] == "good" and rows["parts that follow a joint"] == "16 of 16"
     assert 0 < rows["angle of segments, mean"] < 3 and 0 < rows["distance of joint centres, mean"] < 20
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "joint centres" in page and "l_elbow" in page and "On another person" in page
+    assert "joint centres" in page and "left elbow" in page and "On another person" in page
     table = np.genfromtxt(tmp_path / "out" / "residuals.csv", delimiter=",", names=True)
     assert 1000 * np.mean([table[name].mean() for name in table.dtype.names[2:]]) == pytest.approx(
         rows["distance of joint centres, mean"], rel=1e-4)

@@ -57,7 +57,7 @@ def judged(fit: Followed | None) -> Judgement:
     reasons = []
     if fit is not None and fit.angle > MOST:
         worst = int(fit.angles.mean(axis=0).argmax())
-        reasons.append(f"segments point {fit.angle:.0f} degrees off on average, that to {fit.names[worst]} "
+        reasons.append(f"segments point {fit.angle:.0f} degrees off on average, that to the {_words(fit.names[worst])} "
                        f"{fit.angles[:, worst].mean():.0f}")
     if fit is not None and fit.lean > LEAN:
         reasons.append(f"the trunk of the motion's skeleton leans {fit.lean:.0f} degrees otherwise at rest; does it "
@@ -88,12 +88,19 @@ def figures(found: BodyMotion) -> list[Metric]:
 def _joints(page: Page, motion: Motion, body: Subject, fit: Followed, folder: Path) -> None:
     """The body with the joint centres that it follows; the residuals of `motion` are their distances."""
     at = fit.wanted[played(motion)[0]]
-    dots = Dots(at[0], MARKER, 0.013, on_top=True, name="joint centres of the motion", labels=fit.names)
+    dots = Dots(at[0], MARKER, 0.013, on_top=True, name="joint centres of the motion",
+                labels=tuple(map(_words, fit.names)))
     page.bodies([moving_pane(motion, body, [(dots, at)])],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Joint centres").chart(chart_residuals(motion, "joint centres"),
                                         "distance of the body's joint centres from those of the motion")
     page.bodies(frame_panes(motion, body, fit.wanted, worst_frames(motion, 5)), "where they are farthest off", 300)
-    page.table([(name, MM * float(fit.distances[:, i].mean()), float(fit.angles[:, i].mean()))
+    page.table([(_words(name), MM * float(fit.distances[:, i].mean()), float(fit.angles[:, i].mean()))
                 for i, name in enumerate(fit.names)], ("end of the segment", "mean distance (mm)", "mean angle (°)"))
     write_residuals(folder / "residuals.csv", motion)
+
+
+def _words(joint: str) -> str:
+    """The joint at the end of a segment as a sentence has it."""
+    side = {"l_": "left ", "r_": "right "}.get(joint[:2], "")
+    return {"skullbase": "head", "shoulders": "middle of the shoulders"}.get(joint, side + joint[2:])
