@@ -39,7 +39,8 @@ def place(tmp_path_factory):
     np.savez(many / "amass.npz", poses=of_amass(poses).reshape(len(poses), -1), trans=np.zeros((len(poses), 3)),
              betas=np.zeros(16), gender="male", mocap_framerate=100.0, labels=np.array([None, "A"], dtype=object))
     Motion(poses, np.zeros((len(poses), 3)), np.zeros(4), 50.0, np.zeros((len(poses), 0))).save(many / "own.npz")
-    np.savez(many / "shape.npz", betas=np.zeros(16))
+    np.savez(many / "shape.npz", betas=np.zeros(16))            # as AMASS has it beside its motions
+    (many / "broken.npz").write_text("none")
     return place
 
 

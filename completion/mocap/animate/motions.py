@@ -9,11 +9,12 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from model.motion.error import LEAN, MOST, Followed
-from model.motion.files import is_motion
+from model.motion.files import is_motion as holds_poses
 from model.motion.onto import BodyMotion, read_motion
 from scanprep.batch.room import Room
 from scanprep.cli import MM
 from scanprep.console import Metric, judgement_row
+from scanprep.geometry.storage import StorageError
 from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots
@@ -27,9 +28,17 @@ ENDINGS = (".bvh", ".npz")
 MEAN_DISTANCE = "distance of joint centres, mean"
 
 
-def holds_motion(path: Path) -> bool:
-    """Whether a file is a motion: BVH, or `.npz` with poses."""
-    return path.suffix.lower() == ".bvh" or (path.suffix.lower() == ".npz" and is_motion(path))
+def is_motion(path: Path) -> bool:
+    """Whether a file is to be read as a motion, not as markers."""
+    return path.suffix.lower() in ENDINGS
+
+
+def motion_among(path: Path) -> bool:
+    """Whether a file of a folder is a motion; archives of other things may lie there."""
+    try:
+        return path.suffix.lower() == ".bvh" or (is_motion(path) and holds_poses(path))
+    except StorageError:
+        return False
 
 
 def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, room: Room
