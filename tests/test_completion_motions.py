@@ -12,6 +12,8 @@ from completion.motion import Motion
 from completion.viewing.files import Files
 from model.export.bvh import write_bvh
 from model.export.rig import joint_places, make_rig
+from model.motion.onto import read_motion
+from scanprep import write_mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.pictures import scene
 
@@ -140,3 +142,16 @@ def test_a_motion_of_another_kind_of_model_says_what_to_do(tmp_path):
              surface_model_type="smplh")
     with pytest.raises(StorageError, match=r"found 'smplh'; scape animate a\.npz -m MODEL -o OUT puts it on a model"):
         Motion.load(tmp_path / "a.npz")
+
+
+def test_other_commands_read_the_same_motions(place, tmp_path):
+    model = place / "model.npz"
+    write_mesh(tmp_path / "body.ply", small_people().template)
+    for name in ("theirs.bvh", "amass.npz"):
+        file, out = str(place / "many" / name), tmp_path / name.partition(".")[0]
+        assert main(["model", "export", str(model), "--motion", file, "-o", str(out / "out.bvh")]) == 0
+        found = read_motion(out / "out.bvh", small_people())
+        assert np.abs(found.poses - read_motion(file, small_people()).poses).max() < 1e-6
+        assert main(["model", "repose", str(model), str(tmp_path / "body.ply"), "--poses", file, "-o",
+                     str(out / "reposed")]) == 0
+        assert len(list((out / "reposed").glob("*.ply"))) == len(random_poses())
