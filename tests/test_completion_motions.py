@@ -129,7 +129,7 @@ def test_the_viewer_shows_the_same(place):
     for name in ("theirs.bvh", "amass.npz"):
         content = Files((place / "many" / name,), model).entries()[0].load()
         assert content.shapes[0].rate in (pytest.approx(24), 100)
-        assert any("copied by the directions of the segments" in note for note in content.notes)
+        assert any("copied by the directions of the segments, joint centres" in note for note in content.notes)
     own = Files((place / "many" / "own.npz",), model).entries()[0].load()
     assert not own.notes
     with pytest.raises(ValueError, match=r"theirs\.bvh: a motion needs its model"):
@@ -150,6 +150,8 @@ def test_other_commands_read_the_same_motions(place, tmp_path):
     for name in ("theirs.bvh", "amass.npz"):
         file, out = str(place / "many" / name), tmp_path / name.partition(".")[0]
         assert main(["model", "export", str(model), "--motion", file, "-o", str(out / "out.bvh")]) == 0
+        rows = json.loads((out / "out.bvh.report.json").read_text())["metrics"]
+        assert any(row["metric"] == "motion copied" and "° off" in row["value"] for row in rows), rows
         found = read_motion(out / "out.bvh", small_people())
         assert np.abs(found.poses - read_motion(file, small_people()).poses).max() < 1e-6
         assert main(["model", "repose", str(model), str(tmp_path / "body.ply"), "--poses", file, "-o",

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.cli import MM
+from scanprep.console import Metric
 from scanprep.geometry.storage import StorageError
 
 from ..body import BodyModel
@@ -33,6 +35,15 @@ class BodyMotion:
     rest: str = ""                   # what is not certain about the rest of its own skeleton
     brought: Retargeted | None = None    # what followed what, and how well, of a motion of another skeleton
     fit: Followed | None = None
+
+    @property
+    def told(self) -> list[Metric]:
+        """For a table: how a motion of another skeleton came onto the body, and how far it is off."""
+        if self.brought is None:
+            return []
+        off = self.fit and f", joint centres {MM * self.fit.distance:.0f} mm, segments {self.fit.angle:.1f}° off"
+        return [Metric("motion copied", f"{self.how}{off or ''}"),
+                *([Metric("rest of its skeleton", self.rest)] if self.rest else [])]
 
 
 def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None
