@@ -11,7 +11,7 @@ from model.body import BodyModel
 from model.files import load_model
 from model.motion.files import betas_for, read_motion_file
 from model.motion.onto import read_motion
-from scanprep.cli import MM, Unit
+from scanprep.cli import Unit
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import is_camera
 from scanprep.geometry.files import read_mesh
@@ -242,8 +242,7 @@ class Files:
         if path.suffix.lower() == ".bvh" or read_motion_file(path).of_family:
             model = self._model_of(path)
             found = read_motion(path, model, unit=self.unit)
-            off = found.fit and f", joint centres {MM * found.fit.distance:.0f} mm, segments {found.fit.angle:.1f}° off"
-            return Motion.of(found), model, (f"{path.name}: copied {found.how}{off or ''}",)
+            return Motion.of(found), model, tuple(f"{path.name}: {m.name} {m.value}" for m in found.told)
         motion = Motion.load(path)
         model = self._model_of(path, motion)
         parts = len(model.skeleton.parents)

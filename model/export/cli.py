@@ -79,7 +79,8 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     loaded = load_model(model)
     if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded))
-    moves = None if motion is None else read_motion(motion, loaded)
+    chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
+    moves = None if motion is None else read_motion(motion, loaded, chosen)
     if kind == "npz":
         assert moves is not None
         return Outcome(output, _amass(output, model, loaded, moves))
@@ -109,7 +110,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         write_skinned_usd(output, ready, poses, trans, moves.rate, axis)
     else:
         write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
-    return Outcome(output, [_size(output), *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
+    return Outcome(output, [_size(output), *moves.told, *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
                             Metric("frames", len(poses)), *told])
 
 
@@ -189,7 +190,7 @@ def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: Bo
         raise ValueError(f"{output}: expected a motion for a folder of meshes; name it with --motion")
     with bar("writing meshes") as progress:
         paths = write_frames(output, model.subject(person), moves.poses, moves.trans, progress=progress)
-    return [Metric("meshes", len(paths)), Metric("rate", moves.rate, "1/s"),
+    return [Metric("meshes", len(paths)), *moves.told, Metric("rate", moves.rate, "1/s"),
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
 
 

@@ -14,7 +14,7 @@ _ENDS = (("hips", "shoulders"), ("shoulders", "skullbase"),
          *((middle, f"{side}_{end}") for middle, end in (("hips", "hip"), ("shoulders", "shoulder")) for side in "lr"),
          *((f"{side}_{start}", f"{side}_{end}") for side in "lr" for start, end in
            (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))))
-MOST = 10.0                          # degrees that segments may be off, on average
+MOST, LEAN = 10.0, 20.0              # degrees that segments may be off on average, and a trunk lean otherwise at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Followed:
     angles: np.ndarray               # (T, S) degrees between the segments of the body and of the motion
     distances: np.ndarray            # (T, S) metres, of the joint centres at their ends, where bones are as ours
     wanted: np.ndarray               # (T, S, 3) metres, where those would be
-    apart: float                     # degrees, the most that a segment of the trunk points elsewhere at rest
+    lean: float                      # degrees, how much their trunk leans otherwise at rest than ours
 
     @property
     def angle(self) -> float:
@@ -51,19 +51,19 @@ def followed(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
     rest = _nodes(pair.skeleton.joints, pair.ours)
     frames = {"hips": R[:, pair.ours["humanoid_root"]], "shoulders": R[:, pair.middle()[0][-1]]}
     ends = [(a, b) for a, b in _ENDS if {a, b} <= there.keys() & here.keys()]
-    wanted, angles, apart = {"hips": here["hips"]}, [], []
+    wanted, angles, lean = {"hips": here["hips"]}, [], 0.0
     for a, b in ends:
         theirs, bone = there[b] - there[a], rest[b] - rest[a]
         if a in frames:
             C = _between(their_rest[b] - their_rest[a], bone)
             theirs = np.einsum("tab,bc,tdc,td->ta", frames[a], C, frames[a], theirs)
-            apart.append(float(np.degrees(np.linalg.norm(rotations.log(C)))))
+            lean = float(np.degrees(np.linalg.norm(rotations.log(C)))) if b == "shoulders" else lean
         still = np.linalg.norm(their_rest[b] - their_rest[a])              # a trunk that bends is shorter
         wanted[b] = wanted[a] + np.linalg.norm(bone) / max(float(still), 1e-12) * theirs
         angles.append(_angles(theirs, here[b] - here[a]))
     places = np.stack([wanted[b] for _, b in ends], axis=1)
     off = np.linalg.norm(np.stack([here[b] for _, b in ends], axis=1) - places, axis=2)
-    return Followed(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places, max(apart))
+    return Followed(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places, lean)
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -92,7 +92,9 @@ def _restored(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts
         whose = "parts" if parts is None else f"the model's {parts} parts"
         raise StorageError(f"{path}: expected frames of {whose}, three numbers each, found shape {poses.shape}")
     poses = poses.astype(np.float64).reshape(T, -1, 3)
-    betas = storage.numbers({"betas": np.squeeze(a.get("betas", np.zeros(0)))}, "betas", None).astype(np.float64)
+    betas = a.get("betas", np.zeros(0))
+    betas = betas[0] if betas.shape[:-1] == (1,) else betas                        # some files have them as a row
+    betas = storage.numbers({"betas": betas}, "betas", None).astype(np.float64)
     BETAS.check(betas, "betas")
     TURNS.check(poses, "poses")
     return StoredMotion(poses, storage.numbers(a, "trans", T, 3).astype(np.float64), betas if betas.size else None,

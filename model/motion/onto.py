@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.cli import MM
+from scanprep.console import Metric
 from scanprep.geometry.storage import StorageError
 
 from ..body import BodyModel
@@ -15,7 +17,9 @@ from .bvh import read_bvh
 from .error import Followed, followed
 from .files import StoredMotion, betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
-from .retarget import AT_ONCE, Pairing, Retargeted, copied, retargeted
+from .retarget import AT_ONCE, Pairing, Retargeted, retargeted
+from .same import copied
+from .standing import standing_rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +35,15 @@ class BodyMotion:
     rest: str = ""                   # what is not certain about the rest of its own skeleton
     brought: Retargeted | None = None    # what followed what, and how well, of a motion of another skeleton
     fit: Followed | None = None
+
+    @property
+    def told(self) -> list[Metric]:
+        """For a table: how a motion of another skeleton came onto the body, and how far it is off."""
+        if self.brought is None:
+            return []
+        off = self.fit and f", joint centres {MM * self.fit.distance:.0f} mm, segments {self.fit.angle:.1f}° off"
+        return [Metric("motion copied", f"{self.how}{off or ''}"),
+                *([Metric("rest of its skeleton", self.rest)] if self.rest else [])]
 
 
 def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None
@@ -96,6 +109,9 @@ def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, 
     if same is not None:
         return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,
                           "part by part, of the same skeleton", brought=same)
+    moving, frame = standing_rest(moving)
+    if frame is not None:
+        uncertain = f"that of frame {frame}, in which it stands: the file has none of a person who does"
     try:
         pair = Pairing(skeleton, subject.vertices, moving)
         found = retargeted(pair)

@@ -6,25 +6,22 @@ joints is brought to as many as we have.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import rotations
-from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import upright
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.rig import check_motion, joint_places, turn_up
+from ..export.rig import check_motion, joint_places
 from .moving import MovingSkeleton
-from .roles import NEEDED, numbered_roles, trunk, way
+from .roles import NEEDED, above, numbered_roles, trunk, way
+from .trunks import grouped, heights, nearest_starts, spread
 
 Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres
-ALIKE = 10.0                         # degrees between the bones of two skeletons that rest alike
-SAME = 1e-3                          # metres that the bones of one person may differ
 AT_ONCE = 200                        # frames whose meshes are held at a time
 
 
@@ -127,56 +124,24 @@ class Pairing:
         moving, R = self.moving, self.moving.rotations
         below, beyond = self.middle()
         parts, low, top = below[1:], *trunk(moving.parents, self.theirs)
-        joints = way(moving.parents, low, top)
-        head = self.theirs.get("skullbase", top)
-        necks = way(moving.parents, top, head)
         pelvis = self.theirs["humanoid_root"]
+        joints = way(moving.parents, low, top)
+        if pelvis not in above(moving.parents, top) and "vl5" in self.theirs:      # a tree that hangs on the chest
+            joints = way(moving.parents, pelvis, top)[1:]
+        necks = way(moving.parents, top, self.theirs.get("skullbase", top))
         if len(joints) < len(parts):
-            steps = [pelvis, *joints] if joints[0] != pelvis else joints
-            out, told = _spread(moving, steps, parts)
+            out, told = spread(moving, [pelvis, *joints] if joints[0] != pelvis else joints, parts)
+        elif parts:
+            links = [b if self.skeleton.parents[b] == a else a for a, b in pairwise(below)]
+            starts = nearest_starts(heights(self.joints, links, self.ours), heights(moving.rest, joints, self.theirs))
+            carried = [self.theirs[role] for role in ("l_shoulder", "r_shoulder", "skullbase") if role in self.theirs]
+            out, told = grouped(moving, joints, starts, parts, carried)
         else:
-            out, told = self._groups(joints, parts, [role for role in ("l_shoulder", "r_shoulder", "skullbase")
-                                                     if role in self.theirs])
-        more = _spread(moving, necks, beyond[1:])
+            out, told = {}, {}
+        more = spread(moving, necks, beyond[1:])
         for part in beyond[1:-1]:
             out[part], told[part] = more[0][part], more[1][part]
         return {part: np.broadcast_to(M, R[:, 0].shape) for part, M in out.items()}, told
-
-    def _groups(self, joints: list[int], parts: list[int], carried: list[str]
-                ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
-        """The joints of their trunk in as many groups as we have parts, and the rotation of each.
-
-        A group brings the next one where its joints bring it; the last one neck and shoulders, as nearly as one
-        rotation can.
-        """
-        if not parts:
-            return {}, {}
-        moving = self.moving
-        rest, R, y = moving.rest, moving.rotations, moving.places
-        starts = self._starts(joints, parts)
-        out, told = {}, {}
-        for part, first, after in zip(parts, starts, [*starts[1:], len(joints)], strict=True):
-            low, top = joints[first], joints[after - 1]
-            told[part] = moving.names[low] if low == top else f"{moving.names[low]} to {moving.names[top]}"
-            if low == top:
-                out[part] = R[:, low]
-            elif after < len(joints):
-                mean = rotations.project(R[:, joints[first:after]].mean(axis=1))
-                out[part] = _swung(mean, rest[joints[after]] - rest[low], y[:, joints[after]] - y[:, low])
-            else:
-                points = rest[[self.theirs[role] for role in carried]]
-                there = np.einsum("tab,kb->tka", R[:, top], points - rest[top]) + (y[:, top] - y[:, low])[:, None]
-                out[part] = rotations.project(np.einsum("tka,kb->tab", there, points - rest[low]))
-        return out, told
-
-    def _starts(self, joints: list[int], parts: list[int]) -> tuple[int, ...]:
-        """Which of their joints begins each of our parts: where along the trunk it is nearest."""
-        parents, below = self.skeleton.parents, self.middle()[0]
-        links = [b if parents[b] == a else a for a, b in pairwise(below)]
-        ours = _heights(self.joints, self.joints[links], self.ours)
-        theirs = _heights(self.moving.rest, self.moving.rest[joints], self.theirs)
-        choices = combinations(range(1, len(joints)), len(parts) - 1)
-        return min(((0, *some) for some in choices), key=lambda some: float(np.abs(ours - theirs[list(some)]).sum()))
 
     def world(self, aligned: bool) -> np.ndarray:
         """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards at
@@ -197,10 +162,11 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2) -> Retargeted:
+def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
     """The motion of the pair's skeleton on its body; `aligned`: the body rests as that skeleton does.
 
     Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' angle above the level.
+    Travel is scaled as the legs are, about the origin of the file; `here`: it begins where the body stands at rest.
     """
     moving, skeleton = pair.moving, pair.skeleton
     A = pair.alignment(aligned)
@@ -227,49 +193,7 @@ def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2) -> Ret
     R = V @ M @ np.swapaxes(pair.P, -1, -2)
     poses = skeleton.pose_of(R)
     scale = _leg(skeleton.joints, pair.ours, pair.theirs) / _leg(moving.rest, pair.theirs, pair.ours)
-    return Retargeted(poses, _travel(pair, V, poses, scale), moving.rate, matched, tuple(lacking), scale)
-
-
-def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
-    """The motion of the same parts, which rest alike in axes of another name; None where it is another skeleton.
-
-    The tree may hang on another part; bones may be those of another person.
-    """
-    names = skeleton.names
-    if set(moving.names) != set(names):
-        return None
-    order = [moving.names.index(name) for name in names]
-    above = [names[p] if p >= 0 else "" for p in skeleton.parents]
-    theirs_above = [moving.names[p] if p >= 0 else "" for p in moving.parents[order]]
-    shared = [j for j in range(len(names)) if above[j] == theirs_above[j]]       # joints that link the same parts
-    bones = [j for j in shared if above[j] and skeleton.parents[j] in shared]
-    if not bones or len(bones) < (len(names) - 1) / 2:
-        return None
-    ours, theirs = skeleton.joints[bones] - skeleton.joints[skeleton.parents[bones]], moving.offsets[order][bones]
-    Q = _turn(ours, theirs, turn_up(upright(rest)[0]))
-    if Q is None:
-        return None
-    scale = np.linalg.norm(ours, axis=1).sum() / np.linalg.norm(theirs, axis=1).sum()
-    poses = skeleton.pose_of(Q.T @ moving.rotations[:, order] @ Q)
-    trans = scale * moving.places[:, order[shared[0]]] @ Q - joint_places(skeleton, poses)[:, shared[0]]
-    if np.abs(scale * theirs @ Q - ours).max() > SAME:                  # another person: soles where theirs would be
-        trans = trans + lift(vertices, poses, trans, Q.T @ [0, 1, 0]) * (Q.T @ [0, 1, 0])
-    return Retargeted(poses, trans, moving.rate, dict(zip(names, names, strict=True)), (), float(scale))
-
-
-def _turn(ours: np.ndarray, theirs: np.ndarray, usual: np.ndarray) -> np.ndarray | None:
-    """The rotation that swaps axes and brings bones (n, 3) nearest to others, the usual one where it is as near; None
-    where they do not rest alike.
-    """
-    turns = np.concatenate([usual[None], Rotation.create_group("O").as_matrix().round()])
-    sizes = np.linalg.norm(ours, axis=1) * np.linalg.norm(theirs, axis=1)
-    kept = sizes > 1e-9
-    if not kept.any():
-        return None
-    cosine = np.einsum("na,kab,nb->kn", theirs[kept], turns, ours[kept]) / sizes[kept]
-    off = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
-    best = int(np.flatnonzero(off < off.min() + 1e-3)[0])
-    return turns[best] if off[best] < ALIKE else None
+    return Retargeted(poses, _travel(pair, V, poses, scale, here), moving.rate, matched, tuple(lacking), scale)
 
 
 def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
@@ -287,13 +211,14 @@ def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
 
 
-def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray, scale: float) -> np.ndarray:
+def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray, scale: float, here: bool) -> np.ndarray:
     """(T, 3) travel of the root's joint, with the middle between the hips where that of the motion is, scaled."""
     skeleton, joints = pair.skeleton, pair.skeleton.joints
     ours = [pair.ours["l_hip"], pair.ours["r_hip"]]
     theirs = [pair.theirs["l_hip"], pair.theirs["r_hip"]]
     place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
-    place = place - place[0] + joints[ours].mean(axis=0)
+    if here:
+        place = place - place[0] + joints[ours].mean(axis=0)
     trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)
     return trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
 
@@ -304,39 +229,6 @@ def lift(vertices: Vertices, poses: np.ndarray, trans: np.ndarray, up: np.ndarra
     lowest = np.concatenate([(vertices(poses[k:k + AT_ONCE], trans[k:k + AT_ONCE]) @ up).min(axis=1)
                              for k in range(0, len(poses), AT_ONCE)])
     return float(still - np.percentile(lowest, 5))                      # percentile: some frames may err
-
-
-def _spread(moving: MovingSkeleton, steps: Sequence[int], parts: Sequence[int]
-            ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
-    """Rotations (T, 3, 3) for parts that follow some joints, spread evenly over them; the last follows the last."""
-    out, told = {}, {}
-    for i, part in enumerate(parts, start=1):
-        at = i * (len(steps) - 1) / len(parts)
-        before, share = int(at), at - int(at)
-        first, second = steps[before], steps[min(before + 1, len(steps) - 1)]
-        turn = np.swapaxes(moving.rotations[:, first], -1, -2) @ moving.rotations[:, second]
-        out[part] = moving.rotations[:, first] @ rotations.exp(share * rotations.log(turn)) if share else (
-            moving.rotations[:, first])
-        told[part] = moving.names[first] + (f" to {moving.names[second]}" if share else "")
-    return out, told
-
-
-def _swung(R: np.ndarray, before: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Rotations (T, 3, 3) after the smallest ones that bring `R @ before` (3,) to the directions `now` (T, 3)."""
-    was = R @ before
-    if np.linalg.norm(before) < 1e-6:
-        return R
-    axis = np.cross(was, now)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    angle = np.arctan2(sine, np.einsum("ta,ta->t", was, now)[:, None])
-    return np.asarray(rotations.exp(angle * axis / np.maximum(sine, 1e-12)) @ R)
-
-
-def _heights(joints: np.ndarray, points: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
-    """(n,) how far along the trunk points (n, 3) are, 0 at the hips and 1 at the shoulders."""
-    hips, shoulders = (joints[[roles[f"l_{name}"], roles[f"r_{name}"]]].mean(axis=0) for name in ("hip", "shoulder"))
-    along = shoulders - hips
-    return np.asarray((points - hips) @ along / (along @ along))
 
 
 def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]) -> float:

@@ -52,7 +52,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
     with bar("writing meshes") as progress:
         written = write_frames(output, found.subject, moves.poses, moves.trans, progress=progress)
     return Outcome(output, [
-        Metric("meshes", len(written)),
+        Metric("meshes", len(written)), *moves.told,
         Metric("distance from the body in its own pose, mean", 1e3 * found.mean, "mm"),
         Metric("distance from the body in its own pose, largest", 1e3 * found.largest, "mm")],
         judgement=Judgement.of(None if found.mean <= HAND * size(loaded.template) else

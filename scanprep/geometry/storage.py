@@ -203,7 +203,7 @@ def _array(stream: IO[bytes], size: int, name: str) -> np.ndarray:
     except Exception:                    # numpy's words advise to allow pickles
         raise ValueError(f"array {name}: its header is damaged") from None
     if kind.kind not in "biufcSU":
-        pickled = "Python objects (pickled), which are not read here, because they can run programs" * kind.hasobject
+        pickled = "Python objects, which are not read here, because they can run programs" * kind.hasobject
         raise ValueError(f"array {name}: expected numbers or text, found {pickled or kind}")
     count = math.prod(shape)
     if min(shape, default=0) < 0 or count * max(kind.itemsize, 1) != size - stream.tell():

@@ -24,7 +24,7 @@ from ..files.markers import READERS
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
 from ..subject.person import PersonConfig
-from .motions import ENDINGS, MEAN_DISTANCE, holds_motion
+from .motions import ENDINGS, MEAN_DISTANCE, is_motion, motion_among
 from .work import MEAN_ERROR, BetasTo, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
@@ -69,7 +69,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         workers: Who works through the files of a folder.
     """
     found = _files(markers)
-    if markers.is_file() and holds_motion(markers) and (layout or subject_prefix):
+    if markers.is_file() and is_motion(markers) and (layout or subject_prefix):
         raise ValueError(f"{markers}: a motion has no markers; leave out --layout and --subject-prefix")
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
@@ -121,7 +121,7 @@ def _files(markers: Path) -> list[Path]:
     """The file, or the files of markers and motions in a folder; those of one name would be written over each other."""
     if not markers.is_dir():
         return [markers]
-    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in READERS or holds_motion(p))
+    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in READERS or motion_among(p))
     if not found:
         raise ValueError(f"{markers}: expected files ending in {', '.join(READERS)}, found none, nor "
                          f"motions ({', '.join(ENDINGS)})")

@@ -8,12 +8,13 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from model.motion.error import MOST, Followed
-from model.motion.files import is_motion
+from model.motion.error import LEAN, MOST, Followed
+from model.motion.files import is_motion as holds_poses
 from model.motion.onto import BodyMotion, read_motion
 from scanprep.batch.room import Room
 from scanprep.cli import MM
 from scanprep.console import Metric, judgement_row
+from scanprep.geometry.storage import StorageError
 from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots
@@ -27,9 +28,17 @@ ENDINGS = (".bvh", ".npz")
 MEAN_DISTANCE = "distance of joint centres, mean"
 
 
-def holds_motion(path: Path) -> bool:
-    """Whether a file is a motion: BVH, or `.npz` with poses."""
-    return path.suffix.lower() == ".bvh" or (path.suffix.lower() == ".npz" and is_motion(path))
+def is_motion(path: Path) -> bool:
+    """Whether a file is to be read as a motion, not as markers."""
+    return path.suffix.lower() in ENDINGS
+
+
+def motion_among(path: Path) -> bool:
+    """Whether a file of a folder is a motion; archives of other things may lie there."""
+    try:
+        return path.suffix.lower() == ".bvh" or (is_motion(path) and holds_poses(path))
+    except StorageError:
+        return False
 
 
 def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, room: Room
@@ -54,12 +63,15 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
 
 def judged(fit: Followed | None) -> Judgement:
     """What a motion is worth that was brought onto a body."""
-    if fit is None or fit.angle <= MOST:
-        return Judgement()
-    worst = int(fit.angles.mean(axis=0).argmax())
-    return Judgement.of(None, [f"segments point {fit.angle:.0f} degrees off on average, that to {fit.names[worst]} "
-                               f"{fit.angles[:, worst].mean():.0f}; is the skeleton of the motion a person who stands "
-                               "upright at rest?"])
+    reasons = []
+    if fit is not None and fit.angle > MOST:
+        worst = int(fit.angles.mean(axis=0).argmax())
+        reasons.append(f"segments point {fit.angle:.0f} degrees off on average, that to the {_words(fit.names[worst])} "
+                       f"{fit.angles[:, worst].mean():.0f}")
+    if fit is not None and fit.lean > LEAN:
+        reasons.append(f"the trunk of the motion's skeleton leans {fit.lean:.0f} degrees otherwise at rest; does it "
+                       "stand upright there?")
+    return Judgement.of(None, reasons)
 
 
 def figures(found: BodyMotion) -> list[Metric]:
@@ -78,19 +90,26 @@ def figures(found: BodyMotion) -> list[Metric]:
                 Metric("distance of joint centres, 95th percentile", float(np.percentile(distance, 95)), "mm"),
                 Metric("angle of segments, mean", found.fit.angle, "°"),
                 Metric("angle of segments, 95th percentile", float(np.percentile(found.fit.angles, 95)), "°"),
-                Metric("trunks that rest differently, allowed for", found.fit.apart, "°")]
+                Metric("trunk leans otherwise at rest, allowed for", found.fit.lean, "°")]
     return out
 
 
 def _joints(page: Page, motion: Motion, body: Subject, fit: Followed, folder: Path) -> None:
     """The body with the joint centres that it follows; the residuals of `motion` are their distances."""
     at = fit.wanted[played(motion)[0]]
-    dots = Dots(at[0], MARKER, 0.013, on_top=True, name="joint centres of the motion", labels=fit.names)
+    dots = Dots(at[0], MARKER, 0.013, on_top=True, name="joint centres of the motion",
+                labels=tuple(map(_words, fit.names)))
     page.bodies([moving_pane(motion, body, [(dots, at)])],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Joint centres").chart(chart_residuals(motion, "joint centres"),
                                         "distance of the body's joint centres from those of the motion")
     page.bodies(frame_panes(motion, body, fit.wanted, worst_frames(motion, 5)), "where they are farthest off", 300)
-    page.table([(name, MM * float(fit.distances[:, i].mean()), float(fit.angles[:, i].mean()))
+    page.table([(_words(name), MM * float(fit.distances[:, i].mean()), float(fit.angles[:, i].mean()))
                 for i, name in enumerate(fit.names)], ("end of the segment", "mean distance (mm)", "mean angle (°)"))
     write_residuals(folder / "residuals.csv", motion)
+
+
+def _words(joint: str) -> str:
+    """The joint at the end of a segment as a sentence has it."""
+    side = {"l_": "left ", "r_": "right "}.get(joint[:2], "")
+    return {"skullbase": "head", "shoulders": "middle of the shoulders"}.get(joint, side + joint[2:])

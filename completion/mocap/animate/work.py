@@ -38,7 +38,7 @@ from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_pro
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
-from .motions import bring, holds_motion
+from .motions import bring, is_motion
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 MEAN_ERROR = "distance of markers, mean"
@@ -63,7 +63,7 @@ class Work:
         """Follow the markers of a file, or bring its motion onto the body, write everything into the folder of a room,
         and return the figures; the first says what the motion is worth.
         """
-        if holds_motion(path):
+        if is_motion(path):
             metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, room)
         else:
             metrics, motion, body, page = self._followed(path, room)

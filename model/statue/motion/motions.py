@@ -26,7 +26,8 @@ from ...motion.amass import moving_body
 from ...motion.bvh import read_bvh
 from ...motion.files import read_motion_file
 from ...motion.moving import MovingSkeleton
-from ...motion.retarget import Pairing, Retargeted, copied, retargeted
+from ...motion.retarget import Pairing, Retargeted, retargeted
+from ...motion.same import copied
 from ..control.model import ControlModel, Statue
 from ..detail.reconstruction import Reconstruction
 from ..detail.subdivision import subdivide
@@ -99,7 +100,7 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
                        joint_places(skeleton, poses, trans), rate)
-    return retargeted(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle)
+    return retargeted(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
 
 
 def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> Retargeted:
@@ -112,7 +113,7 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> 
     ValueError for names that say too little.
     """
     same = copied(control.skeleton, control.mesh, control.rig.vertices, bvh)
-    return same or retargeted(Pairing(control.skeleton, control.rig.vertices, bvh, pose))
+    return same or retargeted(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
 
 
 @lru_cache(maxsize=1)
