@@ -224,6 +224,8 @@ def test_joint_centres_are_further_points_of_the_c3d(tmp_path, original):
     many = [f"joint {i}" for i in range(300)]
     (tmp_path / "many.c3d").write_bytes(add_points(original, data, many, many, np.zeros((T, 300, 3))))
     assert read_markers(tmp_path / "many.c3d").labels[-1] == "joint 299"
+    with pytest.raises(MarkerFileError, match="group POINT that can take more points"):
+        add_points(original, data.replace(b"POINT", b"PLINT"), ["a"], ["a"], np.zeros((T, 1, 3)))
     with pytest.raises(MarkerFileError, match="expected a file of 3 frames, found 12"):
         add_points(original, data, ["a"], ["a"], np.zeros((3, 1, 3)))
 

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from scanprep.console import say
 from scanprep.geometry import storage
 from scanprep.ranges import Settings
 
@@ -192,7 +193,10 @@ def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject: str | N
             label += "_"
         labels.append(label)
     told = [f"joint centre of the model ({label})" for label in joints.labels]
-    file.write_bytes(add_points(name, data, labels, told, joints.positions, unit))
+    try:
+        file.write_bytes(add_points(name, data, labels, told, joints.positions, unit))
+    except MarkerFileError as error:                     # the markers are the user's, the joints can be had elsewhere
+        say(f"virtual.c3d has no joint centres: {error}")
 
 
 def _columns(path: Path, data: bytes, labels: tuple[str, ...], subject: str | None) -> np.ndarray:

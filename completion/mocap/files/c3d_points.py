@@ -35,7 +35,11 @@ def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Seq
     begin = (data[0] - 1) * BLOCK
     described = [str(text) for text in file_parameters(data, table.numbers).get(("POINT", "DESCRIPTIONS"), [])]
     described = (described + [""] * len(table.labels))[:len(table.labels)]
-    section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions])
+    try:
+        section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions])
+    except (struct.error, IndexError, ValueError, OverflowError, StopIteration) as error:
+        raise MarkerFileError(f"{path}: expected C3D parameters with a group POINT that can take more points "
+                              f"({type(error).__name__} {error})") from None
     head = bytearray(data[:begin])
     struct.pack_into(f"{table.numbers.order}H", head, 2, len(table.labels) + len(labels))
     struct.pack_into(f"{table.numbers.order}H", head, 16, (begin + len(section)) // BLOCK + 1)
