@@ -2,12 +2,13 @@
 import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
+from people_bodies import small_people
 from test_completion_mosh_virtual import T, found, original
 
 from completion.mocap.artefacts.results import write_virtual
 from completion.mocap.files.c3d_points import add_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers, write_markers
-from completion.mocap.files.motion_files import write_motion
+from completion.mocap.files.motion_files import joint_centres, write_motion
 from completion.mocap.files.opensim import centre_labels, joined, write_mot
 from completion.mocap.joint_angles import JointAngles, anatomy, angles_of, compose, decompose, ground_axes
 from completion.motion import Motion
@@ -141,7 +142,7 @@ def test_a_side_or_the_names_are_missing():
     some = [j for j, name in enumerate(PARTS) if name not in ("l_shin", "l_foot", "r_hand")]
     parents = np.array([-1 if p < 0 else some.index(p) for p in PARENTS[some]])
     less = anatomy(tuple(PARTS[j] for j in some), parents, JOINTS[some])
-    assert less.missing() == ["elbow_r", "wrist_r", "hip_l", "knee_l", "ankle_l"]   # no far end, no axis
+    assert less.missing() == ("elbow_r", "wrist_r", "hip_l", "knee_l", "ankle_l")   # no far end, no axis
     R = exp(np.random.default_rng(5).normal(0, 0.3, (3, 16, 3)))
     whole, part = angles(R), angles(R[:, some], less)
     leg = {name for name in whole if name.startswith(("hip_", "knee_", "ankle_")) and name.endswith("l")}
@@ -174,10 +175,29 @@ def test_files_of_a_motion_without_people(tmp_path, capsys):
     assert text.splitlines()[6].startswith("1\t0\t\t\t\t\t\t\t")
 
 
+def test_files_of_a_person(tmp_path):
+    body = small_people().subject(np.zeros(4))
+    poses = np.random.default_rng(7).normal(0, 0.2, (5, 16, 3))
+    motion = Motion(poses, np.ones((5, 3)), None, 50.0, np.zeros((5, 0)))
+    write_motion(tmp_path, motion, body)
+    centres, points = joint_centres(motion, body), read_markers(tmp_path / "motion.trc")
+    text = (tmp_path / "motion.mot").read_text()
+    names, *rows = [line.split("\t") for line in text.split("endheader\n")[1].splitlines()]
+    told = dict(zip(names, np.array(rows, float).T, strict=True))
+    assert "nan" not in text.lower() and len(told) == 55
+    hips = [points.positions[:, points.labels.index(f"hip_{side}_joint")] for side in "lr"]
+    pelvis = np.stack([told[f"pelvis_t{axis}"] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(pelvis, np.mean(hips, axis=0), atol=1e-6)
+    here, there = (p[:, :, None] - p[:, None] for p in (centres[:, 1:], points.positions))      # turned, not bent
+    np.testing.assert_allclose(np.linalg.norm(there, axis=3), np.linalg.norm(here, axis=3), atol=1e-6)
+    height = dict(zip(points.labels, points.positions[..., 1].mean(axis=0), strict=True))
+    assert height["head_joint"] > height["hip_r_joint"] + 0.4 > height["ankle_l_joint"] + 1
+
+
 def storage_file(path):
     names = ("pelvis_tilt", "pelvis_list", "pelvis_rotation", "hip_flexion_r")
-    told = JointAngles(names, np.arange(12.0).reshape(3, 4), 0.1 * np.ones((3, 3)), np.eye(3))
-    write_mot(path, told, 50.0, ["knee_r"])
+    told = JointAngles(names, np.arange(12.0).reshape(3, 4), 0.1 * np.ones((3, 3)), np.eye(3), ("knee_r",))
+    write_mot(path, told, 50.0)
     return path
 
 

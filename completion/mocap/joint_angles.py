@@ -61,7 +61,6 @@ class Anatomy:
     parts: dict[str, int]
     frames: dict[str, np.ndarray]
     hips: tuple[int, ...]            # joints, of which the pelvis has its place
-    roles: dict[str, int]
 
     def joints(self) -> list[Joint]:
         """The joints whose two segments are there."""
@@ -73,25 +72,24 @@ class Anatomy:
                   for side in "rl" for (a, b, c), (proximal, distal, sequence, signs) in _SIDED.items()]
         return [joint for joint in found if {joint.proximal, joint.distal} <= known]
 
-    def missing(self) -> list[str]:
+    def missing(self) -> tuple[str, ...]:
         """Joints that people have and this body's parts do not, such as "knee_r"."""
         known = {joint.distal for joint in self.joints()}
         wanted = ["trunk", "head", *(f"{name}_{side}" for side in "rl" for name in _LIMBS)]
         joint = {"trunk": "lumbar", "head": "neck"}
         joint |= {f"{name}_{side}": f"{ends[0]}_{side}" for side in "rl" for name, ends in _LIMBS.items()}
-        return [joint[name] for name in wanted if name not in known]
+        return tuple(joint[name] for name in wanted if name not in known)
 
 
 @dataclass(frozen=True, eq=False)
 class JointAngles:
-    """Angles (T, K), degrees, by name, and where the middle of the hips is (T, 3), metres, both in the ground's axes:
-    columns of `ground` (3, 3) are its x, y (up) and z in the axes of the motion.
-    """
+    """The joint angles of a motion, and where the pelvis is, in the axes of the ground."""
 
     names: tuple[str, ...]
-    degrees: np.ndarray
-    pelvis: np.ndarray
-    ground: np.ndarray
+    degrees: np.ndarray              # (T, K)
+    pelvis: np.ndarray               # (T, 3) metres, the middle of the hips
+    ground: np.ndarray               # (3, 3) columns: its x, y (up) and z in the axes of the motion
+    missing: tuple[str, ...]         # joints that people have and this body's parts do not
 
 
 def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> Anatomy:
@@ -119,7 +117,7 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
     frames = dict.fromkeys(parts, body)
     for side in "rl":
         _limbs(side, roles, joints, body, parts, frames)
-    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles), roles)
+    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
 
 
 def _body_axes(right: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -183,7 +181,8 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray) -> 
     ground = ground_axes(found.axes, R[:, found.parts["pelvis"]])
     degrees = angles_of(found, ground, R)
     pelvis = centres[:, list(found.hips or (found.parts["pelvis"],))].mean(axis=1) @ ground
-    return JointAngles(tuple(name for joint in found.joints() for name in joint.angles), degrees, pelvis, ground)
+    names = tuple(name for joint in found.joints() for name in joint.angles)
+    return JointAngles(names, degrees, pelvis, ground, found.missing())
 
 
 def rest_joints(subject: Subject) -> np.ndarray:

@@ -17,7 +17,7 @@ from scanprep.pictures.camera import stance
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion
-from ..joint_angles import JointAngles, anatomical_angles, anatomy, ground_axes, rest_joints
+from ..joint_angles import JointAngles, anatomical_angles, ground_axes
 from .markers import MarkerSequence, write_markers
 
 _AXES = "+x", "+y", "+z", "-x", "-y", "-z"
@@ -27,21 +27,17 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
                   markers: MarkerSequence | None = None) -> None:
     """motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot if the body is a person's."""
     points = centre_sequence(centres, subject.skeleton, motion.rate)
-    skeleton, joints = subject.skeleton, rest_joints(subject)
-    R = skeleton.part_rotations(motion.poses)
     try:
-        found = anatomy(skeleton.names, skeleton.parents, joints)
+        angles = anatomical_angles(motion, subject, centres)
     except ValueError as error:
         say(f"motion.mot is not written: {error}")
-        up, ahead = stance(subject.template, R[:, 0])
+        up, ahead = stance(subject.template, subject.skeleton.part_rotations(motion.poses)[:, 0])
         ground = ground_axes(np.stack([ahead, up, np.cross(ahead, up)], axis=1), np.eye(3)[None])
     else:
-        angles = anatomical_angles(motion, subject, centres)
         ground = angles.ground
-        missing = found.missing()
-        if missing:
-            say(f"motion.mot has no angles of {', '.join(missing)}, for which this body has no parts")
-        write_mot(folder / "motion.mot", angles, motion.rate, missing)
+        if angles.missing:
+            say(f"motion.mot has no angles of {', '.join(angles.missing)}, for which this body has no parts")
+        write_mot(folder / "motion.mot", angles, motion.rate)
     every = points if markers is None else joined(markers, points)
     write_markers(folder / "motion.trc", MarkerSequence(every.positions @ ground, every.labels, every.rate))
 
@@ -79,7 +75,7 @@ def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
                  for j, label in enumerate(taken, start=1))
 
 
-def write_mot(path: str | Path, angles: JointAngles, rate: float, missing: list[str]) -> None:
+def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
     """Joint angles in degrees, and the middle of the hips in metres, as a motion file (Storage) of OpenSim."""
     table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :3], angles.pelvis, angles.degrees[:, 3:]]
     names = ("time", *angles.names[:3], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[3:])
@@ -87,7 +83,7 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float, missing: list[
     lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
              "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
              f"Axes x, y, z are {', '.join(axes)} of the recording.",
-             *([f"No parts for: {', '.join(missing)}."] if missing else []), "", "endheader", "\t".join(names)]
-    lines += ["\t".join(f"{value:.8g}" for value in row) for row in table.tolist()]
+             *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []), "", "endheader"]
+    lines += ["\t".join(names), *("\t".join(f"{value:.8g}" for value in row) for row in table.tolist())]
     with storage.writing(Path(path)) as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
