@@ -18,7 +18,8 @@ from scanprep.pictures.camera import upright
 
 FRAMES = 30
 BETAS = np.array([0.9, -0.6, 0.4])
-WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "residuals.csv",
+WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "motion.trc",
+           "joint_angles.csv", "joint_centres.csv", "residuals.csv",
            "report.html"}
 
 

@@ -20,7 +20,8 @@ from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import upright
 
 PERSON = {"subject.json", "layout.json", "report.html", "report.json", "picture.png"}
-TAKE = {"motion.npz", "soft_tissue.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv",
+TAKE = {"motion.npz", "soft_tissue.npz", "animation.glb", "motion.bvh", "motion.trc",
+        "joint_angles.csv", "joint_centres.csv",
         "residuals.csv", "residuals_soft.csv", "virtual.c3d", "artefacts.json", "artefacts.csv", "report.html",
         "report.json", "picture.png"}
 

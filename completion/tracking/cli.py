@@ -42,8 +42,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     Args:
         frames: Folder of meshes or point clouds, one for each frame; or with one such folder for each camera, all
             cameras in one frame of reference.
-        output: Folder to write motion.npz, animation.glb, motion.bvh, joint_angles.csv, joint_centres.csv,
-            residuals.csv and report.html to.
+        output: Folder to write motion.npz, animation.glb, motion.bvh, motion.trc, motion.mot, joint_angles.csv,
+            joint_centres.csv, residuals.csv and report.html to.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         rate: Frames per second.
         cameras: How files of several cameras in one folder are named, such as "cam{camera}_{frame}.ply".

@@ -47,8 +47,9 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     legs are, and the report says how far joint centres and segments are off. scape animate walk.bvh -m model.npz -o out
 
     Written are motion.npz (poses, trans, betas, rate), animation.glb, motion.bvh, joint_angles.csv (rotation vectors
-    of every part against its parent, in degrees), joint_centres.csv (metres), residuals.csv and report.html; of a
-    subject that was found also subject.json and layout.json, with loose markers where they are on this person.
+    of every part against its parent, in degrees), joint_centres.csv (metres), residuals.csv, for OpenSim motion.trc
+    (markers, joint centres) and motion.mot (ISB joint angles), and report.html; of a subject that was found also
+    subject.json and layout.json, with loose markers where they are on this person.
 
     Args:
         markers: C3D, TRC or CSV of markers, BVH or .npz of a motion, or a folder of these.

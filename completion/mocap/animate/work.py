@@ -31,6 +31,7 @@ from ...motion_pictures import (
 )
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion
+from ..files.opensim import believed
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
@@ -97,7 +98,7 @@ class Work:
         problem = motion_problem(motion, body.template, layout, sequence)
         judgement = Judgement.of(problem, (*worn.doubts(), *hardly_seen([motion]), *hardly_believed([motion])))
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
-        write_motion(output, motion, body)
+        write_motion(output, motion, body, believed(motion, sequence))
         metrics += write_glb(output / "animation.glb", motion, body)
         return metrics, motion, body, motion_page(motion, body, sequence, path.name, rows(metrics))
 

@@ -18,6 +18,8 @@ from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
+from .markers import MarkerSequence
+from .opensim import write_opensim
 
 KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
 MEASURED = 40                        # frames in which it is compared with the exact bodies
@@ -47,15 +49,19 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     return operator.evaluate(motion.poses, motion.trans)
 
 
-def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
-    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; times in seconds."""
-    names, T = subject.skeleton.names, len(motion.poses)
+def write_motion(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None) -> None:
+    """motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; seconds.
+
+    `markers`, of as many frames, go into the TRC.
+    """
+    names, T, centres = subject.skeleton.names, len(motion.poses), joint_centres(motion, subject)
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_table(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
                 np.c_[motion.times, joint_angles(motion).reshape(T, -1)])
     write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, joint_centres(motion, subject).reshape(T, -1)])
+                np.c_[motion.times, centres.reshape(T, -1)])
+    write_opensim(folder, motion, subject, centres, markers)
     if motion.labels:
         write_residuals(folder / "residuals.csv", motion)
 

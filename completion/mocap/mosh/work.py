@@ -24,7 +24,8 @@ from ...motion import spread_frames
 from ...motion_pictures import picture_bodies
 from ..artefacts.results import MarkerArtefacts, artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import write_glb, write_motion, write_residuals
+from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
+from ..files.opensim import centre_sequence
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
@@ -199,7 +200,7 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
     Returned is how far the GLB files are from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    write_motion(folder, motion, body)
+    write_motion(folder, motion, body, take.artefacts.virtual())
     told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
@@ -209,7 +210,8 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
                               partial(soft.vertices, take.model, factor=factor))
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
-                  take.source.who, take.unit)
+                  take.source.who, take.unit,
+                  centre_sequence(joint_centres(motion, body), body.skeleton, motion.rate))
     _write_artefacts(folder, take.artefacts)
     return told
 
