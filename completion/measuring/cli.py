@@ -23,7 +23,7 @@ from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
 
 from ..cli import ModelOrNone, read_model
-from .bodies import Body, landmarks_of, model_of, read_bodies
+from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
 from .page import measures_page
 
 BodiesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[BODY ...]")]
@@ -42,8 +42,8 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
             complete and mosh, or betas of a model (JSON, .npz).
         output: Table to write (.csv), in metres, one line a body; beside it a page of the same name (.html) with the
             tapes on the bodies. With --to the mesh of the body; its betas are written beside it, for --subject.
-        model: Model of the bodies: each is brought into the pose of its template first. Without it they are measured
-            as they stand.
+        model: Model of the bodies: each is brought into the pose of its template first; else the one that their report
+            names. Without any they are measured as they stand, and the first, or that of the set, is the template.
         landmarks: Where the landmarks are on the template, else those that the model keeps, or of the file beside the
             bodies.
         unit: Unit of meshes.
@@ -62,6 +62,8 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     loaded = None if named is None else load_model(named)
     read = read_bodies(bodies, loaded, unit)
     tapes = find_tapes(*landmarks_of(landmarks, read, loaded))
+    if loaded is None:
+        check_standing(tapes, read[0])
     found, stood = list[Measurements](), list[np.ndarray]()
     with bar("measuring") as progress:
         for number, body in enumerate(read):
