@@ -101,7 +101,7 @@ class _Finder:
         """Of one leg, from above."""
         p, knee, heel = self.places, (f"{side} knee", f"{side} knee inside"), f"{side} heel"
         yield f"thigh_girth_{side}", lambda: self.keep(f"thigh_girth_{side}", self.level(
-            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - BELOW_CROTCH * self.scale), None)
+            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - BELOW_CROTCH * self.scale), None, BAND)
         yield f"knee_girth_{side}", lambda: self.across(f"knee_girth_{side}", self.shin(side), 0.0)
         yield f"calf_girth_{side}", lambda: self.widest(f"calf_girth_{side}", lambda t: self.along(
             p.at(*knee), p.at(heel), 0.12 + 0.4 * t), self.shin(side))
@@ -161,8 +161,10 @@ class _Finder:
             ring = self.loop(centre.at(self.mesh.vertices), normal)
             centre = ring.centroid(self.mesh.vertices)
         far, _ = self.graph.nearest(np.unique(ring.edges))
-        near = self.mesh.faces[((far <= band * self.scale) & ~(under_arms & self.arms))[self.mesh.faces].all(axis=1)]
-        self.done[name] = Girth(centre, axis, near, ring, under_arms)
+        near = (far <= band * self.scale)[self.mesh.faces].any(axis=1)
+        if under_arms:
+            near &= ~self.arms[self.mesh.faces].any(axis=1)
+        self.done[name] = Girth(centre, axis, self.mesh.faces[near], ring, under_arms)
         return self.done[name]
 
     @cached_property
