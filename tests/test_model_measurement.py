@@ -201,7 +201,7 @@ def test_what_a_template_lacks_is_told(person):
     found = find_tapes(person.mesh, few)
     assert found.missing["chest_girth"] == "the template has no landmark 'left nipple and right nipple'"
     assert "waist_girth" in found.found and "chest_width" in found.missing
-    with pytest.raises(ValueError, match=r"expected at least top of head, .*; there is no left toe"):
+    with pytest.raises(ValueError, match=r"expected at least left toe, .*; there is no left toe"):
         find_tapes(person.mesh, {name: v for name, v in landmarks().items() if name != "left toe"})
 
 

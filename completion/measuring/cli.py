@@ -12,7 +12,8 @@ from model.body import BodyModel
 from model.files import load_model
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.find import find_tapes
-from model.measurement.measure import Measurements, measure
+from model.measurement.measure import Measurements, measure, stands
+from model.measurement.tapes import Tapes
 from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
 from model.posing.transfer import own_body
 from scanprep.cli import MM, Output, Unit
@@ -42,8 +43,8 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
             complete and mosh, or betas of a model (JSON, .npz).
         output: Table to write (.csv), in metres, one line a body; beside it a page of the same name (.html) with the
             tapes on the bodies. With --to the mesh of the body; its betas are written beside it, for --subject.
-        model: Model of the bodies: each is brought into the pose of its template first; else the one that their report
-            names. Without any they are measured as they stand, and the first, or that of the set, is the template.
+        model: Model of the bodies, else the one that their report names: who does not stand as its template does is
+            brought into that pose first. Without any the template is that of the set, else the first body.
         landmarks: Where the landmarks are on the template, else those that the model keeps, or of the file beside the
             bodies.
         unit: Unit of meshes.
@@ -67,9 +68,9 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     found, stood = list[Measurements](), list[np.ndarray]()
     with bar("measuring") as progress:
         for number, body in enumerate(read):
-            vertices = _standing(body, loaded)
+            vertices, axes = _standing(body, loaded, tapes)
             stood.append(vertices)
-            found.append(measure(vertices, tapes, None if loaded is None else tapes.axes, body.expected_error))
+            found.append(measure(vertices, tapes, axes, body.expected_error))
             progress(number + 1, len(read))
     names = [body.name for body in read]
     write_measures(output, names, found)
@@ -78,11 +79,16 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
                    judgement=judged(names, found))
 
 
-def _standing(body: Body, model: BodyModel | None) -> np.ndarray:
-    """The vertices (N, 3) of a body in the standard pose, with all its detail; as it is where there is no model."""
-    if model is None or body.betas:
-        return body.mesh.vertices
-    return own_body(model, body.mesh.vertices).subject.vertices(np.zeros((len(model.skeleton.parents), 3)))
+def _standing(body: Body, model: BodyModel | None, tapes: Tapes) -> tuple[np.ndarray, np.ndarray | None]:
+    """The vertices (N, 3) of a body in the standard pose, with all its detail, and the axes it then has.
+
+    It is as it was, its axes to be found, where it stands so already, or there is no model.
+    """
+    vertices = body.mesh.vertices
+    if body.betas or model is None or stands(vertices, tapes):
+        return vertices, tapes.axes if body.betas else None
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    return own_body(model, vertices).subject.vertices(rest), tapes.axes
 
 
 def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurements]) -> None:

@@ -39,8 +39,8 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     ----------
     template : Mesh
     landmarks : name to vertex
-        Under the names of the synthetic people, the SCAPE meshes or CAESAR. Crown, toes and heels are needed;
-        what begins at another landmark is left out where there is none.
+        Under the names of the synthetic people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
+        head or neck; what begins at another landmark is left out where there is none.
 
     Raises
     ------
@@ -77,8 +77,9 @@ class _Finder:
         yield "stature", lambda: Height(None)
         yield "neck_height", lambda: Height(self.point("neck back"))
         yield "shoulder_height", lambda: Height(self.point("left shoulder", "right shoulder"))
+        crown = self.floor + self.stature
         yield "head_girth", lambda: self.widest("head_girth", lambda t: self.level(
-            p.at("top of head"), self.floor + self.stature - (0.045 + 0.045 * t) * STATURE * self.scale))
+            p.at("top of head", "left ear", "right ear"), crown - (0.045 + 0.045 * t) * self.stature))
         yield "neck_girth", self.neck
         yield "chest_girth", lambda: self.trunk("chest_girth", p.height("left nipple", "right nipple"))
         yield "under_bust_girth", lambda: self.trunk(
