@@ -16,6 +16,7 @@ from scanprep.pictures.shading import Bones, Dots, Shape, Solid
 
 SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies that turn on the page, columns of its table; and in one figure
 SKIN, TAPE, WAY, HEIGHT = (0.86, 0.83, 0.79), (0.80, 0.20, 0.16), (0.10, 0.38, 0.66), (0.25, 0.30, 0.38)
+NO_BREAK = "\u00a0"
 THICK = 0.003                        # metres
 BESIDE = 0.045                       # metres between the lines of heights
 
@@ -58,7 +59,7 @@ def _pairs() -> list[tuple[str, ...]]:
 
 def _words(both: tuple[str, ...]) -> str:
     """As a table has it."""
-    return both[0].replace("_left", ", left / right").replace("_", " ")
+    return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", NO_BREAK)
 
 
 def _cell(mine: Measurements, both: tuple[str, ...]) -> str:

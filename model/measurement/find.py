@@ -165,7 +165,8 @@ class _Finder:
         near = (far <= band * self.scale)[self.mesh.faces].any(axis=1)
         if under_arms:
             near &= ~self.arms[self.mesh.faces].any(axis=1)
-        self.done[name] = Girth(centre, axis, self.mesh.faces[near], ring, under_arms)
+        aside = 1 if "upper_arm" in name else -1 if "thigh" in name else 0
+        self.done[name] = Girth(centre, axis, self.mesh.faces[near], ring, under_arms, aside)
         return self.done[name]
 
     @cached_property
