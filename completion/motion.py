@@ -9,6 +9,7 @@ import numpy as np
 
 from model.linear import Subject
 from model.motion.files import StoredMotion, check_ours, read_motion_file
+from model.motion.onto import BodyMotion
 from scanprep.geometry import storage
 
 SURFACE_MODEL = "scape"
@@ -96,6 +97,13 @@ class Motion:
             "marker_trusted": self.trusted, **more}
         with storage.writing(path) as beside, open(beside, "wb") as out:
             np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+
+    @staticmethod
+    def of(found: BodyMotion) -> Motion:
+        """A motion that came from no markers."""
+        none = np.zeros((len(found.poses), 0))
+        return Motion(found.poses, found.trans, found.betas, found.rate, none, gender=found.gender,
+                      trusted=none.astype(bool))
 
     @staticmethod
     def load(path: str | Path) -> Motion:

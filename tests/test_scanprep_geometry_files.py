@@ -21,6 +21,7 @@ from scanprep.geometry.files import (
     write_mesh,
     write_points,
 )
+from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
 
 TETRAHEDRON = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -105,11 +106,27 @@ def test_we_read_what_trimesh_writes_and_others_read_ours(tmp_path, suffix):
     np.testing.assert_allclose(read_mesh(tmp_path / f"a{suffix}").corners, mesh.corners, atol=1e-6)
     write_mesh(tmp_path / f"b{suffix}", mesh)
     theirs = trimesh.load(tmp_path / f"b{suffix}", force="mesh", process=False)
-    np.testing.assert_allclose(theirs.vertices[theirs.faces], mesh.corners, atol=1e-6)
+    shown = mesh.corners @ turn_up(tallest(mesh.vertices)).T if suffix == ".glb" else mesh.corners
+    np.testing.assert_allclose(theirs.vertices[theirs.faces], shown, atol=1e-6)
     if suffix != ".glb":
         write_mesh(tmp_path / f"b{suffix}", Mesh(mesh.vertices, mesh.faces))        # it expects no colours
         v, f = igl.read_triangle_mesh(str(tmp_path / f"b{suffix}"))
         np.testing.assert_allclose(v[f], mesh.corners, atol=1e-6)
+
+
+@pytest.mark.parametrize("up", [0, 1, 2])
+def test_glb_has_y_up_and_comes_back_as_it_was(tmp_path, up):
+    mesh = Mesh(np.float32(np.roll([1.7, 0.3, 0.5], up) * np.random.default_rng(up).uniform(0, 1, (60, 3))),
+                np.arange(60).reshape(20, 3), np.tile([0.2, 0.5, 0.7], (60, 1)))
+    write_mesh(tmp_path / "a.glb", mesh)
+    shown = trimesh.load(tmp_path / "a.glb", force="mesh", process=False).vertices
+    assert np.ptp(shown, axis=0).argmax() == 1 and np.array_equal(shown, np.float32(mesh.vertices @ turn_up(up).T))
+    again = read_mesh(tmp_path / "a.glb", "m")
+    assert np.array_equal(again.vertices, mesh.vertices) and np.array_equal(again.faces, mesh.faces)
+    assert np.allclose(again.colors, mesh.colors, atol=1e-6)
+    data = (tmp_path / "a.glb").read_bytes()                # from elsewhere, or from before there was a mark
+    (tmp_path / "b.glb").write_bytes(data.replace(b'"up"', b'"xx"'))
+    assert np.array_equal(read_mesh(tmp_path / "b.glb", "m").vertices, shown)
 
 
 def test_glb_places_every_mesh_by_its_node(tmp_path):

@@ -15,7 +15,7 @@ from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.judgement import Judgement
-from scanprep.ranges import Count, Positive
+from scanprep.ranges import Positive
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
 from ..motion import Motion
@@ -29,7 +29,7 @@ FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES"
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
-                 keys: Count = 120, config: TrackConfig = TrackConfig(),  # noqa: B008
+                 config: TrackConfig = TrackConfig(),  # noqa: B008
                  *, space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 
@@ -53,7 +53,6 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
         unit: Unit of the frames and landmarks.
         surfaces: Write the completed surface of every frame to surfaces/.
-        keys: Largest number of key frames in the GLB.
         config: Settings.
     """
     from ..mocap.files.motion_files import write_glb, write_motion
@@ -79,9 +78,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         _page(folder, motion, person, found, frames.name, metrics)
 
     of_motion = done.key, config.smoothing
+    metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, rows(metrics), frames.name), write)
-    space.step("animation", (of_motion, keys),
-               lambda folder: write_glb(folder / "animation.glb", motion, person, keys=keys))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
                    Judgement.of(tracking_problem(motion)))
 

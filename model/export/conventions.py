@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sides import side_of
-from scanprep.pictures.camera import stance
+from scanprep.pictures.camera import stance, upright
 
 from .bvh import part_ends
 from .names import Names, renamed
@@ -91,6 +92,19 @@ def placed(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool
         step = -min(float(rig.vertices(poses[some], trans[some])[..., up].min())
                     for some in np.array_split(chosen, -(-len(chosen) // _SOME))) * vertical
     return carried(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
+
+
+def standing(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool, turned: np.ndarray | None = None
+             ) -> Mesh:
+    """A mesh with its lowest point at height 0, and its face to the viewer: -y where z is up, else +z.
+
+    What is up, without `up` (0, 1 or 2), and front is told by the same body at rest, whose root is `turned` (3, 3).
+    """
+    up = upright(rest)[0] if up is None else up
+    points = body.vertices
+    if front:
+        points = points @ to_viewer(*stance(rest, turned, np.eye(3)[up]), up).T
+    return body.with_vertices(points - ground * points[:, up].min() * np.eye(3)[up])
 
 
 def to_viewer(vertical: np.ndarray, ahead: np.ndarray, up: int) -> np.ndarray:

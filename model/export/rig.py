@@ -6,16 +6,34 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from scanprep.geometry import rotations
+from scanprep.geometry.format_glb import turn_up
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.gltf import UPRIGHT
 from scanprep.ranges import TURNS
 from scanprep.skeleton.tree import Skeleton, reorder
 
 from ..blend_weights import CARRIERS, skin_weights, strongest
 from ..body import BodyModel
+from ..linear import Subject
 from ..skinning import SkinningModel
 
 SLIDER = 3.0                         # standard deviations that a morph target of a beta reaches at weight 1
+
+
+@dataclass(frozen=True, eq=False)
+class Correctives:
+    """What skinning lacks in one motion: changes of the rest mesh, and how much of each there is over time.
+
+    Between the frames of the weights they go straight from one to the next, as in the files.
+    """
+
+    shapes: np.ndarray               # (C, N, 3) metres, at weight 1
+    weights: np.ndarray              # (n, C), from 0 to 1
+    frames: np.ndarray               # (n,) int, increasing: the frames of the motion that have these weights
+
+    def changes(self, frames: np.ndarray) -> np.ndarray:
+        """The changes (..., N, 3) of the rest mesh in some frames (...) of the motion, metres."""
+        weights = np.stack([np.interp(frames, self.frames, w) for w in self.weights.T], axis=-1)
+        return np.tensordot(weights, self.shapes, axes=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +51,7 @@ class Rig:
     shapes: np.ndarray               # (K, N, 3) metres, change of the rest mesh for one standard deviation of each beta
     # (J, 3, 3): columns are the axes of each bone at rest, in the world; y along the bone where they are `aimed`
     axes: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    correctives: Correctives | None = None          # of the one motion that the rig is written with
 
     def __post_init__(self) -> None:
         N, J = len(self.mesh.vertices), len(self.skeleton.parents)
@@ -88,8 +107,10 @@ class Rig:
 
     def moved(self, R: np.ndarray, shift: np.ndarray | float = 0.0) -> Rig:
         """The same body turned by R (3, 3) and then shifted, metres; see `carried` for its poses and places."""
+        extra = self.correctives and replace(self.correctives, shapes=self.correctives.shapes @ R.T)
         return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices @ R.T + shift), shapes=self.shapes @ R.T,
-                       skeleton=replace(self.skeleton, joints=self.skeleton.joints @ R.T + shift), axes=R @ self.axes)
+                       skeleton=replace(self.skeleton, joints=self.skeleton.joints @ R.T + shift), axes=R @ self.axes,
+                       correctives=extra)
 
     def turned(self, up: int) -> Rig:
         """The same body with the axis `up` turned to +y; poses and trans turn with `turn_up`."""
@@ -118,14 +139,22 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     if shapes and betas is None:
         raise ValueError(f"shapes: the template's own body has none, got {shapes}")
     rest = np.zeros((len(model.skeleton.parents), 3))
-    mesh = model.template.with_vertices(model.vertices(rest, betas))
-    joints = model.skeleton.joint_regressor(model.template) @ mesh.vertices
-    if weights is None:
-        weights = model.weights if isinstance(model, SkinningModel) else skin_weights(model.template, model.skeleton)
-    changes = np.zeros((0, *mesh.vertices.shape))
-    if shapes:
-        changes = np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)
-    return Rig(mesh, replace(model.skeleton, joints=joints), strongest(weights), changes)
+    if weights is None and isinstance(model, SkinningModel):
+        weights = model.weights
+    rig = subject_rig(model, model.vertices(rest, betas), weights)
+    return replace(rig, shapes=np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)) if shapes else rig
+
+
+def subject_rig(body: BodyModel | Subject, rest: np.ndarray | None = None, weights: np.ndarray | None = None) -> Rig:
+    """The rig, without shapes, of a subject, or of a model with these vertices (N, 3) at rest; as `make_rig`."""
+    skeleton, template = body.skeleton, body.template
+    if rest is None:
+        assert isinstance(body, Subject), "a model has many bodies"
+        rest = body.vertices(np.zeros((len(skeleton.parents), 3)))
+    joints = skeleton.joint_regressor(template) @ rest
+    weights = skin_weights(template, skeleton) if weights is None else weights
+    return Rig(template.with_vertices(rest), replace(skeleton, joints=joints), strongest(weights),
+               np.zeros((0, *rest.shape)))
 
 
 def rerooted(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tuple[Rig, np.ndarray, np.ndarray]:
@@ -209,14 +238,3 @@ def check_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None
     if not (np.isfinite(rate) and rate > 0):
         raise ValueError(f"rate: expected a positive number of frames a second, got {rate}")
     return poses, trans
-
-
-def turn_up(up: int) -> np.ndarray:
-    """The rotation (3, 3) that brings an axis to +y; points, poses and trans turn as `x @ turn_up(up).T`.
-
-    A rotation vector turns like a point because the axes of all parts are those of the world at rest.
-    """
-    if up not in UPRIGHT:
-        raise ValueError(f"up: expected 0, 1 or 2, got {up}")
-    axis = np.array(UPRIGHT[up][:3])
-    return rotations.exp(axis / max(float(np.linalg.norm(axis)), 1e-12) * (0 if up == 1 else np.pi / 2)).round()

@@ -5,8 +5,11 @@ model that was imported from one of these is copied; for all others the rest is 
 """
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from scanprep.geometry.storage import writing
 from scanprep.skeleton.tree import Skeleton
 
 from ..export.rig import turn_up
@@ -66,3 +69,21 @@ def with_joints(poses: np.ndarray, count: int) -> np.ndarray:
     if min(J, count) >= BODY + FINGERS:
         out[:, -FINGERS:] = poses[:, -FINGERS:]
     return out
+
+
+def write_amass(path: str | Path, poses: np.ndarray, trans: np.ndarray, betas: np.ndarray | None, rate: float,
+                gender: str, family: str) -> None:
+    """Write a motion of a model of the family, poses (T, J, 3) of 24, 52 or 55 joints, under the names of AMASS."""
+    T, J = poses.shape[:2]
+    if J not in (24, 52, 55):
+        raise ValueError(f"poses: expected 24, 52 or 55 joints of a model of the SMPL family, got {J}")
+    flat = poses.reshape(T, -1)
+    arrays = {"poses": flat, "root_orient": flat[:, :3], "pose_body": flat[:, 3:3 * BODY], "trans": trans,
+              "betas": np.zeros(0) if betas is None else betas, "gender": np.array(gender),
+              "mocap_frame_rate": np.array(float(rate)), "surface_model_type": np.array(family)}
+    if J > 24:
+        arrays["pose_hand"] = flat[:, -3 * FINGERS:]
+    if J == 55:
+        arrays |= {"pose_jaw": flat[:, 66:69], "pose_eye": flat[:, 69:75]}
+    with writing(path) as beside, open(beside, "wb") as out:
+        np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]

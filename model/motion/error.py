@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..linear import PointOperator, Subject
+from scanprep.geometry import rotations
+
 from .retarget import Pairing
 
 # Segments from the hips outwards; "hips" and "shoulders" are the middle between both sides.
@@ -24,6 +25,7 @@ class Followed:
     angles: np.ndarray               # (T, S) degrees between the segments of the body and of the motion
     distances: np.ndarray            # (T, S) metres, of the joint centres at their ends, where bones are as ours
     wanted: np.ndarray               # (T, S, 3) metres, where those would be
+    apart: float                     # degrees, the most that a segment of the trunk points elsewhere at rest
 
     @property
     def angle(self) -> float:
@@ -36,33 +38,44 @@ class Followed:
         return float(self.distances.mean())
 
 
-def joint_centres(subject: Subject, poses: np.ndarray, trans: np.ndarray) -> np.ndarray:
-    """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    regressor = subject.skeleton.joint_regressor(subject.template)
-    M, N, _ = subject.basis.shape
-    basis = (regressor @ subject.basis.transpose(1, 0, 2).reshape(N, -1)).reshape(-1, M, 3).transpose(1, 0, 2)
-    return PointOperator(subject.terms, basis.astype(np.float64), subject.origin).evaluate(poses, trans)
-
-
-def followed(pair: Pairing, centres: np.ndarray) -> Followed:
-    """The error of a body whose joints are at centres (T, J, 3), metres, against the motion of the pair.
+def followed(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
+    """The error of a body in poses (T, J, 3), with its joints at centres (T, J, 3), against the motion of the pair.
 
     Bones differ in length, so the joints of the motion are set out anew from the middle of the hips: in the directions
-    of its segments, as far apart as ours are at rest.
+    of its segments, as far apart as ours are at rest. Hips, shoulders and head are not at the same places in two
+    trunks: by how much a segment of the trunk points elsewhere at rest is allowed for, and told.
     """
-    there = _nodes(pair.moving.places @ pair.world(False).T, pair.theirs)
-    here, rest = _nodes(centres, pair.ours), _nodes(pair.skeleton.joints, pair.ours)
+    V, R = pair.world(False), pair.skeleton.part_rotations(poses)
+    there, here = _nodes(pair.moving.places @ V.T, pair.theirs), _nodes(centres, pair.ours)
+    their_rest = _nodes(pair.moving.rest @ V.T, pair.theirs)
+    rest = _nodes(pair.skeleton.joints, pair.ours)
+    frames = {"hips": R[:, pair.ours["humanoid_root"]], "shoulders": R[:, pair.middle()[0][-1]]}
     ends = [(a, b) for a, b in _ENDS if {a, b} <= there.keys() & here.keys()]
-    wanted, angles = {"hips": here["hips"]}, []
+    wanted, angles, apart = {"hips": here["hips"]}, [], []
     for a, b in ends:
-        theirs, ours = there[b] - there[a], here[b] - here[a]
-        size = np.linalg.norm(theirs, axis=1, keepdims=True)
-        wanted[b] = wanted[a] + np.linalg.norm(rest[b] - rest[a]) * theirs / np.maximum(size, 1e-12)
-        sine = np.linalg.norm(np.cross(theirs, ours), axis=1)
-        angles.append(np.degrees(np.arctan2(sine, (theirs * ours).sum(axis=1))))
+        theirs, bone = there[b] - there[a], rest[b] - rest[a]
+        if a in frames:
+            C = _between(their_rest[b] - their_rest[a], bone)
+            theirs = np.einsum("tab,bc,tdc,td->ta", frames[a], C, frames[a], theirs)
+            apart.append(float(np.degrees(np.linalg.norm(rotations.log(C)))))
+        still = np.linalg.norm(their_rest[b] - their_rest[a])              # a trunk that bends is shorter
+        wanted[b] = wanted[a] + np.linalg.norm(bone) / max(float(still), 1e-12) * theirs
+        angles.append(_angles(theirs, here[b] - here[a]))
     places = np.stack([wanted[b] for _, b in ends], axis=1)
     off = np.linalg.norm(np.stack([here[b] for _, b in ends], axis=1) - places, axis=2)
-    return Followed(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places)
+    return Followed(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places, max(apart))
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(T,) degrees between directions (T, 3)."""
+    return np.asarray(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))))
+
+
+def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest rotation (3, 3) that brings one direction (3,) to another; none where one has no length."""
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    return rotations.exp(np.arctan2(sine, cosine) * axis / sine) if sine > 1e-9 else np.eye(3)
 
 
 def _nodes(joints: np.ndarray, roles: dict[str, int]) -> dict[str, np.ndarray]:

@@ -1,22 +1,21 @@
 """A motion of any file on a model: its own as it is, those of other skeletons brought onto it."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from scanprep.geometry.storage import StorageError
-from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
 from ..linear import Subject
-from .amass import UNCERTAIN, moving_body, with_joints
+from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
-from .error import Followed, followed, joint_centres
+from .error import Followed, followed
 from .files import StoredMotion, betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
-from .retarget import Pairing, Retargeted, copied, retargeted
+from .retarget import AT_ONCE, Pairing, Retargeted, copied, retargeted
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +63,9 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
     if stored.of_family and (stored.made_for or stored.poses.shape[1] != J or family):
         if family:
             return _of_family(path, stored, model, subject)
+        if stored.poses.shape[1] < BODY:
+            raise StorageError(f"{path}: expected at least the {BODY} joints of the body, "
+                               f"found {stored.poses.shape[1]}")
         return _onto(path, moving_body(stored)[0], subject or _mean_person(model), UNCERTAIN, stored.gender)
     check_ours(path, stored)
     if stored.poses.shape[1] != J:
@@ -84,10 +86,12 @@ def _of_family(path: Path, stored: StoredMotion, model: BodyModel, subject: Subj
                       stored.gender, "pose by pose, of the same family")
 
 
-def _onto(path: Path, moving: MovingSkeleton, subject: Subject, rest: str, gender: str = "neutral") -> BodyMotion:
-    at_rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    skeleton = Skeleton(subject.skeleton.part_of_face, subject.skeleton.parents,
-                        subject.skeleton.joint_regressor(subject.template) @ at_rest, subject.skeleton.names)
+def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, gender: str = "neutral"
+          ) -> BodyMotion:
+    """A motion of another skeleton on a body."""
+    regressor = subject.skeleton.joint_regressor(subject.template)
+    rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
+    skeleton = replace(subject.skeleton, joints=regressor @ rest)
     same = copied(skeleton, subject.template, subject.vertices, moving)
     if same is not None:
         return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,
@@ -97,6 +101,9 @@ def _onto(path: Path, moving: MovingSkeleton, subject: Subject, rest: str, gende
         found = retargeted(pair)
     except ValueError as problem:
         raise StorageError(f"{path}: {problem}") from None
-    fit = followed(pair, joint_centres(subject, found.poses, found.trans))
+    centres = np.concatenate([[regressor @ body for body in subject.vertices(found.poses[k:k + AT_ONCE],
+                                                                              found.trans[k:k + AT_ONCE])]
+                              for k in range(0, len(found.poses), AT_ONCE)])
+    fit = followed(pair, found.poses, centres)
     return BodyMotion(found.poses, found.trans, subject.betas, found.rate, gender, "by the directions of the segments",
-                      rest, found, fit)
+                      uncertain, found, fit)

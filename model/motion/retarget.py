@@ -20,7 +20,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..export.rig import check_motion, joint_places, turn_up
 from .moving import MovingSkeleton
-from .roles import NEEDED, body_roles, find_roles, trunk, way
+from .roles import NEEDED, numbered_roles, trunk, way
 
 Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres
 ALIKE = 10.0                         # degrees between the bones of two skeletons that rest alike
@@ -71,7 +71,8 @@ class Pairing:
         self.joints = skeleton.joints.copy()
         for j, p in enumerate(skeleton.parents[1:], start=1):
             self.joints[j] = self.joints[p] + self.P[p].T @ (skeleton.joints[j] - skeleton.joints[p])
-        self.ours, self.theirs = body_roles(skeleton), find_roles(moving.names)
+        self.ours = numbered_roles(skeleton.names, skeleton.joints)
+        self.theirs = numbered_roles(moving.names, moving.rest)
         for what, found, names in (("body", self.ours, skeleton.names), ("motion", self.theirs, moving.names)):
             missing = [role for role in NEEDED if role not in found]
             if missing:
@@ -108,6 +109,9 @@ class Pairing:
                     aside = np.arctan2(left, down)
                     if abs(aside) > np.radians(10):
                         A[self.ours[roles[2]]] = rotations.exp(aside * self.standing(False)[:, 2]) @ whole
+        for j, p in enumerate(self.skeleton.parents.tolist()):
+            if p >= 0 and j not in self.ours.values():
+                A[j] = A[p]                                             # fingers, toes, a second piece of a thigh
         return A
 
     def middle(self) -> tuple[list[int], list[int]]:
@@ -212,6 +216,9 @@ def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2) -> Ret
         elif role in pair.theirs:
             M[:, j] = moving.rotations[:, pair.theirs[role]] @ A[j]
             matched[name] = moving.names[pair.theirs[role]]
+        elif name in moving.names:
+            M[:, j] = moving.rotations[:, moving.names.index(name)] @ A[j]
+            matched[name] = name
         else:
             lacking.append(name)
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
@@ -224,26 +231,30 @@ def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2) -> Ret
 
 
 def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
-    """The motion of the same parts, which rest alike in axes of another name; None where it is another skeleton."""
-    if set(moving.names) != set(skeleton.names):
+    """The motion of the same parts, which rest alike in axes of another name; None where it is another skeleton.
+
+    The tree may hang on another part; bones may be those of another person.
+    """
+    names = skeleton.names
+    if set(moving.names) != set(names):
         return None
-    order = [moving.names.index(name) for name in skeleton.names]
-    above = [-1, *(skeleton.names.index(moving.names[p]) for p in moving.parents[order[1:]])]
-    if above != skeleton.parents.tolist():
+    order = [moving.names.index(name) for name in names]
+    above = [names[p] if p >= 0 else "" for p in skeleton.parents]
+    theirs_above = [moving.names[p] if p >= 0 else "" for p in moving.parents[order]]
+    shared = [j for j in range(len(names)) if above[j] == theirs_above[j]]       # joints that link the same parts
+    bones = [j for j in shared if above[j] and skeleton.parents[j] in shared]
+    if not bones or len(bones) < (len(names) - 1) / 2:
         return None
-    ours, theirs = skeleton.joints[1:] - skeleton.joints[skeleton.parents[1:]], moving.offsets[order[1:]]
-    if not len(ours):
-        return None
+    ours, theirs = skeleton.joints[bones] - skeleton.joints[skeleton.parents[bones]], moving.offsets[order][bones]
     Q = _turn(ours, theirs, turn_up(upright(rest)[0]))
     if Q is None:
         return None
     scale = np.linalg.norm(ours, axis=1).sum() / np.linalg.norm(theirs, axis=1).sum()
     poses = skeleton.pose_of(Q.T @ moving.rotations[:, order] @ Q)
-    trans = scale * moving.places[:, order[0]] @ Q - skeleton.joints[0]
+    trans = scale * moving.places[:, order[shared[0]]] @ Q - joint_places(skeleton, poses)[:, shared[0]]
     if np.abs(scale * theirs @ Q - ours).max() > SAME:                  # another person: soles where theirs would be
         trans = trans + lift(vertices, poses, trans, Q.T @ [0, 1, 0]) * (Q.T @ [0, 1, 0])
-    return Retargeted(poses, trans, moving.rate, dict(zip(skeleton.names, skeleton.names, strict=True)), (),
-                      float(scale))
+    return Retargeted(poses, trans, moving.rate, dict(zip(names, names, strict=True)), (), float(scale))
 
 
 def _turn(ours: np.ndarray, theirs: np.ndarray, usual: np.ndarray) -> np.ndarray | None:

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from scanprep.skeleton.tree import Skeleton
-
 # What the joints of our parts are called elsewhere, in H-Anim, motion databases and animation programs, in small
 # letters without separators; the first that a skeleton has is taken, and none twice. A knee may be a "leg" (below an
 # "up leg") and a clavicle a "shoulder" (above an "arm"): so the order of the rows matters.
@@ -18,11 +16,11 @@ ROLES = {
 SIDED_ROLES = {
     "shoulder": ("upperarm", "uparm", "humerus", "arm", "shldr", "shoulder"),
     "sternoclavicular": ("sternoclavicular", "clavicle", "collar", "collarbone", "shoulder"),
-    "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "radius"),
+    "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "radius", "ulna"),
     "wrist": ("wrist", "radiocarpal", "hand"),
     "knee": ("knee", "lowerleg", "lowleg", "shin", "shank", "calf", "tibia", "leg"),
     "hip": ("upleg", "thigh", "upperleg", "femur", "hip", "leg", "hipjoint"),
-    "ankle": ("ankle", "talocrural", "foot")}
+    "ankle": ("ankle", "talocrural", "talus", "foot", "calcn")}
 NEEDED = ("humanoid_root", "l_hip", "r_hip", "l_shoulder", "r_shoulder")
 
 
@@ -47,24 +45,23 @@ def find_roles(names: Sequence[str]) -> dict[str, int]:
     return out
 
 
-def body_roles(skeleton: Skeleton) -> dict[str, int]:
-    """`find_roles` of a model's parts, whose limbs may be numbered outwards (arm1_left, arm2_left, ...).
+def numbered_roles(names: Sequence[str], joints: np.ndarray) -> dict[str, int]:
+    """`find_roles`, also of limbs that are numbered outwards (arm1_left, arm2_left, ...), with joints (J, 3) at rest.
 
     Of such a limb the elbow or knee is where it leaves two pieces that are most alike.
     """
-    roles = find_roles(skeleton.names)
+    roles, names = find_roles(names), list(names)
     for side, spelt in (("l", "left"), ("r", "right")):
         for limb, wanted in (("arm", ("shoulder", "elbow", "wrist")), ("leg", ("hip", "knee", "ankle"))):
-            chain = [skeleton.names.index(f"{limb}{k}_{spelt}") for k in range(1, 20)
-                     if f"{limb}{k}_{spelt}" in skeleton.names]
+            chain = [names.index(f"{limb}{k}_{spelt}") for k in range(1, 20) if f"{limb}{k}_{spelt}" in names]
             if len(chain) > len(wanted):
                 starts = range(1) if limb == "leg" else range(len(chain) - 2)
-                found = _pieces(skeleton.joints[chain], starts)
+                found = _pieces(joints[chain], starts)
                 roles |= {f"{side}_{role}": chain[k] for role, k in zip(wanted, found, strict=True)}
                 if limb == "arm" and found[0]:
                     roles[f"{side}_sternoclavicular"] = chain[0]
-            elif f"{limb}_{spelt}" in skeleton.names:
-                roles[f"{side}_{wanted[0]}"] = skeleton.names.index(f"{limb}_{spelt}")
+            elif f"{limb}_{spelt}" in names:
+                roles[f"{side}_{wanted[0]}"] = names.index(f"{limb}_{spelt}")
                 roles.pop(f"{side}_knee", None)
     return roles
 

@@ -9,6 +9,7 @@ import tyro
 
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
+from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
 from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
@@ -18,8 +19,10 @@ from scanprep.ranges import BETAS, TURNS, Beta
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..export.cli import write_frames
+from ..export.conventions import standing
 from ..files import load_model
 from ..linear import Subject
+from ..motion.files import betas_for
 from ..motion.onto import read_motion
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
@@ -109,10 +112,10 @@ def _about(model: BodyModel, found: Character) -> list[Metric]:
 
 
 def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[Beta, ...] = (),
-         subject: Path | None = None, own_body: bool = False) -> Outcome:
+         subject: Path | None = None, own_body: bool = False, ground: bool = False, front: bool = False) -> Outcome:
     """Write the mesh of one pose and shape.
 
-    Example: scape model mesh model.npz --betas 2 -1 -o body.ply
+    Example: scape model mesh model.npz --betas 2 -1 --ground --front -o body.ply
 
     Args:
         model: Model file.
@@ -121,6 +124,8 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         betas: Shape in standard deviations, the first of them; the mean person without.
         subject: Betas in JSON or .npz, or a mesh in the model's triangles, instead of --betas.
         own_body: The template's own body instead of the mean person.
+        ground: Lowest point on height 0.
+        front: Face to the viewer: -y where z is up, else +z.
     """
     loaded = load_model(model)
     turns = np.zeros((len(loaded.skeleton.parents), 3))
@@ -140,7 +145,8 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         raise ValueError(f"{model}: it has no shape components; ask for --own-body")
     else:
         vertices = loaded.vertices(turns, np.array(betas if betas else (0.0,)))
-    write_mesh(output, loaded.template.with_vertices(vertices))
+    body = loaded.template.with_vertices(vertices)
+    write_mesh(output, standing(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")])
 
@@ -162,10 +168,8 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     if given is None:
         return model.subject(None)
     if given.suffix in (".json", ".npz"):
-        betas = _read_betas(given)
-        if len(betas) > model.n_betas:
-            raise ValueError(f"{given}: expected at most the {model.n_betas} betas of the model, found {len(betas)}")
-        return model.subject(betas if len(betas) else None)
+        betas = betas_for(given, _read_betas(given), model)
+        return model.subject(betas if betas is not None and len(betas) else None)
     person = read_mesh(given, unit)
     if not np.array_equal(person.faces, model.template.faces):
         raise ValueError(f"{given}: expected the triangles of the model ({model.template}), found {person}; "
@@ -180,7 +184,7 @@ def _read_betas(path: Path) -> np.ndarray:
         found = read_json(path, wanted)
         found = found.get("betas") if isinstance(found, dict) else found
     else:
-        found = load_arrays(path).get("betas")
+        found = load_arrays(path, only=("betas",)).get("betas")
     try:
         betas = np.array(found, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

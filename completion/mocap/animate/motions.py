@@ -37,12 +37,10 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     """Bring a motion onto a body and write it into the folder of a room; the figures, and the page to be written."""
     found = read_motion(path, model, subject, unit)
     body = subject if subject is not None else model.subject(found.betas)
-    none = np.zeros((len(found.poses), 0))
-    motion = Motion(found.poses, found.trans, found.betas, found.rate, none, gender=found.gender,
-                    trusted=none.astype(bool))
+    motion = Motion.of(found)
     metrics = [judgement_row(judged(found.fit)), Metric("model", name), *figures(found)]
     write_motion(room.folder, motion, body)
-    write_glb(room.folder / "animation.glb", motion, body)
+    metrics += write_glb(room.folder / "animation.glb", motion, body)
     page = Page(f"{path.name}, on the body", "The body in motion" + (
         ", with dots where the joint centres of the motion's own skeleton would be with bones as long as these."
         if found.fit else "."))
@@ -79,7 +77,8 @@ def figures(found: BodyMotion) -> list[Metric]:
         out += [Metric(MEAN_DISTANCE, MM * found.fit.distance, "mm"),
                 Metric("distance of joint centres, 95th percentile", float(np.percentile(distance, 95)), "mm"),
                 Metric("angle of segments, mean", found.fit.angle, "°"),
-                Metric("angle of segments, 95th percentile", float(np.percentile(found.fit.angles, 95)), "°")]
+                Metric("angle of segments, 95th percentile", float(np.percentile(found.fit.angles, 95)), "°"),
+                Metric("trunks that rest differently, allowed for", found.fit.apart, "°")]
     return out
 
 

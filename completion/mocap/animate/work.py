@@ -18,7 +18,7 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots
 
 from ...cli import rows
-from ...motion import Motion, spread_frames
+from ...motion import Motion
 from ...motion_pictures import (
     MARKER,
     chart_residuals,
@@ -30,7 +30,7 @@ from ...motion_pictures import (
     worst_frames,
 )
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import KEYS, write_glb, write_motion
+from ..files.motion_files import write_glb, write_motion
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
@@ -68,9 +68,9 @@ class Work:
         else:
             metrics, motion, body, page = self._followed(path, room)
         if self.retarget_to is not None:
-            _other_person(self, self.retarget_to, room.folder, motion, body, page)
+            metrics += _other_person(self, self.retarget_to, room.folder, motion, body, page)
         if self.betas_to is not None:
-            _changing_body(self, self.betas_to, room.folder, motion, body, page)
+            metrics += _changing_body(self, self.betas_to, room.folder, motion, body, page)
         page.write(room.folder / "report.html")
         return metrics
 
@@ -98,7 +98,7 @@ class Work:
         judgement = Judgement.of(problem, (*worn.doubts(), *hardly_believed([motion])))
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body)
-        write_glb(output / "animation.glb", motion, body)
+        metrics += write_glb(output / "animation.glb", motion, body)
         return metrics, motion, body, motion_page(motion, body, sequence, path.name, rows(metrics))
 
     def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: Room
@@ -133,22 +133,26 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
         Metric("frames that converged", 100 * float(motion.converged.mean()), "%")]
 
 
-def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page) -> None:
+def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page
+                  ) -> list[Metric]:
     other = retarget(motion, body, person)
     other.save(output / "onto.npz")
-    write_glb(output / "onto.glb", other, person)
+    told = write_glb(output / "onto.glb", other, person)
     page.section("On another person", "The same rotations of the joints; the way over the ground is as much longer as "
                  "the legs are, and the feet are on the ground when those of the first are.")
     page.bodies([moving_pane(other, person)])
+    return told
 
 
-def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page) -> None:
-    shown = spread_frames(len(motion.poses), KEYS)
-    bodies = morphed_vertices(work.model, motion, morph_keys(goal, motion), shown)
-    write_glb(output / "morph.glb", motion, body, bodies)
+def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page
+                   ) -> list[Metric]:
+    def bodies(frames: np.ndarray) -> np.ndarray:
+        return morphed_vertices(work.model, motion, morph_keys(goal, motion), frames)
+
+    told = write_glb(output / "morph.glb", motion, body, bodies)
     page.section("With a body that changes", "Betas change from key to key, straight over time.")
-    page.bodies([moving_pane(motion, body, bodies=lambda frames: morphed_vertices(
-        work.model, motion, morph_keys(goal, motion), frames))])
+    page.bodies([moving_pane(motion, body, bodies=bodies)])
+    return told
 
 
 def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:

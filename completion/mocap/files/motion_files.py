@@ -1,20 +1,26 @@
 """Files of a motion: tables of joint angles, joint centres and residuals, BVH and GLB."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from model.export.bvh import write_bvh
-from model.linear import Subject
-from model.motion.error import joint_centres as centres_of
+from model.export.conventions import aimed
+from model.export.correctives import body_correctives, motion_correctives, off_exact
+from model.export.glb import write_skinned_glb
+from model.export.rig import subject_rig
+from model.linear import PointOperator, Subject
+from scanprep.console import Metric
 from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
 
-KEYS = 120                           # most key frames in a GLB
+KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
+MEASURED = 40                        # frames in which it is compared with the exact bodies
 
 
 def joint_angles(motion: Motion) -> np.ndarray:
@@ -34,7 +40,11 @@ def joint_angles(motion: Motion) -> np.ndarray:
 
 def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    return centres_of(subject, motion.poses, motion.trans)
+    regressor = subject.skeleton.joint_regressor(subject.template)
+    M, N, _ = subject.basis.shape
+    basis = (regressor @ subject.basis.transpose(1, 0, 2).reshape(N, -1)).reshape(-1, M, 3).transpose(1, 0, 2)
+    operator = PointOperator(subject.terms, basis.astype(np.float64), subject.origin)
+    return operator.evaluate(motion.poses, motion.trans)
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
@@ -65,18 +75,25 @@ def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
               body=subject.template.with_vertices(rest))
 
 
-def write_glb(path: Path, motion: Motion, subject: Subject, vertices: np.ndarray | None = None,
-              colors: np.ndarray | None = None, keys: int = KEYS) -> None:
-    """An animated GLB that lasts as long as the motion, of at most so many key frames.
+def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np.ndarray], np.ndarray] | None = None,
+              colors: np.ndarray | None = None) -> list[Metric]:
+    """An animated GLB: the subject on its skeleton in every frame, with the correctives that skinning needs.
 
-    `vertices` (n, N, 3), metres, are of the key frames, where the body changes; else it is the subject's.
+    `bodies` tells the vertices (n, N, 3), metres, of frames (n,) where the body changes or is smoothed: at most `KEYS`
+    of them are asked for; `colors` (N, 3) are of the vertices. Returned is how far the file is from the exact bodies.
     """
-    from scanprep.pictures.gltf import write_animated_glb
-
-    chosen, mesh = spread_frames(len(motion.poses), keys), subject.template
-    rate = motion.rate * max(len(chosen) - 1, 1) / max(len(motion.poses) - 1, 1)
-    write_animated_glb(path, mesh.faces, motion.vertices(subject, chosen) if vertices is None else vertices, rate,
-                       colors, upright(mesh)[0], keys)
+    rig, T = subject_rig(subject), len(motion.poses)
+    if bodies is None:
+        extra = motion_correctives(rig, subject, motion.poses)
+    else:
+        extra = body_correctives(rig, motion.poses, motion.trans, bodies, spread_frames(T, KEYS))
+    rig = replace(rig, mesh=replace(rig.mesh, colors=colors), correctives=extra)
+    up, measured = upright(subject.template)[0], spread_frames(T, MEASURED)
+    exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
+    off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
+    write_skinned_glb(path, aimed(rig, up), motion.poses, motion.trans, motion.rate, up)
+    return [Metric(f"{path.name}, distance from the exact body, mean", float(off.mean()), "mm"),
+            Metric("the same, largest", float(off.max()), "mm")]
 
 
 def write_table(path: Path, columns: list[str], rows: np.ndarray) -> None:
