@@ -136,7 +136,7 @@ def measures(report: dict) -> str:
                  for r in report["repeated"]]
     told: Rows = [(f"{r['how']}, {r['people']}", "girths" if r["girths"] else "others", r["stated_rms_mm"],
                    r["true_rms_mm"], 100 * r["within_1"], 100 * r["within_2"]) for r in report["stated"]]
-    return "\n".join((
+    return "\n\n".join((
         table(("bodies", "", "count", "mean error (mm)", "bias (mm)", "largest (mm)"), means),
         table(("mean error (mm)", *hows, "men, repeated"), each),
         table(("men, repeated: carried by", "", "count", "apart, mean (mm)", "largest (mm)"), way),
