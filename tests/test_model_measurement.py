@@ -34,6 +34,11 @@ def tapes():
     return find_tapes(Person().mesh, landmarks())
 
 
+@pytest.fixture(scope="module")
+def small_tapes():
+    return find_tapes(small_people().template, small_people().info["landmarks"])
+
+
 def tube(radius=0.05, height=0.4, around=40, rings=31, profile=None):
     """A tube without ends about z; `profile` (angle) -> radius."""
     angle = 2 * np.pi * np.arange(around) / around
@@ -247,9 +252,8 @@ def test_stated_errors(person, tapes):
     assert near == pytest.approx(plain.errors["waist_girth"], abs=1e-7)
 
 
-def test_the_body_with_some_measurements():
-    model = small_people()
-    tapes = find_tapes(model.template, model.info["landmarks"])
+def test_the_body_with_some_measurements(small_tapes):
+    model, tapes = small_people(), small_tapes
     betas = np.array([1.0, -0.8, 0.5, 0.3])
     pose = np.zeros((len(model.skeleton.parents), 3))
     there = measure(model.vertices(pose, betas), tapes, tapes.axes).values
@@ -268,10 +272,9 @@ def test_the_body_with_some_measurements():
 @pytest.mark.parametrize(("given", "told"), [
     ({"stature": 4}, r"stature=4: expected 1.2 to 2.4 m"), ({"waist": 0.01}, r"waist=0.01: expected 0.4 to 2.2 m"),
     ({"shoe": 1}, "no measurement 'shoe'; there are: stature, "), ({}, "expected at least one measurement")])
-def test_measures_that_no_person_has(given, told):
-    model = small_people()
+def test_measures_that_no_person_has(given, told, small_tapes):
     with pytest.raises(ValueError, match=told):
-        body_with_measurements(model, find_tapes(model.template, model.info["landmarks"]), given)
+        body_with_measurements(small_people(), small_tapes, given)
 
 
 def test_names_as_users_say_them():

@@ -36,6 +36,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     """Stature, girths, lengths and widths of bodies, or the body that has some.
 
     Example: scape measure completed -m model.npz -o measures.csv
+
     Example: scape measure -m model.npz --to stature=1.80 waist=0.85 -o body.ply
 
     Args:

@@ -75,7 +75,8 @@ def section(body: np.ndarray, faces: np.ndarray, origin: np.ndarray, normal: np.
     rows = np.arange(len(cut))
     lone, others = cut[rows, odd], [cut[rows, (odd + k) % 3] for k in (1, 2)]
     pairs = np.sort(np.stack([np.stack([lone, other], axis=1) for other in others], axis=1), axis=2)    # (c, 2, 2)
-    edges, links = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+    keys, links = np.unique(pairs[..., 0] * len(body) + pairs[..., 1], return_inverse=True)      # one number an edge
+    edges = np.stack(np.divmod(keys, len(body)), axis=1)
     a, b = height[edges].T
     share = a / (a - b)
     found = [Curve(edges[chain], share[chain], closed) for chain, closed in _chains(links.reshape(-1, 2))]
