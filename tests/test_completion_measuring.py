@@ -26,6 +26,8 @@ def folder(tmp_path_factory):
     for name, vertices in (("rest", model.vertices(rest)), ("bent", model.vertices(bent))):
         write_mesh(folder / "bodies" / f"{name}.ply", model.template.with_vertices(vertices))
     (folder / "somebody.json").write_text(json.dumps({"betas": [0.8, -0.5]}))
+    (folder / "people" / "anna").mkdir(parents=True)                       # as scape mosh writes them
+    (folder / "people" / "anna" / "subject.json").write_text(json.dumps({"betas": [0.8, -0.5], "layout": "cmu41"}))
     (folder / "marks.json").write_text(json.dumps(model.info["landmarks"]))
     return folder
 
@@ -42,10 +44,11 @@ def table(path):
 
 def test_a_folder_and_betas_with_their_model(folder, tmp_path, capsys):
     """A bent body is measured as it stands upright; the page and the report are there, the values those of Python."""
-    assert scape(folder / "bodies", folder / "somebody.json", "-m", folder / "model.npz", "-o",
+    assert scape(folder / "bodies", folder / "somebody.json", folder / "people", "-m", folder / "model.npz", "-o",
                  tmp_path / "all.csv") == 0
     rows, model = table(tmp_path / "all.csv"), small_people()
-    assert list(rows) == ["bent", "rest", "somebody"]
+    assert list(rows) == ["bent", "rest", "somebody", "anna"]
+    assert list(rows["anna"].values())[1:] == list(rows["somebody"].values())[1:]
     assert list(rows["rest"])[:3] == ["body", "stature", "neck_height"] and len(rows["rest"]) == 2 + 2 * len(CATALOGUE)
     tapes = find_tapes(model.template, model.info["landmarks"])
     true = measure(model.vertices(np.zeros((16, 3))), tapes, tapes.axes).values
@@ -54,7 +57,7 @@ def test_a_folder_and_betas_with_their_model(folder, tmp_path, capsys):
         assert float(rows["bent"][name]) == pytest.approx(true[name], abs=0.006), name
     assert rows["rest"]["waist_girth_error"] == ""
     page = (tmp_path / "all.html").read_text(encoding="utf-8")
-    assert "3 bodies, measured" in page and "back waist length, ISO 8559-1" in page
+    assert "4 bodies, measured" in page and "back waist length, ISO 8559-1" in page
     report = (tmp_path / "all.csv.report.json").read_text(encoding="utf-8")
     assert "NaN" not in report and json.loads(report)["judgement"]["verdict"] == "good"
 

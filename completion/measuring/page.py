@@ -18,6 +18,7 @@ SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies that turn on the page, columns of 
 SKIN, TAPE, WAY, HEIGHT = (0.86, 0.83, 0.79), (0.80, 0.20, 0.16), (0.10, 0.38, 0.66), (0.25, 0.30, 0.38)
 NO_BREAK = "\u00a0"
 THICK = 0.003                        # metres
+TALL, LOW = 560, 420                 # pixels: height of a figure of one or two bodies, and of more
 BESIDE = 0.045                       # metres between the lines of heights
 
 
@@ -29,9 +30,10 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
     shown = range(min(SHOWN, len(names)))
     for first in shown[::BESIDE_EACH_OTHER]:
         few = shown[first:first + BESIDE_EACH_OTHER]
-        page.bodies([_pane(names[k], bodies[k], found[k], tapes) for k in few],
-                    "Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. Grey, beside the "
-                    "body: heights. Drag to turn; the list hides and shows them." if not first else "", 560)
+        told = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
+                                 "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
+        page.bodies([_pane(names[k], bodies[k], found[k], tapes, len(few) == 1) for k in few], told,
+                    TALL if len(few) < 3 else LOW)
     if len(names) > SHOWN:
         page.text(f"The first {SHOWN} of {len(names)} bodies; all are in the table file.")
     page.table([(_words(both), *(_cell(found[k], both) for k in shown)) for both in _pairs()
@@ -68,8 +70,8 @@ def _cell(mine: Measurements, both: tuple[str, ...]) -> str:
                                                           else "") if name in mine.values else "–" for name in both)
 
 
-def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes) -> Pane:
-    """A body with its tapes; the lines of heights stand beside it."""
+def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, labelled: bool) -> Pane:
+    """A body with its tapes; the lines of heights stand beside it, with their names where there is room."""
     mesh = tapes.template.with_vertices(vertices)
     up, left, ahead = mine.axes
     girths, ways, heights = ([mine.readings[n].curve for n in mine.readings if kind(n)] for kind in (
@@ -84,7 +86,7 @@ def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes) -> 
         if curves:
             shapes.append(Bones(np.concatenate([c[:-1] for c in curves]), np.concatenate([c[1:] for c in curves]),
                                 color, THICK, name=what))
-    if beside:
+    if beside and labelled:
         words = [n.replace("_", " ") for n in mine.readings if isinstance(tapes.found[n], Height)]
         shapes.append(Dots(np.array([c[-1] for c in beside]), HEIGHT, 0.008, labels=words))
     points = np.concatenate([vertices, *beside])
