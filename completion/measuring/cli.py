@@ -66,18 +66,25 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     tapes = find_tapes(*landmarks_of(landmarks, read, loaded))
     if loaded is None:
         check_standing(tapes, read[0])
-    found, stood = list[Measurements](), list[np.ndarray]()
-    with bar("measuring") as progress:
-        for number, body in enumerate(read):
-            vertices, axes = _standing(body, loaded, tapes)
-            stood.append(vertices)
-            found.append(measure(vertices, tapes, axes, body.expected_error))
-            progress(number + 1, len(read))
+    found, stood = _measured(read, loaded, tapes)
     names = [body.name for body in read]
     write_measures(output, names, found)
     measures_page(names, stood, found, tapes).write(output.with_suffix(".html"))
     return Outcome(output, _figures(names, found), {"model": None if named is None else str(named)},
                    judgement=judged(names, found))
+
+
+def _measured(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
+              ) -> tuple[list[Measurements], list[np.ndarray]]:
+    """The measurements of bodies, and their vertices (N, 3) as they were measured."""
+    found, stood = list[Measurements](), list[np.ndarray]()
+    with bar("measuring") as progress:
+        for number, body in enumerate(bodies):
+            vertices, axes = _standing(body, model, tapes)
+            stood.append(vertices)
+            found.append(measure(vertices, tapes, axes, body.expected_error))
+            progress(number + 1, len(bodies))
+    return found, stood
 
 
 def _standing(body: Body, model: BodyModel | None, tapes: Tapes) -> tuple[np.ndarray, np.ndarray | None]:
