@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from model.body import BodyModel
+from model.measurement.tapes import Tapes
 from model.posing.cli import read_subject
 from scanprep.cli import Unit
 from scanprep.dataset import RegisteredSet
@@ -19,6 +20,8 @@ from ..partial.completion import load_completion
 from ..viewing.kinds import reported_model
 
 COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"      # files that tell what a folder is
+
+LEAN, RAISED = 25.0, 75.0            # degrees of a shin, and of an arm, from hanging, on somebody who stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +133,17 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     whose = "the model" if model is not None else "" if first is None else str(first.path)
     raise ValueError(f"{whose}: measuring begins at landmarks of the template, and there are none; name a file of them "
                      "with --landmarks (scape pick makes one), or a model that keeps them with -m")
+
+
+def check_standing(tapes: Tapes, body: Body) -> None:
+    """Refuse a body as the template of others if its legs bend or its arms are not below the shoulders."""
+    for name, (first, second) in tapes.limbs.items():
+        way = second.at(tapes.template.vertices) - first.at(tapes.template.vertices)
+        angle = float(np.degrees(np.arccos(-way @ tapes.axes[0] / np.linalg.norm(way))))
+        if angle > (LEAN if name.endswith("shin") else RAISED):
+            raise ValueError(f"{body.path}: it is the template of all bodies, as no model is named, and does not stand "
+                             f"upright: the {name} is {angle:.0f} degrees from it; name one that stands first, or the "
+                             "model with -m")
 
 
 def _template(first: Body | None) -> Mesh:

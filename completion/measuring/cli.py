@@ -12,7 +12,8 @@ from model.body import BodyModel
 from model.files import load_model
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.find import find_tapes
-from model.measurement.measure import Measurements, measure
+from model.measurement.measure import Measurements, measure, stands
+from model.measurement.tapes import Tapes
 from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
 from model.posing.transfer import own_body
 from scanprep.cli import MM, Output, Unit
@@ -23,7 +24,7 @@ from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
 
 from ..cli import ModelOrNone, read_model
-from .bodies import Body, landmarks_of, model_of, read_bodies
+from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
 from .page import measures_page
 
 BodiesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[BODY ...]")]
@@ -35,6 +36,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     """Stature, girths, lengths and widths of bodies, or the body that has some.
 
     Example: scape measure completed -m model.npz -o measures.csv
+
     Example: scape measure -m model.npz --to stature=1.80 waist=0.85 -o body.ply
 
     Args:
@@ -42,8 +44,8 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
             complete and mosh, or betas of a model (JSON, .npz).
         output: Table to write (.csv), in metres, one line a body; beside it a page of the same name (.html) with the
             tapes on the bodies. With --to the mesh of the body; its betas are written beside it, for --subject.
-        model: Model of the bodies: each is brought into the pose of its template first. Without it they are measured
-            as they stand.
+        model: Model of the bodies, else the one that their report names: who does not stand as its template does is
+            brought into that pose first. Without any the template is that of the set, else the first body.
         landmarks: Where the landmarks are on the template, else those that the model keeps, or of the file beside the
             bodies.
         unit: Unit of meshes.
@@ -62,13 +64,9 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     loaded = None if named is None else load_model(named)
     read = read_bodies(bodies, loaded, unit)
     tapes = find_tapes(*landmarks_of(landmarks, read, loaded))
-    found, stood = list[Measurements](), list[np.ndarray]()
-    with bar("measuring") as progress:
-        for number, body in enumerate(read):
-            vertices = _standing(body, loaded)
-            stood.append(vertices)
-            found.append(measure(vertices, tapes, None if loaded is None else tapes.axes, body.expected_error))
-            progress(number + 1, len(read))
+    if loaded is None:
+        check_standing(tapes, read[0])
+    found, stood = _measured(read, loaded, tapes)
     names = [body.name for body in read]
     write_measures(output, names, found)
     measures_page(names, stood, found, tapes).write(output.with_suffix(".html"))
@@ -76,11 +74,29 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
                    judgement=judged(names, found))
 
 
-def _standing(body: Body, model: BodyModel | None) -> np.ndarray:
-    """The vertices (N, 3) of a body in the standard pose, with all its detail; as it is where there is no model."""
-    if model is None or body.betas:
-        return body.mesh.vertices
-    return own_body(model, body.mesh.vertices).subject.vertices(np.zeros((len(model.skeleton.parents), 3)))
+def _measured(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
+              ) -> tuple[list[Measurements], list[np.ndarray]]:
+    """The measurements of bodies, and their vertices (N, 3) as they were measured."""
+    found, stood = list[Measurements](), list[np.ndarray]()
+    with bar("measuring") as progress:
+        for number, body in enumerate(bodies):
+            vertices, axes = _standing(body, model, tapes)
+            stood.append(vertices)
+            found.append(measure(vertices, tapes, axes, body.expected_error))
+            progress(number + 1, len(bodies))
+    return found, stood
+
+
+def _standing(body: Body, model: BodyModel | None, tapes: Tapes) -> tuple[np.ndarray, np.ndarray | None]:
+    """The vertices (N, 3) of a body in the standard pose, with all its detail, and the axes it then has.
+
+    It is as it was, its axes to be found, where it stands so already, or there is no model.
+    """
+    vertices = body.mesh.vertices
+    if body.betas or model is None or stands(vertices, tapes):
+        return vertices, tapes.axes if body.betas else None
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    return own_body(model, vertices).subject.vertices(rest), tapes.axes
 
 
 def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurements]) -> None:

@@ -14,9 +14,11 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid
 
-SHOWN = 6                            # bodies that turn on the page, and columns of its table
+SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies that turn on the page, columns of its table; and in one figure
 SKIN, TAPE, WAY, HEIGHT = (0.86, 0.83, 0.79), (0.80, 0.20, 0.16), (0.10, 0.38, 0.66), (0.25, 0.30, 0.38)
+NO_BREAK = "\u00a0"
 THICK = 0.003                        # metres
+TALL, LOW = 560, 420                 # pixels: height of a figure of one or two bodies, and of more
 BESIDE = 0.045                       # metres between the lines of heights
 
 
@@ -26,36 +28,50 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
     several = f"{len(names)} bodies" if len(names) > 1 else names[0]
     page = Page(f"{several}, measured", "Where the tape ran on each body. Metres in the table file, millimetres here.")
     shown = range(min(SHOWN, len(names)))
-    page.bodies([_pane(names[k], bodies[k], found[k], tapes) for k in shown],
-                "Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. Grey, beside the "
-                "body: heights. Drag to turn; the list hides and shows them.", 560)
+    for first in shown[::BESIDE_EACH_OTHER]:
+        few = shown[first:first + BESIDE_EACH_OTHER]
+        told = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
+                                 "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
+        page.bodies([_pane(names[k], bodies[k], found[k], tapes, len(few) == 1) for k in few], told,
+                    TALL if len(few) < 3 else LOW)
     if len(names) > SHOWN:
         page.text(f"The first {SHOWN} of {len(names)} bodies; all are in the table file.")
-    rows = [(name.replace("_", " "), *(_cell(found[k], name) for k in shown), CATALOGUE[name].standard)
-            for name in CATALOGUE if any(name in found[k].readings for k in shown)]
-    page.table(rows, ("mm", *(names[k] for k in shown), "term and standard"))
+    page.table([(_words(both), *(_cell(found[k], both) for k in shown)) for both in _pairs()
+                if any(name in found[k].readings for k in shown for name in both)],
+               ("mm", *(names[k] for k in shown)))
     notes = [(names[k], line) for k in shown for line in (
         *found[k].turned, *(f"no {name.replace('_', ' ')}: {why}" for name, why in found[k].missing.items()))]
     if notes:
         page.section("To be looked at").table(notes)
-    return page.section("How it is measured").text(
+    page.section("How it is measured").text(
         "Where each tape runs was found once on the template, from its landmarks and its shape, and goes with the "
         "vertices: the centre of every girth is the centre of the same ring of skin, and its plane is cut anew on each "
         "body. Trunk, head and thighs are measured level, arms, shins and neck across their own axis. Lengths along "
         "the skin are exact shortest ways over the same landmarks.\n\n"
         "± is the error to be expected from what the scan showed of the body, root mean square; it is known of "
         "completed bodies. It does not tell how far a landmark is from the bone that the standard names.")
+    return page.table([(_words(both), CATALOGUE[both[0]].standard) for both in _pairs()], ("here", "term and standard"))
 
 
-def _cell(mine: Measurements, name: str) -> str:
-    if name not in mine.readings:
-        return "–"
-    error = f" ± {MM * mine.errors[name]:.0f}" if name in mine.errors else ""
-    return f"{MM * mine.values[name]:,.0f}{error}"
+def _pairs() -> list[tuple[str, ...]]:
+    """The measurements, left and right together."""
+    return [(name, name.replace("_left", "_right")) if name.endswith("_left") else (name,) for name in CATALOGUE
+            if not name.endswith("_right")]
 
 
-def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes) -> Pane:
-    """A body with its tapes; the lines of heights stand beside it."""
+def _words(both: tuple[str, ...]) -> str:
+    """As a table has it."""
+    return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", NO_BREAK)
+
+
+def _cell(mine: Measurements, both: tuple[str, ...]) -> str:
+    """Millimetres of one measurement, or of left and right."""
+    return " / ".join(f"{MM * mine.values[name]:,.0f}" + (f" ± {MM * mine.errors[name]:.0f}" if name in mine.errors
+                                                          else "") if name in mine.values else "–" for name in both)
+
+
+def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, labelled: bool) -> Pane:
+    """A body with its tapes; the lines of heights stand beside it, with their names where there is room."""
     mesh = tapes.template.with_vertices(vertices)
     up, left, ahead = mine.axes
     girths, ways, heights = ([mine.readings[n].curve for n in mine.readings if kind(n)] for kind in (
@@ -70,7 +86,7 @@ def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes) -> 
         if curves:
             shapes.append(Bones(np.concatenate([c[:-1] for c in curves]), np.concatenate([c[1:] for c in curves]),
                                 color, THICK, name=what))
-    if beside:
+    if beside and labelled:
         words = [n.replace("_", " ") for n in mine.readings if isinstance(tapes.found[n], Height)]
         shapes.append(Dots(np.array([c[-1] for c in beside]), HEIGHT, 0.008, labels=words))
     points = np.concatenate([vertices, *beside])

@@ -1,6 +1,7 @@
 """Tapes found once on a template, from its landmarks and its shape."""
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
@@ -19,6 +20,8 @@ BAND = 0.10                          # how far from its place on the template a 
 LIMB_BAND = 0.07
 CORRIDOR = 0.05                      # how much longer a way may be than the shortest, for what it crosses to count
 BELOW_BUST, BELOW_CROTCH = 0.085, 0.04
+PAST_ARMPIT = (0.5, 0.56, 0.62, 0.68)                  # of the way from the shoulder to the elbow
+APART = 0.12                         # metres from the middle of a section to where its part is sought
 TRIED = 25                           # sections among which the widest or the narrowest is sought
 
 
@@ -36,8 +39,8 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     ----------
     template : Mesh
     landmarks : name to vertex
-        Under the names of the synthetic people, the SCAPE meshes or CAESAR. Crown, toes and heels are needed;
-        what begins at another landmark is left out where there is none.
+        Under the names of the synthetic people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
+        head or neck; what begins at another landmark is left out where there is none.
 
     Raises
     ------
@@ -74,8 +77,9 @@ class _Finder:
         yield "stature", lambda: Height(None)
         yield "neck_height", lambda: Height(self.point("neck back"))
         yield "shoulder_height", lambda: Height(self.point("left shoulder", "right shoulder"))
+        crown = self.floor + self.stature
         yield "head_girth", lambda: self.widest("head_girth", lambda t: self.level(
-            p.at("top of head"), self.floor + self.stature - (0.045 + 0.045 * t) * STATURE * self.scale))
+            p.at("top of head", "left ear", "right ear"), crown - (0.045 + 0.045 * t) * self.stature))
         yield "neck_girth", self.neck
         yield "chest_girth", lambda: self.trunk("chest_girth", p.height("left nipple", "right nipple"))
         yield "under_bust_girth", lambda: self.trunk(
@@ -98,7 +102,7 @@ class _Finder:
         """Of one leg, from above."""
         p, knee, heel = self.places, (f"{side} knee", f"{side} knee inside"), f"{side} heel"
         yield f"thigh_girth_{side}", lambda: self.keep(f"thigh_girth_{side}", self.level(
-            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - BELOW_CROTCH * self.scale), None)
+            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - BELOW_CROTCH * self.scale), None, BAND)
         yield f"knee_girth_{side}", lambda: self.across(f"knee_girth_{side}", self.shin(side), 0.0)
         yield f"calf_girth_{side}", lambda: self.widest(f"calf_girth_{side}", lambda t: self.along(
             p.at(*knee), p.at(heel), 0.12 + 0.4 * t), self.shin(side))
@@ -108,8 +112,7 @@ class _Finder:
         """Of one arm, from above."""
         p, elbow = self.places, (f"{side} elbow outside", f"{side} elbow inside")
         shoulder, tip = f"{side} shoulder", f"{side} middle finger"
-        yield f"upper_arm_girth_{side}", lambda: self.across(f"upper_arm_girth_{side}", self.limb(
-            f"{side} upper arm", p.at(shoulder), p.at(*elbow), 0.45, 0.9), 0.3)
+        yield f"upper_arm_girth_{side}", lambda: self.across(f"upper_arm_girth_{side}", self.upper_arm(side), 0.0)
         yield f"wrist_girth_{side}", lambda: self.narrowest(f"wrist_girth_{side}", lambda t: self.along(
             p.at(*elbow), p.at(tip), 0.42 + 0.26 * t), self.limb(
                 f"{side} forearm", p.at(*elbow), p.at(tip), 0.12, 0.45))
@@ -127,7 +130,7 @@ class _Finder:
         """The closed section by a plane that is nearest to a point (3,) of it."""
         curves = section(self.mesh.vertices, self.mesh.faces, origin, normal)
         far = [np.linalg.norm(curve.at(self.mesh.vertices).mean(axis=0) - origin) for curve in curves]
-        if not curves or min(far) > 0.2 * self.scale:
+        if not curves or min(far) > APART * self.scale:
             raise _NotThere("the template has no section there")
         best = curves[int(np.argmin(far))]
         if not best.closed:
@@ -159,8 +162,11 @@ class _Finder:
             ring = self.loop(centre.at(self.mesh.vertices), normal)
             centre = ring.centroid(self.mesh.vertices)
         far, _ = self.graph.nearest(np.unique(ring.edges))
-        near = self.mesh.faces[((far <= band * self.scale) & ~(under_arms & self.arms))[self.mesh.faces].all(axis=1)]
-        self.done[name] = Girth(centre, axis, near, ring, under_arms)
+        near = (far <= band * self.scale)[self.mesh.faces].any(axis=1)
+        if under_arms:
+            near &= ~self.arms[self.mesh.faces].any(axis=1)
+        aside = 1 if "upper_arm" in name else -1 if "thigh" in name else 0
+        self.done[name] = Girth(centre, axis, self.mesh.faces[near], ring, under_arms, aside)
         return self.done[name]
 
     @cached_property
@@ -218,10 +224,11 @@ class _Finder:
         return self.keep("waist_girth", plane, None, BAND)
 
     def hips(self) -> Girth:
-        """The widest below the waist."""
-        low, high = self.places.height("crotch"), float(self.girth("waist_girth").centre.at(self.mesh.vertices)
-                                                        @ self.places.up)
-        plane = self.best(lambda t: self.level(self.middle(), low + (0.12 + 0.6 * t) * (high - low)), 1)
+        """The widest from the crotch up to two thirds of the way to the waist."""
+        p = self.places
+        low = p.height("crotch")
+        high = p.height("left waist", "right waist", "navel")
+        plane = self.best(lambda t: self.level(self.middle(), low + (0.12 + 0.55 * t) * (high - low)), 1)
         return self.keep("hip_girth", plane, None, BAND)
 
     def neck(self) -> Girth:
@@ -237,6 +244,15 @@ class _Finder:
         rings = [self.loop(*self.along(start, end, share)) for share in (first, second)]
         self.limbs[name] = (rings[0].centroid(self.mesh.vertices), rings[1].centroid(self.mesh.vertices))
         return self.limbs[name]
+
+    def upper_arm(self, side: str) -> tuple[Carried, Carried]:
+        """From its middle, or as soon as the armpit is passed, to the elbow."""
+        p = self.places
+        for share in PAST_ARMPIT:
+            with contextlib.suppress(_NotThere):
+                return self.limb(f"{side} upper arm", p.at(f"{side} shoulder"),
+                                 p.at(f"{side} elbow outside", f"{side} elbow inside"), share, 0.95)
+        raise _NotThere("the upper arm lies against the trunk on the template")
 
     def shin(self, side: str) -> tuple[Carried, Carried]:
         p = self.places

@@ -27,7 +27,8 @@ PAIRED = {
     "armpit": ("{} armpit", "shoulder (bottom) {} side", "{} axilla, ant."),
     "nipple": ("{} nipple", "tit, {}", "{} thelion/bustpoint"), "ear": ("{} ear", "ear, {}", "{} tragion")}
 SIDES = {"left": ("left", "lt."), "right": ("right", "rt.")}
-FRAME = ("top of head", *(f"{side} {name}" for side in SIDES for name in ("toe", "heel")))
+FEET = tuple(f"{side} {name}" for side in SIDES for name in ("toe", "heel"))
+ABOVE = ("top of head", "neck front", "neck back", "left ear", "right ear")
 
 
 def known_landmarks(landmarks: Mapping[str, int]) -> dict[str, int]:
@@ -67,20 +68,21 @@ class Places:
 def places_of(mesh: Mesh, landmarks: Mapping[str, int]) -> Places:
     """The landmarks of a template, by our names, and its axes.
 
-    Up is the axis of coordinates along which the crown is above the feet, where it stands along one.
+    Up is the axis of coordinates along which head or neck are above the feet, where the body stands along one.
 
     Raises
     ------
     ValueError
-        No crown, or no toes and heels: then nothing tells which way is up, and where the front is.
+        No toes and heels, or nothing above: then nothing tells which way is up, and where the front is.
     """
     known = known_landmarks(landmarks)
-    lacking = [name for name in FRAME if name not in known]
-    if lacking:
-        raise ValueError(f"landmarks: expected at least {', '.join(FRAME)}; there is no {', '.join(lacking)}")
-    at = {name: mesh.vertices[known[name]] for name in FRAME}
-    feet = np.mean([at[name] for name in FRAME[1:]], axis=0)
-    up = (at["top of head"] - feet) / np.linalg.norm(at["top of head"] - feet)
+    lacking = [name for name in FEET if name not in known]
+    if lacking or not set(ABOVE) & set(known):
+        raise ValueError(f"landmarks: expected at least {', '.join(FEET)}, and one of {', '.join(ABOVE)}; there is no "
+                         f"{', '.join(lacking) or 'landmark of head or neck'}")
+    at = {name: mesh.vertices[known[name]] for name in (*FEET, *ABOVE) if name in known}
+    feet, head = (np.mean([at[name] for name in names if name in at], axis=0) for names in (FEET, ABOVE))
+    up = (head - feet) / np.linalg.norm(head - feet)
     axis = int(np.abs(up).argmax())
     if np.abs(up[axis]) > 0.97:
         up = np.sign(up[axis]) * np.eye(3)[axis]

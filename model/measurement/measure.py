@@ -14,6 +14,7 @@ from .tapes import Tapes
 from .uncertainty import measured_error
 
 TURNED = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}       # degrees from the standard pose that change little
+NEARLY = 0.5                         # of these: not worth the millimetres that another pose costs
 ROUNDS = 20                          # of laying a template on a body
 
 
@@ -100,14 +101,20 @@ def laid_on(template: Mesh, vertices: np.ndarray) -> np.ndarray:
     return R
 
 
-def turned_limbs(tapes: Tapes, body: Standing) -> tuple[str, ...]:
-    """Limbs that point elsewhere than on the template, in words."""
+def stands(vertices: np.ndarray, tapes: Tapes) -> bool:
+    """Whether a body (N, 3) stands so nearly as its template that it need not be brought into that pose."""
+    mesh = tapes.template.with_vertices(vertices)
+    return not turned_limbs(tapes, Standing(mesh, tapes.axes @ laid_on(tapes.template, vertices).T), NEARLY)
+
+
+def turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple[str, ...]:
+    """Limbs that point elsewhere than on the template, by more than a share of what changes little, in words."""
     found = []
     for name, (first, second) in tapes.limbs.items():
         ways = [(second.at(vertices) - first.at(vertices)) @ axes.T for vertices, axes in (
             (tapes.template.vertices, tapes.axes), (body.vertices, body.axes))]
         cosine = ways[0] @ ways[1] / (np.linalg.norm(ways[0]) * np.linalg.norm(ways[1]))
         angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-        if angle > TURNED[name.split(" ", 1)[1]]:
+        if angle > share * TURNED[name.split(" ", 1)[1]]:
             found.append(f"the {name} is turned by {angle:.0f} degrees from the standard pose")
     return tuple(found)

@@ -33,7 +33,7 @@ def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> 
         raise ValueError(f"vertices {start} and {end}: expected two that the triangles join")
     none = np.zeros(0, dtype=np.int64)
     far = igl.exact_geodesic(vertices, few, places[:1], none, np.arange(len(used)), none)
-    if not np.isfinite(far[places[1]]) or far[places[1]] > 1e6:
+    if not 0 < far[places[1]] < 1e6:                                       # 0, or a huge number, where no way leads
         raise ValueError(f"vertices {start} and {end}: no way along the surface joins them, there is a gap")
     edges, share = _straightened(vertices, *_descent(Mesh(vertices, few), far, int(places[0]), int(places[1])))
     return float(far[places[1]]), Curve(used[edges], share, False)

@@ -67,17 +67,20 @@ def section(body: np.ndarray, faces: np.ndarray, origin: np.ndarray, normal: np.
     """
     height = (body - origin) @ normal
     height = np.where(height == 0, 1e-12, height)                     # no vertex lies in the plane
-    cut = faces[np.ptp(np.sign(height[faces]), axis=1) > 0]
+    above = (height > 0)[faces]
+    a, b, c = above.T
+    crossed = (a | b | c) & ~(a & b & c)
+    cut, above = faces[crossed], above[crossed]
     if not len(cut):
         return []
-    above = height[cut] > 0
     odd = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))    # the corner on its own
     rows = np.arange(len(cut))
     lone, others = cut[rows, odd], [cut[rows, (odd + k) % 3] for k in (1, 2)]
     pairs = np.sort(np.stack([np.stack([lone, other], axis=1) for other in others], axis=1), axis=2)    # (c, 2, 2)
-    edges, links = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
-    a, b = height[edges].T
-    share = a / (a - b)
+    keys, links = np.unique(pairs[..., 0] * len(body) + pairs[..., 1], return_inverse=True)      # one number an edge
+    edges = np.stack(np.divmod(keys, len(body)), axis=1)
+    first, second = height[edges].T
+    share = first / (first - second)
     found = [Curve(edges[chain], share[chain], closed) for chain, closed in _chains(links.reshape(-1, 2))]
     return sorted(found, key=lambda curve: -len(curve.share))
 

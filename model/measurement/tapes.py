@@ -16,7 +16,8 @@ class Girth:
     """A tape around some part: the plane through `centre`, along `up` where there is no axis, else across the axis.
 
     `faces` (F', 3) are the triangles around its place on the template: arms and other legs are none of them.
-    `under_arms`: where they end at the arms the tape runs straight on, under the armpit.
+    `under_arms`: where they end at the arms the tape runs straight on, under the armpit. `aside`: where the plane meets
+    the trunk or the other leg it moves on, along its normal (1) or against it (-1); 0 if it stays.
     """
 
     centre: Carried
@@ -24,6 +25,7 @@ class Girth:
     faces: np.ndarray
     ring: Curve                          # on the template
     under_arms: bool = False
+    aside: int = 0
 
 
 @dataclass(frozen=True, eq=False)
