@@ -54,8 +54,7 @@ def info(model: ModelArg) -> Outcome:
 
 def about(model: BodyModel) -> list[Metric]:
     """What a model is made of."""
-    rows = [Metric("pose features", model.terms.features.count), Metric("terms of the fast path", model.terms.count),
-            Metric("shape components", model.n_betas)]
+    rows = [Metric("pose features", model.n_features), Metric("shape components", model.n_betas)]
     if model.n_betas:
         rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
     return rows

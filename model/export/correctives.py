@@ -100,7 +100,7 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
     arrays = {
         "v_template": rig.mesh.vertices, "f": rig.mesh.faces.astype(np.int64), "weights": rig.weights,
         "kintree_table": np.stack([model.skeleton.parents, np.arange(J)]),
-        "J_regressor": model.skeleton.joint_regressor(model.template).toarray(), "J": rig.skeleton.joints,
+        "J_regressor": model.joint_regressor.toarray(), "J": rig.skeleton.joints,
         "shapedirs": np.moveaxis(rig.shapes, 0, -1).astype(np.float32),
         "part_names": np.array(model.skeleton.names, dtype=str), "betas_unit": np.array("standard deviation"),
         "length_unit": np.array("metre")}

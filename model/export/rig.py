@@ -86,7 +86,7 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
         raise ValueError(f"shapes: the template's own body has none, got {shapes}")
     rest = np.zeros((len(model.skeleton.parents), 3))
     mesh = model.template.with_vertices(model.vertices(rest, betas))
-    joints = model.skeleton.joint_regressor(model.template) @ mesh.vertices
+    joints = model.joint_regressor @ mesh.vertices
     if weights is None:
         weights = model.weights if isinstance(model, SkinningModel) else skin_weights(model.template, model.skeleton)
     changes = np.zeros((0, *mesh.vertices.shape))

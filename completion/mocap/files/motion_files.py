@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from model.export.bvh import write_bvh
-from model.linear import PointOperator, Subject
+from model.linear import Subject
 from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
 
@@ -33,11 +33,7 @@ def joint_angles(motion: Motion) -> np.ndarray:
 
 def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    regressor = subject.skeleton.joint_regressor(subject.template)
-    M, N, _ = subject.basis.shape
-    basis = (regressor @ subject.basis.transpose(1, 0, 2).reshape(N, -1)).reshape(-1, M, 3).transpose(1, 0, 2)
-    operator = PointOperator(subject.terms, basis.astype(np.float64), subject.origin)
-    return operator.evaluate(motion.poses, motion.trans)
+    return subject.operator.combined(subject.joint_regressor).astype(np.float64).evaluate(motion.poses, motion.trans)
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
@@ -62,7 +58,7 @@ def write_residuals(path: Path, motion: Motion) -> None:
 def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
     """BVH in centimetres: the subject's bones at rest, of fixed length, and the motion."""
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    skeleton = replace(subject.skeleton, joints=subject.skeleton.joint_regressor(subject.template) @ rest)
+    skeleton = replace(subject.skeleton, joints=subject.joint_regressor @ rest)
     write_bvh(path, skeleton, motion.poses, motion.trans, motion.rate, up=upright(subject.template)[0],
               body=subject.template.with_vertices(rest))
 
