@@ -21,6 +21,7 @@ ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.np
 
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),
+    "import": ("A body model of the SMPL family's layout as ours.", "model.importing:import_file"),
     "mesh": ("The mesh of one pose and shape.", "model.posing.cli:mesh"),
     "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
     "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),

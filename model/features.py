@@ -123,7 +123,7 @@ class RadialLift:
 class RotationLift:
     """The rotation less the identity, row by row.
 
-    [SMPL]
+    Loper et al., SMPL, 2015.
     """
 
     kind = "rotation"
@@ -144,7 +144,7 @@ class RotationLift:
 class QuaternionLift:
     """The unit quaternion (x, y, z, w) of the rotation, less that of none.
 
-    [STAR]
+    Osman et al., STAR, 2020.
     """
 
     kind = "quaternion"

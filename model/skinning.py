@@ -59,7 +59,7 @@ class SkinningModel(BodyModel):
     joint_components : (K, J, 3) float, metres, optional
         Change of the joints for one standard deviation of each beta, where they do not follow the rest vertices.
 
-    [SMPL]
+    Loper et al., SMPL, 2015.
     """
 
     template: Mesh
