@@ -2,8 +2,8 @@
 
     T(β, θ) = v_template + shapedirs β + posedirs f(θ),    joints J_regressor (v_template + shapedirs β)
 
-and linear blend skinning of T about the joints, + trans (Loper et al. 2015). f is `R - I` of all joints but the root's, row by row,
-or quaternions and then the second beta (Osman et al. 2020). Licences of such files are their users' affair.
+and linear blend skinning of T about the joints, + trans (Loper et al. 2015). f is `R - I` of all joints but the root's,
+row by row, or quaternions and then the second beta (Osman et al. 2020). Licences of such files are their users' affair.
 """
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ CONVERT = ("convert it once where the library it came with is installed: python 
 
 @dataclass(frozen=True, eq=False)
 class Published:
-    """The arrays of a published model, checked, in float64 or float32: N vertices, J joints, K betas, C pose columns."""
+    """The arrays of a published model, checked: N vertices, J joints, K betas, C pose columns."""
 
     mesh: Mesh
     shapes: np.ndarray               # (N, 3, K) metres
