@@ -38,7 +38,8 @@ class Blended(PointOperator):
         Of its lift the bends are linear functions.
     weights : (n, J) float
     rest : (n, 3) float, metres
-    joints : (J, 3) float, metres
+    places : (J, 3) float, metres
+        Of the joints at rest.
     bends : (J - 1, m, 3, n) float, metres
         Change of the rest vertices by every lifted number of every joint but the root's.
     origin : (3,) float, metres
@@ -53,7 +54,7 @@ class Blended(PointOperator):
     features: PoseFeatures
     weights: np.ndarray
     rest: np.ndarray
-    joints: np.ndarray
+    places: np.ndarray
     bends: np.ndarray
     origin: np.ndarray
     bent: float = 1.0
@@ -90,18 +91,18 @@ class Blended(PointOperator):
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         poses, (n, J), leading = pose.reshape(-1, *pose.shape[-2:]), self.weights.shape, pose.shape[:-2]
         B, descends = len(poses), self.skeleton.descends.astype(float)
-        R, t, places = self._rigid(poses)
+        R, t, moved = self._rigid(poses)
         each = R @ self._bent(poses)[:, None] + t[..., None]                  # (B, J, 3, n) where a part alone takes it
         each *= self.weights.T[:, None]
         carried = (descends.T @ each.reshape(B, J, -1)).reshape(each.shape)   # all that hangs below each joint
-        carried -= (self.weights @ descends).T[:, None] * places[..., None]
+        carried -= (self.weights @ descends).T[:, None] * moved[..., None]
         turn = R @ rotations.right_jacobian(poses)                            # world turn per parameter, in columns
         # ω × x = hat(ω) @ x for every column ω of `turn`
         columns = rotations.hat(np.swapaxes(turn, -1, -2)) @ carried[:, :, None]                # (B, J, 3, 3, n)
         if self.bent and self.bends.size:
             slope = self.bent * np.swapaxes(lifted_slopes(self.features.lift, poses)[:, 1:], -1, -2)
             sway = (slope @ self.bends.reshape(*self.bends.shape[:2], -1)).reshape(B, J - 1, 3, 3, n)
-            G = self._motions(R, t, places)[:, None, None]
+            G = self._motions(R, t, moved)[:, None, None]
             for k in range(3):
                 columns[:, 1:] += G[..., k, :] * sway[..., k, None, :]
         y = np.swapaxes(_mixed(carried[:, 0], self.mix), -1, -2).reshape(*leading, self.count, 3)
@@ -114,7 +115,7 @@ class Blended(PointOperator):
     def _rigid(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rotations (B, J, 3, 3) of the parts, what follows them (B, J, 3), and where joints are; the root's is 0."""
         R = self.skeleton.part_rotations(poses)
-        return R, *hung(self.skeleton, R, self.joints)
+        return R, *hung(self.skeleton, R, self.places)
 
     def _motions(self, R: np.ndarray, t: np.ndarray, _: np.ndarray) -> np.ndarray:
         """(B, 3, 4, n) the mean motion of every vertex: a mean of rotations, then a translation."""
@@ -135,15 +136,22 @@ class Blended(PointOperator):
         return replace(self, weights=self.weights[used], rest=self.rest[used],
                        bends=np.ascontiguousarray(self.bends[..., used]), mix=mix)
 
+    def joints(self, regressor: sparray) -> Blended:
+        if self.middle is not None:
+            return self.combined(regressor)
+        above = np.maximum(self.skeleton.parents, 0)              # a joint hangs on the part above it
+        return replace(self, weights=np.eye(len(above))[above], rest=self.places, bends=np.zeros((0, 0, 3, len(above))),
+                       mix=None)
+
     def plus(self, factor: float, other: PointOperator) -> Blended:
         assert isinstance(other, Blended), "of the same kind of model"
         middle = self.middle if self.middle is None or other.middle is None else self.middle.plus(factor, other.middle)
         return replace(self, rest=self.rest + self.rest.dtype.type(factor) * other.rest, middle=middle,
-                       joints=self.joints + factor * other.joints, origin=self.origin + factor * other.origin,
+                       places=self.places + factor * other.places, origin=self.origin + factor * other.origin,
                        bent=self.bent + factor * other.bent)
 
     def scaled(self, factor: float) -> Blended:
-        return replace(self, rest=(factor * self.rest).astype(self.rest.dtype), joints=factor * self.joints,
+        return replace(self, rest=(factor * self.rest).astype(self.rest.dtype), places=factor * self.places,
                        bent=factor * self.bent, middle=None if self.middle is None else self.middle.scaled(factor))
 
     def astype(self, dtype: Any) -> Blended:
@@ -221,7 +229,7 @@ class ShapedBlended(ShapedPoints):
         rest, joints, origin, middle = (np.tensordot(betas, by_beta[:len(betas)], axes=1)
                                         for by_beta in (self.rest, self.joints, self.origin, self.middle))
         held = None if mean.middle is None else replace(mean.middle, basis=mean.middle.basis + middle)
-        return replace(mean, rest=mean.rest + rest, joints=mean.joints + joints, origin=mean.origin + origin,
+        return replace(mean, rest=mean.rest + rest, places=mean.places + joints, origin=mean.origin + origin,
                        middle=held)
 
     def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:

@@ -78,6 +78,10 @@ class PointOperator(ABC):
     def astype(self, dtype: Any) -> PointOperator:
         """The same in float64, or in float32, which is twice as fast and agrees to a few micrometres."""
 
+    def joints(self, regressor: sparray) -> PointOperator:
+        """The joints of a whole body: combinations (J, L) of the surface around them, unless they are its own."""
+        return self.combined(regressor)
+
     def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """Positions (..., L, 3) of the points at poses (..., J, 3) and trans (..., 3)."""
         pose, trans = check_pose(self.skeleton, pose, trans)

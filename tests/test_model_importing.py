@@ -9,6 +9,7 @@ from published_bodies import as_smplx, as_star, published_vertices, synthetic_sm
 from scipy.sparse import csc_array, csr_array
 
 from model.export.correctives import write_body_npz
+from model.export.rig import joint_places, make_rig
 from model.features import QuaternionLift, RotationLift, lifted, lifted_slopes
 from model.files import load_model
 from model.fitting import fit_shape
@@ -140,6 +141,10 @@ def test_our_own_export_comes_back(tmp_path):
     back = import_model(tmp_path / "body.npz")
     assert back.skeleton.names == worm.skeleton.names and back.n_betas == 3
     pose, betas = np.random.default_rng(0).normal(0, 0.4, (4, 3)), np.array([1.0, -0.5, 2.0])
+    again = write_body_npz(tmp_path / "again.npz", back)
+    np.testing.assert_allclose(again["posedirs"], arrays["posedirs"], rtol=0, atol=1e-7)
+    joints = back.operator(betas).joints(back.joint_regressor)
+    np.testing.assert_allclose(joints.evaluate(pose), joint_places(make_rig(back, betas).skeleton, pose), atol=1e-9)
     np.testing.assert_allclose(back.vertices(pose, betas), published_vertices(arrays, pose, betas, np.zeros(3)),
                                rtol=0, atol=1e-6)
 

@@ -189,7 +189,7 @@ def _bvh(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, mo
     else:
         write_bvh(output, rig.skeleton, moves.poses, moves.trans, moves.rate, unit, up, rig.mesh)
     poses, where = _measured(model, moves)
-    exact = np.stack([model.joint_regressor @ body for body in model.subject(person).vertices(poses)])
+    exact = model.operator(person).joints(model.joint_regressor).evaluate(poses)
     off = joint_places(rig.skeleton, poses) - exact
     return [_size(output), Metric("joints", len(rig.skeleton.parents)), Metric("unit", unit), Metric("up", "xyz"[up]),
             Metric("frames", 1 if moves is None else len(moves.poses)), Metric("measured on", where),

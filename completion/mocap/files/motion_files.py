@@ -32,8 +32,8 @@ def joint_angles(motion: Motion) -> np.ndarray:
 
 
 def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
-    """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    return subject.operator.combined(subject.joint_regressor).astype(np.float64).evaluate(motion.poses, motion.trans)
+    """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them, or the model's own."""
+    return subject.operator.joints(subject.joint_regressor).astype(np.float64).evaluate(motion.poses, motion.trans)
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
