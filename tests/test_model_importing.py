@@ -1,5 +1,6 @@
 """Other people's body models: the published formula, and every way in which such a file can be wrong."""
 import pickle
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,6 +18,7 @@ from model.importing import NAMES, import_model
 from model.linear import check_pose
 from model.products import Products, Terms
 from model.resolution.change import change_resolution, resample
+from scanprep.batch.digests import Digests
 from scanprep.geometry import rotations
 
 
@@ -53,6 +55,14 @@ def test_vertices_are_those_of_the_published_formula(both):
             np.testing.assert_allclose(found, wanted[::7] if len(found) < len(wanted) else wanted, rtol=0, atol=1e-9)
         np.testing.assert_allclose(model.joint_regressor @ model.vertices(0 * pose, betas, trans) - trans,
                                    arrays["J_regressor"] @ (model.vertices(0 * pose, betas)), rtol=0, atol=1e-9)
+
+
+def test_a_change_of_the_joints_is_noticed(both):
+    _, model = both
+    other = replace(model, regressor=csr_array(model.regressor * 1.0))
+    assert Digests().of(model) == Digests().of(other)
+    other.regressor.data[0] += 1e-6
+    assert Digests().of(model) != Digests().of(other)
 
 
 def test_derivatives_match_differences(both):
