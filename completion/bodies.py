@@ -157,8 +157,7 @@ class Anchor:
         self.part = model.skeleton.part_of_vertex(model.template)
         self.R = model.skeleton.part_rotations(pose)
         D = model.shape_jacobian(pose)
-        self.joints = np.einsum("jn,ndk->jdk", model.skeleton.joint_regressor(model.template).toarray(), D)
-        self.joints[0] = 0                                           # stitching holds the root's joint
+        self.joints = np.einsum("jn,ndk->jdk", model.joint_regressor.toarray(), D)
         self.local = D - self.joints[self.part]
 
     def turned(self, pose: np.ndarray) -> float:

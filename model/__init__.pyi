@@ -21,6 +21,7 @@ from .fitting import PoseFit as PoseFit
 from .fitting import ShapeFit as ShapeFit
 from .fitting import fit_pose as fit_pose
 from .fitting import fit_shape as fit_shape
+from .importing import import_model as import_model
 from .learning.config import LearnConfig as LearnConfig
 from .learning.mixing import learn_scape_mix as learn_scape_mix
 from .learning.parts import choose_skeleton as choose_skeleton

@@ -1,50 +1,72 @@
-"""Some surface points of a body whose shape is free: bilinear in (1, β) and products of features and rotations."""
+"""Some surface points of a body whose shape is free."""
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
+from scipy.sparse import sparray
 
-from .features import Terms
-from .linear import PointOperator, posed_product
+from scanprep.skeleton.tree import Skeleton
+
+from .linear import PointOperator
 
 
-@dataclass(frozen=True, eq=False)
-class ShapedPoints:
-    """Surface points as a function of pose, betas and place, with derivatives.
+class ShapedPoints(ABC):
+    """Surface points as a function of pose, betas and place, with derivatives; affine in betas.
 
-    T of every term (M, L, 3), metres, for the template's own body and the mean person, and its change (K, M, L, 3) for
-    one standard deviation of each beta.
+    Made by `BodyModel.points`.
     """
 
-    terms: Terms
-    template_basis: np.ndarray
-    mean_basis: np.ndarray
-    shape_basis: np.ndarray
-    origin: np.ndarray
+    @property
+    @abstractmethod
+    def skeleton(self) -> Skeleton:
+        """What the pose turns."""
 
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """L, the number of points."""
+
+    @property
+    @abstractmethod
+    def n_betas(self) -> int:
+        """K, the number of betas."""
+
+    @property
+    @abstractmethod
+    def load(self) -> int:
+        """Numbers that derivatives of one coordinate of a point hold in between."""
+
+    @abstractmethod
     def operator(self, betas: np.ndarray | None = None) -> PointOperator:
         """The points of the body with betas (k,), k ≤ K; None is the template's own body."""
-        if betas is None:
-            return PointOperator(self.terms, self.template_basis, self.origin)
-        betas = np.asarray(betas, dtype=np.float64)
-        if betas.ndim != 1 or len(betas) > len(self.shape_basis):
-            raise ValueError(f"betas: expected at most {len(self.shape_basis)} numbers, got shape {betas.shape}")
-        change = np.tensordot(betas, self.shape_basis[:len(betas)], axes=1)
-        return PointOperator(self.terms, self.mean_basis + change, self.origin)
 
+    @abstractmethod
     def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
         """Derivative (..., L, 3, K) of the points with respect to betas at poses (..., J, 3), metres."""
-        K, _, L, _ = self.shape_basis.shape
-        pose = np.asarray(pose, dtype=np.float64)
-        by_beta = posed_product(self.terms, self._flat, pose).reshape(*pose.shape[:-2], 3, K, L)
-        return np.moveaxis(by_beta, -1, -3)
 
-    @cached_property
-    def _flat(self) -> np.ndarray:
-        K, M, L, _ = self.shape_basis.shape
-        return np.ascontiguousarray(self.shape_basis.transpose(1, 3, 0, 2)).reshape(3 * M, K * L)
+    @abstractmethod
+    def combined(self, weights: np.ndarray | sparray) -> ShapedPoints:
+        """Linear combinations of the points, with weights (n, L) whose rows sum to 1."""
+
+    @abstractmethod
+    def joined(self, other: ShapedPoints) -> ShapedPoints:
+        """These points and then others of the same model."""
+
+    @abstractmethod
+    def along(self, directions: np.ndarray) -> ShapedPoints:
+        """The same in other unknowns z (k,): betas are z @ directions (k, K)."""
+
+    @abstractmethod
+    def first(self, n_betas: int) -> ShapedPoints:
+        """The same with the first betas only."""
+
+    def _checked(self, betas: np.ndarray) -> np.ndarray:
+        betas = np.asarray(betas, dtype=np.float64)
+        if betas.ndim != 1 or len(betas) > self.n_betas:
+            raise ValueError(f"betas: expected at most {self.n_betas} numbers, got shape {betas.shape}")
+        return betas
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +78,12 @@ class PosedPoints:
     @property
     def J3(self) -> int:
         """Three times the number of parts."""
-        return 3 * len(self.source.terms.skeleton.parents)
+        return 3 * len(self.source.skeleton.parents)
 
     @property
     def n_unknowns(self) -> int:
         """P."""
-        return self.J3 + 3 + (len(self.source.shape_basis) if isinstance(self.source, ShapedPoints) else 0)
+        return self.J3 + 3 + (self.source.n_betas if isinstance(self.source, ShapedPoints) else 0)
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """(L, 3) metres."""

@@ -13,11 +13,11 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .bilinear import ShapedPoints
-from .features import PoseFeatures, Terms
+from .features import PoseFeatures
 from .gradients import edges
 from .linear import Subject, check_points
 from .pose_space import PoseSpace
+from .products import Products, ShapedProducts, Terms
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
@@ -98,8 +98,8 @@ class BlendedTemplate:
         return Terms(features, np.repeat([block.rotation for block in self.blocks], [len(e) for e in each]),
                      np.concatenate(each))
 
-    def basis(self, space: PoseSpace, S: np.ndarray) -> np.ndarray:
-        """T (M, N, 3), metres, of every term for one body with shape deformation S (F, 3, 3).
+    def operator(self, space: PoseSpace, S: np.ndarray) -> Products:
+        """All vertices of one body with shape deformation S (F, 3, 3): T (M, N, 3), metres, of every term.
 
         [SCAPE] Eq. 9
         """
@@ -112,16 +112,16 @@ class BlendedTemplate:
             column = wanted.reshape(len(a), -1, 3).transpose(1, 0, 2).reshape(len(rows), -1)
             columns.append((G[rows].T @ column).reshape(n, len(a), 3))
         rhs = np.concatenate(columns, axis=1)
-        return self.stitching.solve(rhs.reshape(n, -1)).reshape(rhs.shape).transpose(1, 0, 2)
+        T = self.stitching.solve(rhs.reshape(n, -1)).reshape(rhs.shape).transpose(1, 0, 2)
+        return Products(self.terms(space.features), T, self.skeleton.joints[0])
 
     def subject(self, space: PoseSpace, S: np.ndarray | None = None) -> Subject:
         """A body with a pose space in the making, the template's own unless S (F, 3, 3) is given."""
         S = np.broadcast_to(np.eye(3), (len(self.template.faces), 3, 3)) if S is None else S
-        return Subject(self.template, self.skeleton, None, self.terms(space.features), self.basis(space, S),
-                       self.skeleton.joints[0])
+        return Subject(self.template, self.skeleton, None, self.operator(space, S))
 
     def points(self, space: PoseSpace, shapes: ShapeSpace, vertex_ids: np.ndarray, weights: np.ndarray | None
-               ) -> ShapedPoints:
+               ) -> ShapedProducts:
         """Some points as a function of pose and betas: stitched backwards from them, edge by edge."""
         ids, weights = check_points(len(self.template.vertices), vertex_ids, weights)
         if weights is None:
@@ -143,7 +143,7 @@ class BlendedTemplate:
                 found[k] = (mine @ wanted).reshape(len(ids), len(a), 3).transpose(1, 0, 2)
             blocks.append(found)
         basis = np.concatenate(blocks, axis=1)
-        return ShapedPoints(self.terms(space.features), basis[0], basis[1], basis[2:], self.skeleton.joints[0])
+        return ShapedProducts(self.terms(space.features), basis[0], basis[1], basis[2:], self.skeleton.joints[0])
 
 
 def _coefficients(space: PoseSpace, block: Block) -> tuple[np.ndarray, np.ndarray]:

@@ -5,18 +5,20 @@ import importlib.metadata
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .features import PoseFeatures, Terms
-from .linear import Subject, check_pose
+from .features import PoseFeatures
+from .linear import PointOperator, Subject, check_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,8 @@ class BodyModel(ABC):
         M = 0 in files of earlier versions.
     info : dict
         How the model was made: settings, sizes and a digest of the training set.
+    regressor : (J, N) sparse or None
+        Joints as combinations of vertices, where a model has its own; else those of the skeleton's rings.
     """
 
     kind: ClassVar[str]
@@ -57,6 +61,7 @@ class BodyModel(ABC):
     pose_covariance: np.ndarray
     pose_examples: np.ndarray
     info: dict[str, Any]
+    regressor: csr_array | None = None
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.template!r}, {len(self.skeleton.parents)} parts, {self.n_betas} betas)"
@@ -73,12 +78,17 @@ class BodyModel(ABC):
 
     @property
     @abstractmethod
-    def terms(self) -> Terms:
-        """The products of features and rotations that a fixed body is linear in."""
+    def n_features(self) -> int:
+        """The number of functions of the pose that the deformation by pose is linear in, constants included."""
+
+    @cached_property
+    def joint_regressor(self) -> csr_array:
+        """(J, N) weights: `joint_regressor @ vertices` are the joints of a body."""
+        return self.skeleton.joint_regressor(self.template) if self.regressor is None else self.regressor
 
     @abstractmethod
-    def basis(self, betas: np.ndarray | None = None) -> np.ndarray:
-        """T (M, N, 3), metres, of every term for the body with betas (k,), k ≤ K; None is the template's own."""
+    def operator(self, betas: np.ndarray | None = None) -> PointOperator:
+        """All vertices of the body with betas (k,), k ≤ K, as a function of the pose; None is the template's own."""
 
     @abstractmethod
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
@@ -95,10 +105,12 @@ class BodyModel(ABC):
 
     @abstractmethod
     def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
-        """Vertices (N, 3), metres, of one checked pose (J, 3) and betas (k,), the root's joint in the origin."""
+        """Vertices (N, 3), metres, of one checked pose (J, 3) and betas (k,), the template's root joint in the
+        origin.
+        """
 
     def bodies_of(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
-        """Vertices (B, N, 3), metres, of checked poses (B, J, 3) and betas (B, k), the root's joint in the origin.
+        """Vertices (B, N, 3), metres, of checked poses (B, J, 3) and betas (B, k).
 
         As `vertices_of` one by one, up to rounding; a few dozen at once are made fastest.
         """
@@ -201,9 +213,8 @@ class BodyModel(ABC):
         if np.dtype(dtype) not in (np.float32, np.float64):
             raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
         kept = None if betas is None else np.array(betas, dtype=np.float64)
-        return Subject(self.template, self.skeleton, kept, self.terms, self.basis(betas).astype(dtype, copy=False),
-                       self.skeleton.joints[0], self.pose_mean, self.pose_covariance, self.pose_examples,
-                       self.info.get("left_out_error"))
+        return Subject(self.template, self.skeleton, kept, self.operator(betas).astype(dtype), self.pose_mean,
+                       self.pose_covariance, self.pose_examples, self.info.get("left_out_error"), self.regressor)
 
     def jacobian(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None,
                  vertex_ids: np.ndarray | None = None) -> Derivatives:

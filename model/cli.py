@@ -21,6 +21,7 @@ ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.np
 
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),
+    "import": ("A body model of the SMPL family's layout as ours.", "model.importing:import_file"),
     "mesh": ("The mesh of one pose and shape.", "model.posing.cli:mesh"),
     "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
     "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),
@@ -54,8 +55,7 @@ def info(model: ModelArg) -> Outcome:
 
 def about(model: BodyModel) -> list[Metric]:
     """What a model is made of."""
-    rows = [Metric("pose features", model.terms.features.count), Metric("terms of the fast path", model.terms.count),
-            Metric("shape components", model.n_betas)]
+    rows = [Metric("pose features", model.n_features), Metric("shape components", model.n_betas)]
     if model.n_betas:
         rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
     return rows

@@ -119,19 +119,86 @@ class RadialLift:
         return {"centres": self.centres, "radius": self.radius}
 
 
+@dataclass(frozen=True)
+class RotationLift:
+    """The rotation less the identity, row by row.
+
+    Loper et al., SMPL, 2015.
+    """
+
+    kind = "rotation"
+    width = 9
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        return (rotations.exp(t) - np.eye(3)).reshape(*t.shape[:-1], 9)
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        along = rotations.hat(np.swapaxes(rotations.right_jacobian(t), -1, -2))                # of every parameter
+        return np.moveaxis(rotations.exp(t)[..., None, :, :] @ along, -3, -1).reshape(*t.shape[:-1], 9, 3)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+
+@dataclass(frozen=True)
+class QuaternionLift:
+    """The unit quaternion (x, y, z, w) of the rotation, less that of none.
+
+    Osman et al., STAR, 2020.
+    """
+
+    kind = "quaternion"
+    width = 4
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        half = np.linalg.norm(t, axis=-1, keepdims=True) / 2
+        return np.concatenate([0.5 * np.sinc(half / np.pi) * t, np.cos(half) - 1], axis=-1)
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        # a rotation vector d from the right changes q = (v, w) by (w d + v × d, -v · d) / 2
+        q = self.evaluate(t)
+        v, w = q[..., :3], q[..., 3, None, None] + 1
+        by_turn = np.concatenate([w * np.eye(3) + rotations.hat(v), -v[..., None, :]], axis=-2) / 2
+        return by_turn @ rotations.right_jacobian(t)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+
+_PLAIN: dict[str, Lift] = {lift.kind: lift for lift in (LinearLift(), QuadraticLift(), RotationLift(),
+                                                        QuaternionLift())}
+
+
+def lifted(lift: Lift, pose: np.ndarray) -> np.ndarray:
+    """The lifted twists (..., J, m) of poses (..., J, 3) of any length."""
+    return lift.evaluate(twists(pose))
+
+
+def lifted_slopes(lift: Lift, pose: np.ndarray) -> np.ndarray:
+    """(..., J, m, 3) derivative of the lifted twists of each joint by its pose parameters (..., J, 3)."""
+    pose = np.asarray(pose, dtype=np.float64)
+    t = twists(pose)
+    slope = lift.derivative(t)
+    far = np.linalg.norm(pose, axis=-1) > np.pi
+    if far.any():
+        turn = rotations.inverse_right_jacobian(t[far]) @ rotations.right_jacobian(pose[far])
+        slope = slope.copy()
+        slope[far] = slope[far] @ turn
+    return slope
+
+
 def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
     """The features of a model file, or ValueError."""
     J, kind = len(skeleton.parents), header["lift"]
-    lift: Lift = LinearLift()
-    if kind == QuadraticLift.kind:
-        lift = QuadraticLift()
-    elif kind == RadialLift.kind:
+    if kind == RadialLift.kind:
         radius = storage.numbers(arrays, "lift_radius", J)
         if not (radius > 0).all():
             raise ValueError("lift_radius: expected positive numbers")
-        lift = RadialLift(storage.numbers(arrays, "lift_centres", J, None, 3), radius)
-    elif kind != LinearLift.kind:
-        raise ValueError(f"features: '{kind}' is not known here (known: linear, quadratic, radial)")
+        lift: Lift = RadialLift(storage.numbers(arrays, "lift_centres", J, None, 3), radius)
+    elif kind in _PLAIN:
+        lift = _PLAIN[kind]
+    else:
+        raise ValueError(f"features: '{kind}' is not known here (known: {', '.join(_PLAIN)}, {RadialLift.kind})")
     part = storage.numbers(arrays, "feature_part", None)
     return PoseFeatures(skeleton, lift, part.astype(np.int64),
                         storage.numbers(arrays, "feature_mix", J, lift.width, len(part)))
@@ -190,20 +257,12 @@ class PoseFeatures:
 
     def evaluate(self, pose: np.ndarray) -> np.ndarray:
         """Features (..., A) of poses (..., J, 3), radians."""
-        raised = self.lift.evaluate(twists(pose))
+        raised = lifted(self.lift, pose)
         return raised.reshape(*raised.shape[:-2], len(self._flat)) @ self._flat + self.constant
 
     def derivative(self, pose: np.ndarray) -> np.ndarray:
         """(..., A, J, 3) derivative of every feature by the pose parameters (..., J, 3)."""
-        pose = np.asarray(pose, dtype=np.float64)
-        t = twists(pose)
-        slope = self.lift.derivative(t)                                       # (..., J, m, 3)
-        far = np.linalg.norm(pose, axis=-1) > np.pi
-        if far.any():
-            turn = rotations.inverse_right_jacobian(t[far]) @ rotations.right_jacobian(pose[far])
-            slope = slope.copy()
-            slope[far] = slope[far] @ turn
-        by_joint = np.swapaxes(self.mix, -1, -2) @ slope                      # (..., J, A, 3)
+        by_joint = np.swapaxes(self.mix, -1, -2) @ lifted_slopes(self.lift, pose)              # (..., J, A, 3)
         return np.swapaxes(by_joint, -2, -3)
 
 
@@ -231,28 +290,3 @@ def linear_features(skeleton: Skeleton, directions: Sequence[np.ndarray]) -> Pos
     [SCAPE] Eq. 3
     """
     return part_features(skeleton, LinearLift(), directions)
-
-
-@dataclass(frozen=True, eq=False)
-class Terms:
-    """The products of a `feature` (M,) and the rotation of a `part` (M,) in which the vertices of a fixed body are
-    linear.
-    """
-
-    features: PoseFeatures
-    part: np.ndarray
-    feature: np.ndarray
-
-    @property
-    def skeleton(self) -> Skeleton:
-        return self.features.skeleton
-
-    @property
-    def count(self) -> int:
-        """M, the number of products."""
-        return len(self.part)
-
-    def weights(self, pose: np.ndarray) -> np.ndarray:
-        """(..., M, 3, 3) of δ R at poses (..., J, 3), radians."""
-        R = self.skeleton.part_rotations(pose)[..., self.part, :, :]
-        return self.features.evaluate(pose)[..., self.feature, None, None] * R

@@ -163,7 +163,7 @@ class ShapeFitter:
             raise ValueError(f"n_betas: expected 1..{self.n_betas}, got {n_betas}")
         fewer = copy(self)
         fewer.config, fewer.n_betas = replace(self.config, n_betas=n_betas), n_betas
-        fewer._points = replace(self._points, shape_basis=self._points.shape_basis[:n_betas])
+        fewer._points = self._points.first(n_betas)
         return fewer
 
     def fit(self, vertices: np.ndarray, start: PoseFit | None = None) -> ShapeFit:

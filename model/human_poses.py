@@ -24,6 +24,7 @@ WORTH = 8                            # training poses that what people do with t
 LOOSE = 0.25                         # radians by which joints of this body may differ from those of all people
 DRAWN = 400                          # poses for its mean and covariance
 SHOULDER = 0.3                       # of an upper arm's rotation against the chest happens in the shoulder itself
+HELD = ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")   # parts that stay at rest
 KINDS = {"arm": ("shoulder", "upper_arm", "forearm", "hand", "arm"), "leg": ("hip", "thigh", "shin", "foot", "leg")}
 
 
@@ -40,8 +41,13 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
     R = person.axes @ _world(drawn) @ person.axes.T
     world = np.stack([_between(R[:, a], R[:, b], share) for a, b, share in person.source], axis=1)
     poses = skeleton.pose_of(world @ person.at_rest)
-    poses[:, 0] = 0
+    poses[:, [0, *(p for p, name in enumerate(skeleton.names) if is_held(name))]] = 0
     return poses
+
+
+def is_held(name: str) -> bool:
+    """Whether a part, by its name, is one that poses of people here leave at rest: toes, fingers, face."""
+    return name.removesuffix("_left").removesuffix("_right").rstrip("0123456789") in HELD
 
 
 def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.ndarray, covariance: np.ndarray

@@ -1,24 +1,20 @@
-"""The fast path: a fixed body whose vertices are one matrix product away from its poses.
+"""The fast path: points of a fixed body as a function of its pose and place, with derivatives.
 
-Every kind of model is, for a fixed body, linear in products of a feature δ and the rotation of a part:
-
-    Y = Σ_m δ_m T_m R_mᵀ + joints[0] + trans
-
-where `T_m` is made once, for SCAPE stitched from the edges that the product contributes.
+What a kind of model makes of a pose is a `PointOperator`: SCAPE adds up products of features and rotations
+(`model.products`), skinning blends rotations at every vertex (`model.blended`).
 """
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, sparray
 
-from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
-
-from .features import Terms
 
 
 def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -35,38 +31,61 @@ def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, n
     return pose, np.broadcast_to(trans, (*pose.shape[:-2], 3))
 
 
-def posed_product(terms: Terms, flat: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """(..., 3, L) of Σ δ T Rᵀ for `flat` (3M, L) and poses (..., J, 3): one matrix product."""
-    W = np.moveaxis(terms.weights(pose), -3, -2)                              # (..., i, m, j)
-    W = W.reshape(-1, flat.shape[0]).astype(flat.dtype, copy=False)
-    return (W @ flat).reshape(*pose.shape[:-2], 3, flat.shape[1])
+class PointOperator(ABC):
+    """Some surface points of a fixed body as a function of pose and place, with derivatives.
 
-
-@dataclass(frozen=True, eq=False)
-class PointOperator:
-    """Some surface points of a fixed body, T (M, L, 3), metres, as a function of pose and place, with derivatives.
-
-    Built by `Subject.points`; it never touches the mesh. The root part's centroid stands in `origin` when trans is
-    zero.
+    Built by `Subject.points`; it never touches the mesh. The root's joint stands in `origin` (3,) when trans is zero.
     """
 
-    terms: Terms
-    basis: np.ndarray
     origin: np.ndarray
 
     @property
+    @abstractmethod
+    def skeleton(self) -> Skeleton:
+        """What the pose turns."""
+
+    @property
+    @abstractmethod
     def count(self) -> int:
         """L, the number of points."""
-        return self.basis.shape[1]
 
-    @cached_property
-    def _flat(self) -> np.ndarray:
-        return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(-1, self.count)
+    @property
+    @abstractmethod
+    def load(self) -> int:
+        """Numbers that the derivatives of one coordinate of a point at one pose hold in between."""
+
+    @abstractmethod
+    def turned(self, pose: np.ndarray) -> np.ndarray:
+        """Places (..., 3, L) relative to `origin` at checked poses (..., J, 3), coordinates before points."""
+
+    @abstractmethod
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `jacobian`, with the derivatives as (..., 3J, L, 3), contiguous for each parameter."""
+
+    @abstractmethod
+    def combined(self, weights: np.ndarray | sparray) -> PointOperator:
+        """Linear combinations of the points, with weights (K, L) whose rows sum to 1."""
+
+    @abstractmethod
+    def plus(self, factor: float, other: PointOperator) -> PointOperator:
+        """The sum with a multiple of another operator of the same model and points, origins included."""
+
+    @abstractmethod
+    def scaled(self, factor: float) -> PointOperator:
+        """The same body larger or smaller about the root's joint."""
+
+    @abstractmethod
+    def astype(self, dtype: Any) -> PointOperator:
+        """The same in float64, or in float32, which is twice as fast and agrees to a few micrometres."""
+
+    def joints(self, regressor: sparray) -> PointOperator:
+        """The joints of a whole body: combinations (J, L) of the surface around them, unless they are its own."""
+        return self.combined(regressor)
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """Positions (..., L, 3) of the points at poses (..., J, 3) and trans (..., 3)."""
-        pose, trans = check_pose(self.terms.skeleton, pose, trans)
-        y = posed_product(self.terms, self._flat, pose)
+        pose, trans = check_pose(self.skeleton, pose, trans)
+        y = self.turned(pose)
         y += (self.origin + trans)[..., None].astype(y.dtype)
         return np.swapaxes(y, -1, -2)
 
@@ -76,38 +95,19 @@ class PointOperator:
         A pose parameter rotates its part and all that hangs below it, and changes the features of its joint.
         The derivative with respect to trans is the identity.
         """
-        pose, trans = check_pose(self.terms.skeleton, pose, trans)
+        pose, trans = check_pose(self.skeleton, pose, trans)
         if pose.ndim == 2:
             y, columns = self.columns(pose, trans)
             return y, np.moveaxis(columns, 0, -1)
-        B, J, L = len(pose), len(self.terms.skeleton.parents), self.count
+        B, J, L = len(pose), len(self.skeleton.parents), self.count
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
         # numbers that a batch of derivatives holds at a time
-        step = max(1, 2**24 // max(1, 3 * L * (self.terms.count + 4 * J)))
+        step = max(1, 2**24 // max(1, 3 * L * self.load))
         for start in range(0, B, step):
             mine = slice(start, start + step)
             y[mine], columns = self.columns(pose[mine], trans[mine])
             d_pose[mine] = np.moveaxis(columns, 1, -1)
         return y, d_pose
-
-    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `jacobian`, with the derivatives as (..., 3J, L, 3), contiguous for each parameter."""
-        terms, skeleton = self.terms, self.terms.skeleton
-        J, M, L, leading = len(skeleton.parents), terms.count, self.count, pose.shape[:-2]
-        R = skeleton.part_rotations(pose)
-        turned = self.basis @ np.swapaxes(R[..., terms.part, :, :], -1, -2)   # (..., M, L, 3)
-        gather = np.zeros((*leading, J, M))                                   # C_p = Σ_m δ_m T_m R_pᵀ
-        gather[..., terms.part, np.arange(M)] = terms.features.evaluate(pose)[..., terms.feature]
-        below = skeleton.descends.T.astype(float) @ gather                    # all that hangs below each joint
-        sway = np.moveaxis(terms.features.derivative(pose)[..., terms.feature, :, :], -3, -1)   # (..., J, 3, M)
-        both = np.concatenate([below, sway.reshape(*leading, 3 * J, M)], axis=-2) @ turned.reshape(*leading, M, -1)
-        carried = both[..., :J, :].reshape(*leading, J, L, 3)
-        columns = both[..., J:, :].reshape(*leading, J, 3, L, 3)
-        turn = R @ rotations.right_jacobian(pose)                             # world turn per parameter, in columns
-        # ω × x = x @ hat(ω)ᵀ for every column ω of `turn`
-        columns += carried[..., None, :, :] @ np.swapaxes(rotations.hat(np.swapaxes(turn, -1, -2)), -1, -2)
-        y = carried[..., 0, :, :] + (self.origin + trans)[..., None, :]
-        return y, columns.reshape(*leading, 3 * J, L, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,37 +120,42 @@ class Subject:
     skeleton : Skeleton
     betas : (K,) float or None
         The body's shape; None is the template's own body.
-    terms : Terms
-    basis : (M, N, 3) float64 or float32, metres
-        Of this type are the vertices; float32 is twice as fast and agrees to a few micrometres.
-    origin : (3,) float, metres
+    operator : PointOperator
+        All vertices, in the type that they are to have.
     pose_mean, pose_covariance : (J, 3) and (3J, 3J) float, optional
         The model's pose prior, which a body of known shape keeps.
     pose_examples : (M, J, 3) float, radians, optional
         The model's training poses.
     left_out_error : float, metres, optional
         How far off the model predicted poses that were left out of learning.
+    regressor : (J, N) sparse, optional
+        Joints as combinations of vertices; else those of the skeleton's rings.
     """
 
     template: Mesh
     skeleton: Skeleton
     betas: np.ndarray | None
-    terms: Terms
-    basis: np.ndarray
-    origin: np.ndarray
+    operator: PointOperator
     pose_mean: np.ndarray | None = None
     pose_covariance: np.ndarray | None = None
     pose_examples: np.ndarray | None = None
     left_out_error: float | None = None
+    regressor: csr_array | None = None
 
     @property
     def n_vertices(self) -> int:
         """N."""
-        return self.basis.shape[1]
+        return self.operator.count
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) metres: where the root's joint stands when trans is zero."""
+        return self.operator.origin
 
     @cached_property
-    def _all(self) -> PointOperator:
-        return PointOperator(self.terms, self.basis, self.origin)
+    def joint_regressor(self) -> csr_array:
+        """(J, N) weights: `joint_regressor @ vertices` are the joints of a body."""
+        return self.skeleton.joint_regressor(self.template) if self.regressor is None else self.regressor
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """Vertices for one pose or a batch.
@@ -164,7 +169,18 @@ class Subject:
         -------
         (N, 3) or (B, N, 3) float of the subject's dtype, metres
         """
-        return self._all.evaluate(poses, trans)
+        return self.operator.evaluate(poses, trans)
+
+    def joints(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """Joint centres (..., J, 3), metres, for poses (..., J, 3), radians, and trans (..., 3), metres.
+
+        Affine combinations of the surface around them, or those that an imported model has of its own.
+        """
+        return self._joints.evaluate(poses, trans)
+
+    @cached_property
+    def _joints(self) -> PointOperator:
+        return self.operator.joints(self.joint_regressor).astype(np.float64)
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None) -> PointOperator:
         """Some surface points of the body.
@@ -181,12 +197,25 @@ class Subject:
         ValueError
             Indices out of range, shapes that do not agree, weights that do not sum to 1.
         """
-        ids, weights = check_points(self.n_vertices, vertex_ids, weights)
-        if weights is None:
-            basis = self.basis[:, ids].astype(np.float64)
-        else:
-            basis = np.einsum("alkd,lk->ald", self.basis[:, ids].astype(np.float64), weights)
-        return PointOperator(self.terms, basis, self.origin)
+        return self.operator.combined(picked(self.n_vertices, vertex_ids, weights)).astype(np.float64)
+
+
+def picked(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None) -> csr_array:
+    """(L, N) surface points as combinations of vertices; arguments as of `Subject.points`."""
+    ids, weights = check_points(n_vertices, vertex_ids, weights)
+    share = np.ones(ids.shape) if weights is None else weights
+    ends = np.arange(len(ids) + 1) * (ids.shape[1] if ids.ndim == 2 else 1)
+    found = csr_array((share.ravel(), ids.ravel(), ends), shape=(len(ids), n_vertices), copy=True)
+    found.sum_duplicates()
+    return found
+
+
+def chosen_rows(weights: np.ndarray | sparray) -> np.ndarray | None:
+    """(K,) the points, where weights (K, L) pick one each; None for true combinations."""
+    if isinstance(weights, np.ndarray) or weights.nnz != weights.shape[0]:
+        return None
+    rows = csr_array(weights)
+    return rows.indices if (rows.data == 1).all() and (np.diff(rows.indptr) == 1).all() else None
 
 
 def check_points(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None

@@ -15,9 +15,10 @@ from scanprep.skeleton.tree import Skeleton
 from .bilinear import ShapedPoints
 from .blending import BlendedTemplate, rigid_weights
 from .body import BodyModel, restored_parts, restored_variances
-from .features import PoseFeatures, Terms, linear_features, restored_features
+from .features import PoseFeatures, linear_features, restored_features
 from .linear import check_pose
 from .pose_space import PoseSpace
+from .products import Products, Terms
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
@@ -77,6 +78,7 @@ class ScapeModel(BodyModel):
 
     @cached_property
     def terms(self) -> Terms:
+        """The products of features and rotations that a fixed body is linear in."""
         return self.parts.terms(self.pose_space.features)
 
     @cached_property
@@ -122,8 +124,12 @@ class ScapeModel(BodyModel):
             edges[:, faces] += block.weights[:, None, None] * rotated.reshape(B, -1, 2, 3)
         return self.stitching.stitch(edges)
 
-    def basis(self, betas: np.ndarray | None = None) -> np.ndarray:
-        return self.parts.basis(self.pose_space, self.shape_space.gradients(betas))
+    @property
+    def n_features(self) -> int:
+        return self.pose_space.features.count
+
+    def operator(self, betas: np.ndarray | None = None) -> Products:
+        return self.parts.operator(self.pose_space, self.shape_space.gradients(betas))
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedPoints:

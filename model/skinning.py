@@ -1,24 +1,26 @@
-"""Linear blend skinning with pose-corrective shapes: the baseline beside SCAPE, under the same contract."""
+"""Linear blend skinning with pose-corrective shapes: learned beside SCAPE, or imported, under the same contract."""
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array, csr_array
 
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .bilinear import ShapedPoints
+from .blended import Blended, ShapedBlended
 from .body import BodyModel, restored_parts, restored_variances
-from .features import PoseFeatures, Terms, restored_features
-from .linear import check_points, check_pose
+from .features import PoseFeatures, restored_features
+from .linear import check_pose, picked
+from .products import Products, Terms
 
-VERSION = 2                          # 1 had no pose examples
+VERSION = 3                          # 1 had no pose examples, 2 no joints of its own
 SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
 
 
@@ -30,7 +32,8 @@ class SkinningModel(BodyModel):
 
         y_n = Σ_p w_np (R_p (x_n + c_n(pose) - j_p) + y_jp),    y_jp = y_jparent(p) + R_parent(p) (j_p - j_parent(p))
 
-    and the body is then placed like every other. Rest vertices are affine in betas, and joints follow them.
+    and the body is then placed like every other. Rest vertices are affine in betas, and joints follow them. A model
+    with a regressor of its own is placed as its formula is published: trans moves the root's joint of these betas.
 
     Parameters
     ----------
@@ -51,8 +54,12 @@ class SkinningModel(BodyModel):
         Variance over the training people along each component, summed over vertices, largest first.
     shape_total : float, square metres
         The same in all directions.
-    pose_mean, pose_covariance, pose_examples, info
+    pose_mean, pose_covariance, pose_examples, info, regressor
         As for `BodyModel`.
+    joint_components : (K, J, 3) float, metres, optional
+        Change of the joints for one standard deviation of each beta, where they do not follow the rest vertices.
+
+    Loper et al., SMPL, 2015.
     """
 
     template: Mesh
@@ -69,6 +76,8 @@ class SkinningModel(BodyModel):
     pose_covariance: np.ndarray
     info: dict[str, Any] = field(default_factory=dict)
     pose_examples: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)), kw_only=True)
+    regressor: csr_array | None = field(default=None, kw_only=True)
+    joint_components: np.ndarray | None = field(default=None, kw_only=True)
 
     kind: ClassVar[str] = "skinning"
 
@@ -79,6 +88,9 @@ class SkinningModel(BodyModel):
                             ("shape_mean", (N, 3)), ("shape_components", (K, N, 3))):
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
+        for name, shape in (("regressor", (J, N)), ("joint_components", (K, J, 3))):
+            if getattr(self, name) is not None and getattr(self, name).shape != shape:
+                raise ValueError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
         if not np.allclose(self.weights.sum(axis=1), 1, rtol=0, atol=1e-9) or self.weights.min() < 0:
             raise ValueError("weights: expected rows that are not negative and sum to 1")
 
@@ -87,27 +99,17 @@ class SkinningModel(BodyModel):
         return len(self.shape_components)
 
     @property
+    def n_features(self) -> int:
+        return self.features.count
+
+    @property
     def explained(self) -> np.ndarray:
         return np.cumsum(self.shape_variances) / max(self.shape_total, np.finfo(float).tiny)
-
-    @cached_property
-    def joint_regressor(self) -> csr_array:
-        """(J, N) weights: `joint_regressor @ rest vertices` are the joints of a body."""
-        return self.skeleton.joint_regressor(self.template)
 
     @cached_property
     def below(self) -> np.ndarray:
         """(N, J) how much of each vertex follows each part or what hangs below it."""
         return self.weights @ self.skeleton.descends
-
-    @cached_property
-    def terms(self) -> Terms:
-        """A constant for every part, then each part with the features that correct vertices it carries."""
-        bent = np.any(self.correctives != 0, axis=2).astype(np.float32)
-        feature, part = np.nonzero(bent @ (self.weights != 0).astype(np.float32))
-        free = np.flatnonzero(self.features.constant == 0)
-        return Terms(self.features, np.r_[np.arange(len(self.skeleton.parents)), part],
-                     np.r_[self.features.starts, free[feature]])
 
     @cached_property
     def _root(self) -> tuple[np.ndarray, np.ndarray]:
@@ -125,14 +127,20 @@ class SkinningModel(BodyModel):
             raise ValueError("betas: expected finite numbers")
         return self.shape_mean + np.tensordot(betas, self.shape_components[:len(betas)].astype(np.float64), axes=1)
 
+    def rest_joints(self, betas: np.ndarray | None) -> np.ndarray:
+        """Joints (J, 3), metres, at zero pose of the body with betas (k,), k ≤ K; None is the template's own."""
+        x = self.rest_vertices(betas)
+        if betas is None or self.joint_components is None:
+            return np.asarray(self.joint_regressor @ x)
+        return self.joint_regressor @ self.shape_mean + np.tensordot(betas, self.joint_components[:len(betas)], axes=1)
+
     def corrections(self, pose: np.ndarray) -> np.ndarray:
         """Displacements (..., N, 3), metres, of the rest vertices at poses (..., J, 3)."""
         delta = self.features.evaluate(pose)[..., self.features.constant == 0]
         return np.tensordot(delta, self.correctives.astype(np.float64), axes=1)
 
     def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
-        x = self.rest_vertices(betas)
-        joints, R = self.joint_regressor @ x, self.skeleton.part_rotations(pose)
+        x, joints, R = self.rest_vertices(betas), self.rest_joints(betas), self.skeleton.part_rotations(pose)
         posed = joints.copy()
         for j in range(1, len(joints)):
             parent = self.skeleton.parents[j]
@@ -140,7 +148,7 @@ class SkinningModel(BodyModel):
         x = x + self.corrections(pose)
         y = sum(self.weights[:, p, None] * ((x - joints[p]) @ R[p].T + posed[p]) for p in range(len(joints)))
         ids, share = self._root
-        return np.asarray(y - share @ y[ids])
+        return np.asarray(y - (share @ y[ids] if self.regressor is None else self.skeleton.joints[0]))
 
     def blended(self, pose: np.ndarray) -> np.ndarray:
         """(N, 3, 3) the weighted mean of the rotations that carry each vertex, at a pose (J, 3)."""
@@ -156,58 +164,60 @@ class SkinningModel(BodyModel):
         turns[0] = 0                                                          # the root's place is trans
         return turns
 
-    def _products(self, ids: np.ndarray, x: np.ndarray, joints: np.ndarray, bends: bool = True) -> np.ndarray:
-        """T (M, n, 3) of every term at some vertices with rest places x (n, 3), wherever the body stands."""
-        terms, J = self.terms, len(joints)
-        w, below = self.weights[ids].T, self.below[ids].T
-        T = np.zeros((terms.count, len(ids), 3))
-        T[:J] = w[..., None] * x - below[..., None] * joints[:, None]
-        for j in range(1, J):
-            T[self.skeleton.parents[j]] += below[j, :, None] * joints[j]
+    @cached_property
+    def _terms(self) -> Terms:
+        """The products that the middle of the root's vertices is a sum of: constants, then all parts with features."""
+        J, (ring, _) = len(self.skeleton.parents), self._root
+        part, feature = np.meshgrid(np.flatnonzero((self.weights[ring] != 0).any(axis=0)),
+                                    np.flatnonzero(self.features.constant == 0), indexing="ij")
+        return Terms(self.features, np.r_[np.arange(J), part.ravel()], np.r_[self.features.starts, feature.ravel()])
+
+    def _middle(self, x: np.ndarray, joints: np.ndarray, bends: bool) -> np.ndarray:
+        """T (M, 1, 3) of the middle of the root's vertices, which stays where it is, of a body with rest vertices x."""
+        (ring, share), J, terms = self._root, len(joints), self._terms
+        T, weights, below = np.zeros((terms.count, 3)), share[:, None] * self.weights[ring], share @ self.below[ring]
+        T[:J] = weights.T @ x[ring] - below[:, None] * joints
+        np.add.at(T, self.skeleton.parents[1:], below[1:, None] * joints[1:])
         if bends:
-            free = np.cumsum(self.features.constant == 0) - 1
-            for m in range(J, terms.count):
-                T[m] = w[terms.part[m], :, None] * self.correctives[free[terms.feature[m]], ids]
-        return T
+            each = np.einsum("rj,crd->jcd", weights, self.correctives[:, ring].astype(np.float64))
+            T[J:] = each[(self.weights[ring] != 0).any(axis=0)].reshape(-1, 3)
+        return T[:, None]
 
-    def _placed_products(self, ids: np.ndarray, x: np.ndarray, bends: bool = True) -> np.ndarray:
-        """T (M, n, 3) of every term at some vertices of the body with rest vertices x (N, 3)."""
-        joints, (ring, share) = self.joint_regressor @ x, self._root
-        middle = np.einsum("n,mnd->md", share, self._products(ring, x[ring], joints, bends))
-        return self._products(ids, x[ids], joints, bends) - middle[:, None]
+    @cached_property
+    def _whole(self) -> ShapedBlended:
+        """All vertices as a function of pose and betas."""
+        J, origin = len(self.skeleton.parents), self.skeleton.joints[0]
+        mix = self.features.mix[1:, :, self.features.constant == 0]
+        bends = np.tensordot(mix, self.correctives.astype(np.float64), axes=1).swapaxes(-1, -2)
+        held, U = self.regressor is None, self.shape_components.astype(np.float64)
 
-    def basis(self, betas: np.ndarray | None = None) -> np.ndarray:
-        return self._placed_products(np.arange(len(self.rest)), self.rest_vertices(betas))
+        def body(betas: np.ndarray | None) -> Blended:
+            x, joints = self.rest_vertices(betas), self.rest_joints(betas)
+            middle = Products(self._terms, self._middle(x, joints, True), np.zeros(3)) if held else None
+            return Blended(self.features, self.weights, x, joints, np.ascontiguousarray(bends),
+                           origin if held else joints[0], middle=middle)
+
+        joints = self.joint_components
+        if joints is None:
+            joints = np.stack([self.joint_regressor @ u for u in U]) if len(U) else np.zeros((0, J, 3))
+        middles = [self._middle(u, j, False) for u, j in zip(U, joints, strict=True)] if held else []
+        own = body(None)
+        mean = replace(body(np.zeros(0)), bends=own.bends)
+        return ShapedBlended(own, mean, U, joints, np.zeros((len(U), 3)) if held else joints[:, 0],
+                             np.array(middles).reshape(len(U), self._terms.count if held else 0, 1, 3))
+
+    def operator(self, betas: np.ndarray | None = None) -> Blended:
+        self.rest_vertices(betas)                                             # refuses what is wrong with betas
+        return self._whole.operator(betas)
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
-               ) -> ShapedPoints:
-        ids, weights = check_points(len(self.rest), vertex_ids, weights)
-        some, place = np.unique(ids, return_inverse=True)
-        place = place.reshape(ids.shape)
-
-        def basis(x: np.ndarray, bends: bool) -> np.ndarray:
-            T = self._placed_products(some, x, bends)[:, place]
-            return T if weights is None else np.einsum("mlkd,lk->mld", T, weights)
-
-        components = self.shape_components[:n_betas].astype(np.float64)
-        by_beta = np.zeros((len(components), self.terms.count, len(ids), 3))
-        for k, U in enumerate(components):
-            by_beta[k] = basis(U, False)
-        return ShapedPoints(self.terms, basis(self.rest_vertices(None), True),
-                            basis(self.shape_mean.astype(np.float64), True), by_beta, self.skeleton.joints[0])
+               ) -> ShapedBlended:
+        whole = self._whole if n_betas is None else self._whole.first(n_betas)
+        return whole.combined(picked(len(self.rest), vertex_ids, weights))
 
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         pose, _ = check_pose(self.skeleton, pose, None)
-        (ring, share), U = self._root, self.shape_components.astype(np.float64)
-        joints = np.stack([self.joint_regressor @ u for u in U]) if len(U) else np.zeros((0, len(pose), 3))
-        moved, B = np.einsum("jde,kje->jkd", self.joint_turns(pose), joints), self.blended(pose)
-
-        def slope(ids: np.ndarray) -> np.ndarray:
-            own = B[ids] @ U[:, ids].transpose(1, 2, 0)                       # (n, 3, K)
-            return np.asarray(own + np.tensordot(self.below[ids], moved, axes=1).transpose(0, 2, 1))
-
-        ids = np.arange(len(self.rest)) if vertex_ids is None else np.asarray(vertex_ids)
-        return slope(ids) - np.tensordot(share, slope(ring), axes=1)
+        return (self._whole if vertex_ids is None else self.points(vertex_ids)).shape_jacobian(pose)
 
     def unposed(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(N, 3) rest vertices that the model carries onto a body (N, 3) exactly, joints of their own included.
@@ -226,17 +236,34 @@ class SkinningModel(BodyModel):
     def save(self, path: str | Path) -> None:
         arrays = {**self._common_arrays(self.features), **{name: getattr(self, name) for name in _STORED},
                   "shape_variances": self.shape_variances, "shape_total": np.asarray(self.shape_total)}
-        storage.save(path, self.kind, VERSION, arrays, self._header(self.features))
+        if self.regressor is not None:
+            sparse = self.regressor.tocoo()
+            arrays |= {"regressor_joint": sparse.coords[0], "regressor_vertex": sparse.coords[1],
+                       "regressor_weight": sparse.data}
+            arrays["joint_components"] = self._whole.joints
+        header = {**self._header(self.features), "own_joints": self.regressor is not None}
+        storage.save(path, self.kind, VERSION, arrays, header)
 
     @classmethod
     def load(cls, path: str | Path) -> SkinningModel:
         """Read a file of `save`; see `load_model`."""
-        header, a = storage.load(path, cls.kind, (1, VERSION))
+        header, a = storage.load(path, cls.kind, (1, 2, VERSION))
         with storage.taking_apart(path, "a whole model"):
-            parts = restored_parts(header, a, VERSION)
+            parts = restored_parts(header, a, 2)
             stored: dict[str, Any] = {name: storage.numbers(a, name, *(None,) * axes) for name, axes in _STORED.items()}
             stored["shape_variances"], stored["shape_total"] = restored_variances(a, "shape_total")
-            return cls(features=restored_features(parts["skeleton"], header, a), **parts, **stored)
+            return cls(features=restored_features(parts["skeleton"], header, a), **parts, **stored,
+                       **_restored_joints(parts["skeleton"], header, a))
+
+
+def _restored_joints(skeleton: Skeleton, header: Mapping[str, Any], a: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The joints that an imported model has of its own."""
+    if not header.get("own_joints"):
+        return {}
+    J, data = len(skeleton.parents), storage.numbers(a, "regressor_weight", None)
+    at = tuple(storage.numbers(a, f"regressor_{name}", len(data), kinds="iu") for name in ("joint", "vertex"))
+    return {"regressor": csr_array(coo_array((data, at), shape=(J, len(a["vertices"])))),
+            "joint_components": storage.numbers(a, "joint_components", None, J, 3)}
 
 
 _STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3}

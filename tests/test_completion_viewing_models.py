@@ -44,8 +44,8 @@ def test_a_movable_body_is_the_model(model):
 
 def test_moving_one_slider_makes_one_difference(model, monkeypatch):
     body, pose, made = MovableBody(model), np.zeros((4, 3)), []
-    real = type(model).basis
-    monkeypatch.setattr(type(model), "basis", lambda self, betas=None: made.append(betas) or real(self, betas))
+    real = type(model).operator
+    monkeypatch.setattr(type(model), "operator", lambda self, betas=None: made.append(betas) or real(self, betas))
     for value in np.linspace(-2, 2, 9):
         body.vertices(np.array([value, 0, 0]), pose)
     assert len(made) == 2                                # of one standard deviation, and of the mean

@@ -187,8 +187,7 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray) -> 
 
 def rest_joints(subject: Subject) -> np.ndarray:
     """(J, 3) metres: the joints of a person at rest."""
-    rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    return subject.skeleton.joint_regressor(subject.template) @ rest
+    return subject.joints(np.zeros((len(subject.skeleton.parents), 3)))
 
 
 def angles_of(found: Anatomy, ground: np.ndarray, R: np.ndarray) -> np.ndarray:

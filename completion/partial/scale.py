@@ -44,7 +44,7 @@ class ScaledBody(FixedBody):
     def held(self, x: np.ndarray) -> FixedBody:
         """The body with the shape and size it has at x (P,), as one of known shape."""
         subject = self.inner.held(x[:-1]).subject
-        return FixedBody(replace(subject, basis=(np.exp(-LOOSE * x[-1]) * subject.basis).astype(subject.basis.dtype)))
+        return FixedBody(replace(subject, operator=subject.operator.scaled(float(np.exp(-LOOSE * x[-1])))))
 
     def vertices(self, x: np.ndarray) -> np.ndarray:
         """The predicted mesh (N, 3) of unknowns (P,)."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.linear import Subject, posed_product
+from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import heat
 from scanprep.pictures.low_rank import low_rank
@@ -42,10 +42,9 @@ def as_columns(motion: Motion, subject: Subject, frames: np.ndarray) -> tuple[np
     made, _ = low_rank(frames.astype(np.float64))
     even = np.full((made.shape[0], 1), made.shape[0] ** -0.5)              # moves all vertices alike
     basis = np.linalg.qr(np.hstack([even, made]))[0]
-    flat = np.einsum("mnc,nr->mcr", subject.basis, basis.astype(subject.basis.dtype), optimize=True).reshape(
-        -1, basis.shape[1]).astype(np.float64)
+    columns = subject.operator.combined(basis.T).astype(np.float64)
     place = (subject.origin + motion.trans)[:, None] * basis.sum(axis=0)[:, None]
-    out = np.concatenate([posed_product(subject.terms, flat, motion.poses[i:i + AT_ONCE])
+    out = np.concatenate([columns.turned(motion.poses[i:i + AT_ONCE])
                           for i in range(0, len(motion.poses), AT_ONCE)])
     return basis, np.swapaxes(out, 1, 2) + place
 

@@ -1,8 +1,8 @@
 """A body whose shape and pose change from moment to moment, by sliders: a product of matrices at every move.
 
-Vertices are affine in betas and linear in the terms of the fast path, `Y = W(pose) (T + Σ_k Δβ_k D_k)`. `D_k` is what
-the basis gains by one standard deviation of component k; it is made when that slider is first moved. While the pose
-stands still, `W T` and `W D_k` are kept and a move of a shape's slider is one multiplication of vertices.
+Vertices are affine in betas, `Y = Y_0(pose) + Σ_k Δβ_k D_k(pose)`. `D_k` is what the body gains by one standard
+deviation of component k; it is made when that slider is first moved. While the pose stands still, `Y_0` and `D_k` are
+kept and a move of a shape's slider is one multiplication of vertices.
 """
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from collections import OrderedDict
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import PointOperator, posed_product
+from model.linear import PointOperator, picked
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.names import in_words
 
-FEW = 3                              # differences beside the basis at a new pose: for more it gets these betas itself
-KEPT = 24                            # differences of the basis that are kept, those used last
+FEW = 3                              # differences beside the body at a new pose: for more it gets these betas itself
+KEPT = 24                            # differences of the body that are kept, those used last
 
 
 class MovableBody:
@@ -31,12 +31,12 @@ class MovableBody:
         self.model, self.skeleton = model, model.skeleton
         self.parts = tuple(map(part_in_words, model.skeleton.names))
         self.part_of_vertex = model.skeleton.part_of_vertex(model.template)
-        self.regressor = model.skeleton.joint_regressor(model.template)
+        self.regressor = model.joint_regressor
         self.betas: np.ndarray | None = np.zeros(model.n_betas) if model.n_betas else None
-        self.basis = self._made(self.betas)                       # (3M, N) float32, of `betas`
-        self._differences: OrderedDict[int, np.ndarray] = OrderedDict()
+        self.operator = model.operator(self.betas).astype(np.float32)
+        self._differences: OrderedDict[int, PointOperator] = OrderedDict()
         self._pose = np.zeros((0, 3))
-        self._products: dict[int, np.ndarray] = {}                # at `_pose`; -1 is that of the basis
+        self._products: dict[int, np.ndarray] = {}                # at `_pose`; -1 is the body itself
 
     @property
     def n_parts(self) -> int:
@@ -71,12 +71,11 @@ class MovableBody:
     def point(self, vertex: int, betas: np.ndarray | None) -> PointOperator:
         """One vertex of the body with these betas, as a function of the pose."""
         self._settle(betas)
-        column = self._column(vertex).astype(np.float64).reshape(-1, 1, 3)
-        return PointOperator(self.model.terms, column, self.origin)
+        return self.operator.combined(picked(self.operator.count, *self._below(vertex))).astype(np.float64)
 
-    def _column(self, vertex: int) -> np.ndarray:
-        """(3M,) of the basis."""
-        return self.basis[:, vertex]
+    def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """The vertex of the model that it is, as for `Subject.points`."""
+        return np.array([vertex]), None
 
     @property
     def layers(self) -> tuple[MovableBody, ...]:
@@ -92,7 +91,7 @@ class MovableBody:
         return self.model.template.with_vertices(self.model.vertices(pose, betas, trans))
 
     def _changed(self, betas: np.ndarray | None) -> np.ndarray | None:
-        """Which betas are not those of the basis; None where it has to be made again."""
+        """Which betas are not those of the operator; None where it has to be made again."""
         if betas is None or self.betas is None:
             return np.zeros(0, dtype=np.int64) if betas is None and self.betas is None else None
         changed = np.flatnonzero(betas != self.betas)
@@ -100,38 +99,31 @@ class MovableBody:
         return changed if len(missing) < 2 else None               # to make all at once is quicker
 
     def _settle(self, betas: np.ndarray | None) -> None:
-        """Give the basis these betas."""
+        """Give the operator these betas."""
         changed = self._changed(betas)
         if changed is None or any(k not in self._differences for k in changed.tolist()):
-            self.basis = self._made(betas)
+            self.operator = self.model.operator(betas).astype(np.float32)
         elif len(changed):
             assert betas is not None and self.betas is not None
-            basis = self.basis.copy()
             for k in changed.tolist():
-                basis += np.float32(betas[k] - self.betas[k]) * self._differences[k]
-            self.basis = basis
+                self.operator = self.operator.plus(betas[k] - self.betas[k], self._differences[k])
         self.betas = None if betas is None else np.array(betas)
         self._pose, self._products = np.zeros((0, 3)), {}
 
-    def _made(self, betas: np.ndarray | None) -> np.ndarray:
-        T = self.model.basis(betas)
-        return np.ascontiguousarray(T.transpose(0, 2, 1), dtype=np.float32).reshape(-1, T.shape[1])
-
     def _product(self, k: int) -> np.ndarray:
-        """(3, N) of the basis, or of difference k, at the pose."""
+        """(3, N) of the body, or of difference k, at the pose."""
         if k not in self._products:
-            flat = self.basis if k < 0 else self._difference(k)
-            self._products[k] = posed_product(self.model.terms, flat, self._pose)
+            one, shift = (self.operator, self.origin) if k < 0 else (self._difference(k), np.zeros(3))
+            self._products[k] = one.turned(self._pose) + (one.origin - shift).astype(np.float32)[:, None]
         return self._products[k]
 
-    def _difference(self, k: int) -> np.ndarray:
-        """(3M, N) what the basis gains by one standard deviation of component k."""
+    def _difference(self, k: int) -> PointOperator:
+        """What the body gains by one standard deviation of component k."""
         if k not in self._differences:
             unit = np.zeros(self.model.n_betas)
             unit[k] = 1
-            gained = self.model.basis(unit) - self.model.basis(np.zeros_like(unit))
-            self._differences[k] = np.ascontiguousarray(gained.transpose(0, 2, 1), dtype=np.float32).reshape(
-                -1, gained.shape[1])
+            gained = self.model.operator(unit).plus(-1, self.model.operator(np.zeros_like(unit)))
+            self._differences[k] = gained.astype(np.float32)
             while len(self._differences) > KEPT:
                 self._differences.popitem(last=False)
         self._differences.move_to_end(k)

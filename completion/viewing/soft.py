@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import posed_product
 from scanprep.pictures.colors import Heat
 from scanprep.pictures.low_rank import low_rank
 from scanprep.pictures.shading import Moving, Shape, Solid
@@ -79,14 +78,14 @@ def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tupl
     own = soft.betas(0.0)[0]
     shares, sizes, directions = np.linalg.svd(soft.changes, full_matrices=False)
     shares = (shares * sizes)[:, sizes > LEAST * np.sqrt(len(soft.changes))]
-    rest = model.basis(own)
-    gained = [model.basis(own + direction) - rest for direction in directions[:shares.shape[1]]]
-    flats = [np.einsum("mnc,nr->mcr", T, basis, optimize=True).reshape(-1, basis.shape[1]) for T in (rest, *gained)]
-    amounts = np.hstack([np.ones((len(shares), 1)), shares])               # of each product, in every frame
-    poses, places = soft.motion.poses, model.skeleton.joints[0] + soft.motion.trans
-    out = np.zeros((len(poses), 3, basis.shape[1]))
-    for flat, amount in zip(flats, amounts.T, strict=True):
+    rest, whole = model.operator(own), basis.sum(axis=0)[:, None]
+    gained = [model.operator(own + direction).plus(-1, rest) for direction in directions[:shares.shape[1]]]
+    amounts = np.hstack([np.ones((len(shares), 1)), shares])               # of each body, in every frame
+    poses = soft.motion.poses
+    out = soft.motion.trans[:, :, None] * whole.T
+    for body, amount in zip((rest, *gained), amounts.T, strict=True):
+        columns, origin = body.combined(basis.T), body.origin[:, None] * whole.T
         for i in range(0, len(poses), AT_ONCE):
             now = slice(i, i + AT_ONCE)
-            out[now] += amount[now, None, None] * posed_product(model.terms, flat, poses[now])
-    return basis, np.swapaxes(out, 1, 2) + places[:, None] * basis.sum(axis=0)[:, None]
+            out[now] += amount[now, None, None] * (columns.turned(poses[now]) + origin)
+    return basis, np.swapaxes(out, 1, 2)

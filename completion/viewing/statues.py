@@ -61,9 +61,9 @@ class MovableStatue(MovableBody):
         """The detailed surface, made the exact way."""
         return self.detailed.mesh(self.model.vertices(pose, betas, trans))
 
-    def _column(self, vertex: int) -> np.ndarray:
-        """Of the place of the control mesh below a vertex."""
-        return np.asarray(self.basis[:, self._corners[vertex]] @ self._bary[vertex])
+    def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """The place of the control mesh below a vertex."""
+        return self._corners[[vertex]], self._bary[[vertex]]
 
 
 def movable(model: BodyModel, statue: Statue | None) -> MovableBody:

@@ -234,7 +234,7 @@ def _measured_rig(kind: str, model: BodyModel, person: np.ndarray | None, rig: R
     exact = subject.vertices(poses[frames])
     told = [Metric("measured on", where)]
     if kind == "bvh":
-        joints = np.einsum("jn,tna->tja", model.skeleton.joint_regressor(model.template).toarray(), exact)
+        joints = subject.joints(poses[frames])
         off = np.linalg.norm(joint_places(rig.skeleton, poses[frames]) - joints, axis=-1)
         return rig, [*told, *_distances("joints of the exact body", off)]
     if moves is not None and count != 0:

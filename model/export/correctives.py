@@ -17,7 +17,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 
 from ..body import BodyModel
+from ..features import RotationLift
 from ..linear import Subject
+from ..skinning import SkinningModel
 from .rig import Correctives, Rig, make_rig
 
 AT_ONCE = 256                        # frames that are held at a time, of a few points
@@ -128,8 +130,8 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
     Posed by `Σ_j weights_j G_j (v_template + shapedirs @ betas + posedirs @ vec(R_1 - I, ..., R_{J-1} - I))`, where G_j
     rotates about `J_regressor @ (v_template + shapedirs @ betas)` and R_j is the rotation of part j against its parent,
     row by row. With betas of zero it is the mean person, or the template's own body where the model has no betas. No
-    kind of model here is linear in R - I, so the pose directions are fitted to so many draws from the prior; with 0
-    there are none. Weights (N, J) are as for `make_rig`.
+    kind of model that is learned here is linear in R - I, so the pose directions are fitted to so many draws from the
+    prior, with 0 there are none; an imported model has its own. Weights (N, J) are as for `make_rig`.
 
     `v_template` (N, 3) metres, `f` (F, 3), `weights` (N, J), `kintree_table` (2, J) with the parents (-1 for the root)
     over the parts, `J_regressor` (J, N), `J` (J, 3) metres, `shapedirs` (N, 3, K) metres per standard deviation,
@@ -141,11 +143,13 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
     arrays = {
         "v_template": rig.mesh.vertices, "f": rig.mesh.faces.astype(np.int64), "weights": rig.weights,
         "kintree_table": np.stack([model.skeleton.parents, np.arange(J)]),
-        "J_regressor": model.skeleton.joint_regressor(model.template).toarray(), "J": rig.skeleton.joints,
+        "J_regressor": model.joint_regressor.toarray(), "J": rig.skeleton.joints,
         "shapedirs": np.moveaxis(rig.shapes, 0, -1).astype(np.float32),
         "part_names": np.array(model.skeleton.names, dtype=str), "betas_unit": np.array("standard deviation"),
         "length_unit": np.array("metre")}
-    if draws and J > 1:
+    if isinstance(model, SkinningModel) and model.features.lift.kind == RotationLift.kind and len(model.correctives):
+        arrays["posedirs"] = np.moveaxis(model.correctives, 0, -1)
+    elif draws and J > 1:
         poses = sample_poses(model, draws, np.random.default_rng(0))
         arrays["posedirs"] = pose_directions(rig, poses, model.subject(mean).vertices(poses)).astype(np.float32)
     with writing(path) as beside, open(beside, "wb") as out:

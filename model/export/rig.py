@@ -142,6 +142,8 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     if weights is None and isinstance(model, SkinningModel):
         weights = model.weights
     rig = subject_rig(model, model.vertices(rest, betas), weights)
+    if isinstance(model, SkinningModel):                     # of STAR they do not follow all that betas do
+        rig = replace(rig, skeleton=replace(rig.skeleton, joints=model.rest_joints(betas)))
     return replace(rig, shapes=np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)) if shapes else rig
 
 
@@ -151,7 +153,7 @@ def subject_rig(body: BodyModel | Subject, rest: np.ndarray | None = None, weigh
     if rest is None:
         assert isinstance(body, Subject), "a model has many bodies"
         rest = body.vertices(np.zeros((len(skeleton.parents), 3)))
-    joints = skeleton.joint_regressor(template) @ rest
+    joints = body.joint_regressor @ rest
     weights = skin_weights(template, skeleton) if weights is None else weights
     return Rig(template.with_vertices(rest), replace(skeleton, joints=joints), strongest(weights),
                np.zeros((0, *rest.shape)))

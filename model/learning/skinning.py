@@ -91,7 +91,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     examples = pose_examples(template, skeleton, at, shapes)
     mean, covariance = pose_prior(template, skeleton, examples, len(at))
     info = {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
-            **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
+            **model.info, "digest": digest(template, poses, shapes)}
     return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)
 
 

@@ -17,7 +17,7 @@ from .bvh import read_bvh
 from .error import Followed, followed
 from .files import StoredMotion, betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
-from .retarget import AT_ONCE, Pairing, Retargeted, retargeted
+from .retarget import Pairing, Retargeted, retargeted
 from .same import copied
 from .standing import standing_rest
 
@@ -102,9 +102,7 @@ def _of_family(path: Path, stored: StoredMotion, model: BodyModel, subject: Subj
 def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, gender: str = "neutral"
           ) -> BodyMotion:
     """A motion of another skeleton on a body."""
-    regressor = subject.skeleton.joint_regressor(subject.template)
-    rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    skeleton = replace(subject.skeleton, joints=regressor @ rest)
+    skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
     same = copied(skeleton, subject.template, subject.vertices, moving)
     if same is not None:
         return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,
@@ -117,9 +115,6 @@ def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, 
         found = retargeted(pair)
     except ValueError as problem:
         raise StorageError(f"{path}: {problem}") from None
-    centres = np.concatenate([[regressor @ body for body in subject.vertices(found.poses[k:k + AT_ONCE],
-                                                                              found.trans[k:k + AT_ONCE])]
-                              for k in range(0, len(found.poses), AT_ONCE)])
-    fit = followed(pair, found.poses, centres)
+    fit = followed(pair, found.poses, subject.joints(found.poses, found.trans))
     return BodyMotion(found.poses, found.trans, subject.betas, found.rate, gender, "by the directions of the segments",
                       uncertain, found, fit)

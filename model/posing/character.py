@@ -183,7 +183,7 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
         body = fit.mesh
     pose = character_pose(model, body.vertices, config.character)
     found = character_model(model, body.vertices, config.character, pose)
-    joints = model.skeleton.joint_regressor(model.template) @ body.vertices
+    joints = model.joint_regressor @ body.vertices
     return Character(found, body, pose, joints, inside(body, joints), fit)
 
 

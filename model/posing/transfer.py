@@ -63,8 +63,7 @@ def own_body(model: BodyModel, vertices: np.ndarray, fit: PoseFit | None = None)
                          f"got shape {vertices.shape}")
     subject = replace(exact_subject(model, vertices, fit),
                       betas=fit.betas if isinstance(fit, ShapeFit) else None)
-    ring, share = model.skeleton.joint_weights(model.template, 0)
-    trans = share @ vertices[ring] - model.skeleton.joints[0]
+    trans = (model.joint_regressor[[0]] @ (vertices - subject.vertices(pose)))[0]
     found = subject.vertices(pose, trans)
     far = np.linalg.norm(found - vertices, axis=1)
     return OwnBody(subject, pose, trans, found, float(far.mean()), float(far.max()))

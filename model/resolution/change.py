@@ -6,6 +6,7 @@ from functools import singledispatch
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from model.priors import sample_poses
@@ -13,7 +14,7 @@ from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
 from scanprep.ranges import Settings
-from scanprep.skeleton.tree import Skeleton
+from scanprep.skeleton.tree import Skeleton, affine_weights
 
 from ..body import BodyModel
 from ..pose_space import PoseSpace, faces_of_part
@@ -147,7 +148,20 @@ def _transfer_skinning(model: SkinningModel, template: Mesh, config: ResolutionC
         features=replace(model.features, skeleton=skeleton), correctives=displaced(model.correctives),
         shape_mean=shape_mean, shape_components=displaced(model.shape_components),
         shape_variances=model.shape_variances * per_vertex, shape_total=model.shape_total * per_vertex,
-        info=transfer_info(model, template))
+        regressor=_transfer_regressor(model, template), info=transfer_info(model, template))
+
+
+def _transfer_regressor(model: SkinningModel, template: Mesh) -> csr_array | None:
+    """The joints of a model that has its own, as combinations of the new vertices nearest to theirs and to them."""
+    if model.regressor is None:
+        return None
+    near, places, old = cKDTree(template.vertices), model.regressor @ model.template.vertices, model.regressor
+    rows = np.zeros((len(places), len(template.vertices)))
+    for j, place in enumerate(places):
+        theirs = model.template.vertices[old.indices[old.indptr[j]:old.indptr[j + 1]]]
+        chosen = np.union1d(near.query(theirs)[1], near.query(place, 8)[1])
+        rows[j, chosen] = affine_weights(template.vertices[chosen], place)
+    return csr_array(rows)
 
 
 def transfer_info(model: BodyModel, template: Mesh) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import sparray
 
 from ..geometry import storage
 
@@ -88,6 +89,9 @@ class Digests:
             self._several(whole, "map", sorted(((str(k), v) for k, v in value.items()), key=lambda kv: kv[0]))
         elif isinstance(value, list | tuple):
             self._several(whole, "list", value)
+        elif isinstance(value, sparray):
+            entries = value.tocoo()
+            self._several(whole, "sparse", [entries.shape, *entries.coords, entries.data])
         elif isinstance(value, set | frozenset):
             self._several(whole, "set", sorted(value))
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -121,7 +121,7 @@ class Skeleton:
             ring = self.ring(template, j, widen=2)
             if not len(ring):
                 raise ValueError(f"part_of_face: part {j} does not touch its parent {self.parents[j]}")
-        return ring, _affine_weights(template.vertices[ring], self.joints[j])
+        return ring, affine_weights(template.vertices[ring], self.joints[j])
 
     def part_rotations(self, pose: np.ndarray) -> np.ndarray:
         """World rotations (..., J, 3, 3) of the parts for poses (..., J, 3), radians.
@@ -177,7 +177,7 @@ class Skeleton:
             return Skeleton(stored["part_of_face"], stored["parents"], stored["joints"], tuple(stored["names"]))
 
 
-def _affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+def affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Weights nearest to equal that sum to 1 and average `points` (n, 3) to `target`."""
     n = len(points)
     scale = np.linalg.norm(points - points.mean(axis=0), axis=1).mean()

@@ -12,7 +12,7 @@ from model.export.conventions import aimed
 from model.export.correctives import body_correctives, motion_correctives, off_exact
 from model.export.glb import write_skinned_glb
 from model.export.rig import subject_rig
-from model.linear import PointOperator, Subject
+from model.linear import Subject
 from scanprep.console import Metric
 from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
@@ -41,12 +41,8 @@ def joint_angles(motion: Motion) -> np.ndarray:
 
 
 def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
-    """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them."""
-    regressor = subject.skeleton.joint_regressor(subject.template)
-    M, N, _ = subject.basis.shape
-    basis = (regressor @ subject.basis.transpose(1, 0, 2).reshape(N, -1)).reshape(-1, M, 3).transpose(1, 0, 2)
-    operator = PointOperator(subject.terms, basis.astype(np.float64), subject.origin)
-    return operator.evaluate(motion.poses, motion.trans)
+    """(T, J, 3) metres: where the joints are, as affine combinations of the surface around them, or the model's own."""
+    return subject.joints(motion.poses, motion.trans)
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None) -> None:
@@ -76,7 +72,7 @@ def write_residuals(path: Path, motion: Motion) -> None:
 def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
     """BVH in centimetres: the subject's bones at rest, of fixed length, and the motion."""
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    skeleton = replace(subject.skeleton, joints=subject.skeleton.joint_regressor(subject.template) @ rest)
+    skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
     write_bvh(path, skeleton, motion.poses, motion.trans, motion.rate, up=upright(subject.template)[0],
               body=subject.template.with_vertices(rest))
 

@@ -2,14 +2,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
-from model.linear import PointOperator
+from model.linear import PointOperator, picked
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
@@ -60,27 +60,22 @@ class BodyPoints:
 
     def __init__(self, shaped: ShapedPoints) -> None:
         self.shaped = shaped
-        self.n_betas, _, self.count, _ = shaped.shape_basis.shape
-        self.n_angles = 3 * len(shaped.terms.skeleton.parents)
+        self.n_betas, self.count = shaped.n_betas, shaped.count
+        self.n_angles = 3 * len(shaped.skeleton.parents)
         self.n_unknowns = self.n_angles + 3 + self.n_betas
-        self._changes = shaped.shape_basis.reshape(self.n_betas, -1)
 
     def some(self, chosen: np.ndarray) -> BodyPoints:
         """Some of the points."""
-        shaped = self.shaped
-        return BodyPoints(replace(shaped, template_basis=shaped.template_basis[:, chosen],
-                                  mean_basis=shaped.mean_basis[:, chosen],
-                                  shape_basis=shaped.shape_basis[:, :, chosen]))
+        return BodyPoints(self.shaped.combined(picked(self.count, np.arange(self.count)[chosen], None)))
 
     @property
     def batch(self) -> int:
         """Bodies whose derivatives are held at once."""
         # numbers of a batch of derivatives
-        return max(1, 2**25 // max(1, 3 * self.count * (self.n_unknowns + self.shaped.terms.count)))
+        return max(1, 2**25 // max(1, 3 * self.count * (self.n_unknowns + self.shaped.load)))
 
     def _operators(self, betas: np.ndarray) -> list[PointOperator]:
-        change = (betas @ self._changes).reshape(len(betas), *self.shaped.mean_basis.shape)
-        return [PointOperator(self.shaped.terms, self.shaped.mean_basis + own, self.shaped.origin) for own in change]
+        return [self.shaped.operator(own) for own in betas]
 
     def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         n = self.n_angles
@@ -169,12 +164,12 @@ def rough_poses(model: BodyModel, bodies: np.ndarray, n_betas: int) -> np.ndarra
     """Unknowns (Z, 3J + 3 + K) of the mean person whose parts are turned as those of bodies (Z, N, 3)."""
     J = len(model.skeleton.parents)
     rest = model.template.with_vertices(model.vertices(np.zeros((J, 3)), np.zeros(n_betas)))
-    ring, share = model.skeleton.joint_weights(model.template, 0)
+    root = model.joint_regressor[[0]]
     x = np.zeros((len(bodies), 3 * J + 3 + n_betas))
     for i, body in enumerate(bodies):
         pose = model.skeleton.pose_of(model.skeleton.fit_rotations(rest, body))
         x[i, :3 * J] = rotations.log(rotations.exp(pose)).ravel()
-        x[i, 3 * J:3 * J + 3] = share @ body[ring] - model.skeleton.joints[0]
+        x[i, 3 * J:3 * J + 3] = (root @ body)[0] - model.skeleton.joints[0]
     return x
 
 

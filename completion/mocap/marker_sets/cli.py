@@ -149,7 +149,7 @@ def _body(model: Path | None, body: Path | None, unit: Unit | None
     loaded, name = read_model(model)
     kept = loaded.info.get("people_vertices")
     rest = at_rest(loaded)
-    skeleton = replace(loaded.skeleton, joints=loaded.skeleton.joint_regressor(loaded.template) @ rest.vertices)
+    skeleton = replace(loaded.skeleton, joints=loaded.joint_regressor @ rest.vertices)
     return rest, skeleton, None if kept is None else np.array(kept), name
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import Subject, posed_product
+from model.linear import Subject
 
 from ...energy import lifted
 from ...motion import Motion
@@ -97,11 +97,8 @@ def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], mark
     if soft is None:
         return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), None)
     moving = points.evaluate(soft.motion.poses, soft.motion.trans)
-    K, M, L, _ = shaped.shape_basis.shape
-    flat = np.ascontiguousarray(shaped.shape_basis.transpose(1, 3, 0, 2)).reshape(3 * M, K * L)
     changes = np.pad(soft.changes, ((0, 0), (0, K - soft.changes.shape[1])))
     for start in range(0, len(moving), AT_ONCE):
         some = slice(start, start + AT_ONCE)
-        by_beta = posed_product(shaped.terms, flat, soft.motion.poses[some]).reshape(-1, 3, K, L)
-        moving[some] += np.einsum("tk,tdkl->tld", changes[some], by_beta)
+        moving[some] += np.einsum("tk,tldk->tld", changes[some], shaped.shape_jacobian(soft.motion.poses[some]))
     return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), np.linalg.norm(lifted(moving, lift) - seen, axis=2))

@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter1d
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import Dense
 
-from .marked_body import MarkedBody, PartShapes, point_system
+from .marked_body import MarkedBody, PartShapes, part_shapes, point_system
 from .robust import runs
 
 TOUCH = 0.025                        # metres above the floor below which a point may stand
@@ -84,7 +84,7 @@ class FootContact:
         pose, trans, _ = body.body.split(x[np.unique(np.linspace(0, len(x) - 1, 150).astype(int))])
         vertices = subject.vertices(pose, trans)
         self.floor = floor or Floor.below(vertices)
-        self.shapes = PartShapes(subject.points(_soles(subject.template.vertices, self.floor.above(vertices))))
+        self.shapes = part_shapes(subject.points(_soles(subject.template.vertices, self.floor.above(vertices))))
         self.stands = self._standing_places(self._points(x), rate)
 
     def held(self, x: np.ndarray) -> HeldPoints:

@@ -5,6 +5,7 @@ feature and a rotation falls apart into one local shape a part, rotated once:
 
     Y = Σ_p (K_p + Σ_j Σ_c f_c(t_j) B_{p,j,c}) R_pᵀ + origin + trans
 
+Where every feature moves every point, as in skinned bodies, the operator of the points itself has the fewest products.
 Everything is done for a batch of poses. Derivatives are by small rotations of every joint from the right,
 `R_parent exp(pose) exp(d)`, so that no chart ends at a half turn.
 """
@@ -14,9 +15,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from model.blended import Blended
 from model.features import twists
 from model.linear import PointOperator, Subject
 from model.priors import gaussian_prior
+from model.products import Products, Terms
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
@@ -109,7 +112,7 @@ def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weight
 class PartShapes:
     """Points (L) of a body as local shapes of its parts; coordinates come before points, (3, L), everywhere."""
 
-    def __init__(self, operator: PointOperator) -> None:
+    def __init__(self, operator: Products) -> None:
         terms, features = operator.terms, operator.terms.features
         self.skeleton, self.lift, self.origin = terms.skeleton, features.lift, operator.origin
         J, L, m = len(terms.skeleton.parents), operator.count, features.lift.width
@@ -186,6 +189,52 @@ class PartShapes:
         self._arrange()
 
 
+class SkinnedShapes(PartShapes):
+    """Points (L) of a skinned body: its operator moves them, and what lifts them off the skin is shapes of parts."""
+
+    def __init__(self, operator: Blended) -> None:
+        of_part, L = operator.skeleton.joints_of_part, operator.count
+        part = np.repeat(np.arange(len(of_part)), [len(joints) for joints in of_part])
+        features = operator.features
+        constants = np.arange(features.count)[features.constant == 1]
+        super().__init__(Products(Terms(features, np.arange(len(of_part)), constants),
+                                  np.zeros((len(of_part), L, 3)), operator.origin))
+        self.bends = {(int(p), j): np.zeros((self.lift.width, 3, L))
+                      for p, j in zip(part, (j for joints in of_part for j in joints), strict=True)}
+        self.operator, self.lifts = operator, False
+
+    def evaluate(self, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
+        y = np.swapaxes(self.operator.evaluate(pose, trans), 1, 2)
+        return y + super().evaluate(pose, np.zeros_like(trans) - self.origin) if self.lifts else y
+
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        y, by_pose = self.operator.columns(pose, trans)
+        B, J, L = len(pose), self.joints, self.count
+        # a turn d from the right changes the pose by the inverse right Jacobian times d
+        local = np.swapaxes(rotations.inverse_right_jacobian(pose), -1, -2)
+        out = np.empty((B, 3 * J + 3, 3, L))
+        by_turn = (local @ by_pose.reshape(B, J, 3, 3 * L)).reshape(B, 3 * J, L, 3)
+        out[:, :-3] = np.swapaxes(by_turn, -1, -2)
+        out[:, -3:] = np.eye(3)[:, :, None]
+        y = np.swapaxes(y, 1, 2)
+        if self.lifts:
+            lift, by_turn = super().columns(pose, np.zeros_like(trans) - self.origin)
+            y, out[:, :-3] = y + lift, out[:, :-3] + by_turn[:, :-3]
+        return y, out
+
+    def lift_off(self, part: np.ndarray, offsets: np.ndarray, bends: list[dict[int, np.ndarray]]) -> None:
+        super().lift_off(part, offsets, bends)
+        self.lifts = True
+
+
+def part_shapes(operator: PointOperator) -> PartShapes:
+    """The points of an operator for the inner loop."""
+    if isinstance(operator, Products):
+        return PartShapes(operator)
+    assert isinstance(operator, Blended), "one of the two kinds of operators"
+    return SkinnedShapes(operator)
+
+
 def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray, distances: np.ndarray
                   ) -> PartShapes:
     """Markers at distances (L,), metres, above the skin as local shapes; points (3L, k) are those of `supports`.
@@ -193,7 +242,7 @@ def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray,
     The exact normal, of `energy.above_skin`, is no linear function of the body's features: over poses drawn from the
     prior it is regressed on the rotation of the part that it follows best and the lifted twists of that part's joints.
     """
-    shapes = PartShapes(subject.points(vertex_ids[::3], weights[::3]))
+    shapes = part_shapes(subject.points(vertex_ids[::3], weights[::3]))
     if not distances.any():
         return shapes
     poses = _sample_poses(subject)

@@ -99,8 +99,7 @@ def _along_lines(model: BodyModel, middle: np.ndarray, shares: np.ndarray, steps
     first = model.subject(middle)
     out = first.vertices(poses, trans).astype(np.float64)
     for share, step in zip(shares.T, steps, strict=True):
-        change = model.subject(middle + step).basis - first.basis
-        out += share[:, None, None] * replace(first, basis=change, origin=np.zeros(3)).vertices(poses)
+        out += share[:, None, None] * model.operator(middle + step).plus(-1, first.operator).evaluate(poses)
     return out
 
 

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
 from model.body import BodyModel
-from model.linear import Subject, posed_product
+from model.linear import Subject
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import harmonic
@@ -69,9 +69,8 @@ def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyMode
     for start in range(0, len(trans), AT_ONCE):
         some = slice(start, start + AT_ONCE)
         fixed = points.operator(np.zeros(K)).evaluate(motion.poses[some])[..., up]
-        flat = np.ascontiguousarray(points.shape_basis.transpose(1, 3, 0, 2)).reshape(-1, K * len(soles))
-        slopes = posed_product(points.terms, flat, motion.poses[some])[..., up, :].reshape(-1, K, len(soles))
-        changed = fixed + np.einsum("tkl,tk->tl", slopes, changes[some])
+        slopes = points.shape_jacobian(motion.poses[some])[..., up, :]
+        changed = fixed + np.einsum("tlk,tk->tl", slopes, changes[some])
         trans[some, up] += sign * ((sign * fixed).min(axis=1) - (sign * changed).min(axis=1))
     return SoftTissue(replace(motion, trans=trans), changes)
 

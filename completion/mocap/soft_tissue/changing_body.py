@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import check_pose, posed_product
+from model.linear import check_pose
 from scanprep.geometry.least_squares import Dense
 
 from ...energy import MovingPoints, above_skin
@@ -47,8 +47,8 @@ def skin_metric(model: BodyModel, slopes: np.ndarray) -> np.ndarray:
 class ChangingBody:
     """A person with markers whose betas change by Δ = z @ directions (K, K) around their own.
 
-    Markers are affine in z, `y(θ) + D(θ) z`, D (3L, K) linear in products of features and rotations: one matrix product
-    for a batch of poses. `slopes` (N, 3, K) of all vertices by betas in the mean pose tell how the skin turns.
+    Markers are affine in z, `y(θ) + D(θ) z`, D (3L, K). `slopes` (N, 3, K) of all vertices by betas in the mean pose
+    tell how the skin turns.
     """
 
     def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, directions: np.ndarray,
@@ -56,32 +56,25 @@ class ChangingBody:
         self.marked = MarkedBody(model.subject(betas), layout, prior_weight, prior_shrinkage)
         self.directions = directions
         self.count, self.n_betas = self.marked.count, len(directions)
-        self.terms = model.terms
-        self._flat = self._along(model, layout, slopes)
-
-    def _along(self, model: BodyModel, layout: MarkerLayout, slopes: np.ndarray) -> np.ndarray:
-        """(3M, K L): the change of the markers along the directions, normals included."""
         ids, weights = supports(model.template, layout)
-        basis = model.points(ids[::3], weights[::3], self.n_betas).shape_basis
-        distances = np.asarray(layout.distances)
-        if distances.any():
-            mean = self.marked.body.subject.vertices(model.pose_mean)
-            skin = MovingPoints(*(np.einsum("lk,lk...->l...", weights, of[ids]) for of in (mean, slopes)))
-            turning = above_skin(skin, np.ones(len(distances))).jacobian - skin.jacobian[::3]    # of the normals
-            part = model.skeleton.part_of_vertex(model.template)[ids[::3, 0]]
-            R = model.skeleton.part_rotations(model.pose_mean)
-            plain = self.terms.features.constant[self.terms.feature] == 1
-            for i, p in enumerate(part):
-                row = np.flatnonzero(plain & (self.terms.part == p))[0]
-                basis[:, row, i] += distances[i] * (R[p].T @ turning[i]).T
-        K, M, L, _ = basis.shape
-        along = (self.directions @ basis.reshape(K, -1)).reshape(K, M, L, 3)
-        return np.ascontiguousarray(along.transpose(1, 3, 0, 2)).reshape(3 * M, -1)
+        self._skin = model.points(ids[::3], weights[::3], self.n_betas).along(directions)
+        self._part = model.skeleton.part_of_vertex(model.template)[ids[::3, 0]]
+        self._turning = self._normals(model, ids, weights, np.asarray(layout.distances), slopes)
+
+    def _normals(self, model: BodyModel, ids: np.ndarray, weights: np.ndarray, distances: np.ndarray,
+                 slopes: np.ndarray) -> np.ndarray:
+        """(L, 3, K) the change of what lifts the markers off the skin, along the directions, in the frames of parts."""
+        mean = self.marked.body.subject.vertices(model.pose_mean)
+        skin = MovingPoints(*(np.einsum("lk,lk...->l...", weights, of[ids]) for of in (mean, slopes)))
+        turning = above_skin(skin, np.ones(len(distances))).jacobian - skin.jacobian[::3]    # of the normals
+        back = np.swapaxes(model.skeleton.part_rotations(model.pose_mean)[self._part], -1, -2)
+        return np.asarray(distances[:, None, None] * (back @ turning @ self.directions.T))
 
     def slopes(self, pose: np.ndarray) -> np.ndarray:
         """Derivative (B, K, 3, L) of the markers by z at poses (B, J, 3), metres."""
-        D = posed_product(self.terms, self._flat, pose)
-        return D.reshape(len(pose), 3, self.n_betas, self.count).swapaxes(1, 2)
+        D = self._skin.shape_jacobian(pose)
+        D += self._skin.skeleton.part_rotations(pose)[:, self._part] @ self._turning
+        return D.transpose(0, 3, 2, 1)
 
     def positions(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Where the body puts the markers (T, L, 3), metres, for unknowns (T, P) and changes z (T, K)."""

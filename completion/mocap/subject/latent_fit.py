@@ -12,6 +12,7 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from model.linear import picked
 from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 from scanprep.ranges import Count, Positive, Seed, Settings
@@ -335,11 +336,6 @@ class PointPool:
             rows = np.array(list(new.values()))
             made = self.model.points(markers.ids[rows], markers.weights[rows], self.n_betas)
             self.column |= {key: len(self.column) + i for i, key in enumerate(new)}
-            self.made = made if self.made is None else ShapedPoints(
-                made.terms, np.concatenate([self.made.template_basis, made.template_basis], axis=1),
-                np.concatenate([self.made.mean_basis, made.mean_basis], axis=1),
-                np.concatenate([self.made.shape_basis, made.shape_basis], axis=2), made.origin)
+            self.made = made if self.made is None else self.made.joined(made)
         assert self.made is not None, "at least one marker"
-        some, every = [self.column[key] for key in keys], self.made
-        return ShapedPoints(every.terms, every.template_basis[:, some], every.mean_basis[:, some],
-                            every.shape_basis[:, :, some], every.origin)
+        return self.made.combined(picked(self.made.count, np.array([self.column[key] for key in keys]), None))

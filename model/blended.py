@@ -1,0 +1,273 @@
+"""Points of a skinned body: every vertex follows a mean of the motions of its parts, and bends before it does.
+
+    y_n = Σ_p w_np (R_p (x_n + Σ_f f(pose) C_fn) + t_p) + origin + trans,    t_p = y_jp - R_p j_p
+
+The sum over features f of the joints is one matrix product for a batch of poses, the mean of the rotations another.
+Products of features and rotations, which SCAPE adds up, would here be as many as features times parts.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from scipy.sparse import block_diag, csr_array, eye_array, sparray
+
+from scanprep.geometry import rotations
+from scanprep.skeleton.tree import Skeleton
+
+from .bilinear import ShapedPoints
+from .features import PoseFeatures, lifted, lifted_slopes
+from .linear import PointOperator, chosen_rows
+from .products import Products
+
+AT_ONCE = 2**21                      # numbers of the blended motions that are held together
+
+Mix: TypeAlias = np.ndarray | sparray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Blended(PointOperator):
+    """Points of a skinned body.
+
+    Parameters
+    ----------
+    features : PoseFeatures
+        Of its lift the bends are linear functions.
+    weights : (n, J) float
+    rest : (n, 3) float, metres
+    places : (J, 3) float, metres
+        Of the joints at rest.
+    bends : (J - 1, m, 3, n) float, metres
+        Change of the rest vertices by every lifted number of every joint but the root's.
+    origin : (3,) float, metres
+    bent : float
+        How many times the bends are taken.
+    middle : Products, optional
+        One point, the same mean of vertices in every pose, that stands in `origin` in the place of the root's joint.
+    mix : (L, n) float, optional
+        Points as combinations of vertices; else they are the vertices.
+    """
+
+    features: PoseFeatures
+    weights: np.ndarray
+    rest: np.ndarray
+    places: np.ndarray
+    bends: np.ndarray
+    origin: np.ndarray
+    bent: float = 1.0
+    middle: Products | None = None
+    mix: Mix = None
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.features.skeleton
+
+    @property
+    def count(self) -> int:
+        return len(self.rest) if self.mix is None else self.mix.shape[0]
+
+    @property
+    def load(self) -> int:
+        return 16 * len(self.skeleton.parents) * max(1, len(self.rest) // max(1, self.count))
+
+    def turned(self, pose: np.ndarray) -> np.ndarray:
+        poses, n = pose.reshape(-1, *pose.shape[-2:]), len(self.rest)
+        out = np.empty((len(poses), 3, self.count), dtype=self.rest.dtype)
+        step = max(1, AT_ONCE // max(1, 12 * n))
+        for start in range(0, len(poses), step):
+            some = slice(start, start + step)
+            M, x = self._motions(*self._rigid(poses[some])), self._bent(poses[some])
+            y = M[:, :, 3]
+            for k in range(3):
+                y += M[:, :, k] * x[:, k, None]
+            out[some] = _mixed(y, self.mix)
+        if self.middle is not None:
+            out -= self.middle.turned(poses)
+        return out.reshape(*pose.shape[:-2], 3, self.count)
+
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        poses, (n, J), leading = pose.reshape(-1, *pose.shape[-2:]), self.weights.shape, pose.shape[:-2]
+        B, descends = len(poses), self.skeleton.descends.astype(float)
+        R, t, moved = self._rigid(poses)
+        each = R @ self._bent(poses)[:, None] + t[..., None]                  # (B, J, 3, n) where a part alone takes it
+        each *= self.weights.T[:, None]
+        carried = (descends.T @ each.reshape(B, J, -1)).reshape(each.shape)   # all that hangs below each joint
+        carried -= (self.weights @ descends).T[:, None] * moved[..., None]
+        turn = R @ rotations.right_jacobian(poses)                            # world turn per parameter, in columns
+        # ω × x = hat(ω) @ x for every column ω of `turn`
+        columns = rotations.hat(np.swapaxes(turn, -1, -2)) @ carried[:, :, None]                # (B, J, 3, 3, n)
+        if self.bent and self.bends.size:
+            slope = self.bent * np.swapaxes(lifted_slopes(self.features.lift, poses)[:, 1:], -1, -2)
+            sway = (slope @ self.bends.reshape(*self.bends.shape[:2], -1)).reshape(B, J - 1, 3, 3, n)
+            G = self._motions(R, t, moved)[:, None, None]
+            for k in range(3):
+                columns[:, 1:] += G[..., k, :] * sway[..., k, None, :]
+        y = np.swapaxes(_mixed(carried[:, 0], self.mix), -1, -2).reshape(*leading, self.count, 3)
+        columns = np.swapaxes(_mixed(columns, self.mix), -1, -2).reshape(*leading, 3 * J, self.count, 3)
+        if self.middle is not None:
+            held, by_pose = self.middle.columns(pose, np.zeros(3))
+            y, columns = y - held, columns - by_pose
+        return y + (self.origin + trans)[..., None, :], np.ascontiguousarray(columns)
+
+    def _rigid(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rotations (B, J, 3, 3) of the parts, what follows them (B, J, 3), and where joints are; the root's is 0."""
+        R = self.skeleton.part_rotations(poses)
+        return R, *hung(self.skeleton, R, self.places)
+
+    def _motions(self, R: np.ndarray, t: np.ndarray, _: np.ndarray) -> np.ndarray:
+        """(B, 3, 4, n) the mean motion of every vertex: a mean of rotations, then a translation."""
+        motion = np.concatenate([R, t[..., None]], axis=-1).reshape(*R.shape[:2], 12)
+        M = np.swapaxes(motion, 1, 2).astype(self.rest.dtype, copy=False) @ self.weights.T
+        return M.reshape(len(R), 3, 4, -1)
+
+    def _bent(self, poses: np.ndarray) -> np.ndarray:
+        """(B, 3, n) rest vertices with what the joints do to them."""
+        x = np.ascontiguousarray(self.rest.T)
+        if not self.bent or not self.bends.size:
+            return np.broadcast_to(x, (len(poses), *x.shape))
+        f = self.bent * lifted(self.features.lift, poses)[:, 1:].reshape(len(poses), -1)
+        return (f.astype(x.dtype, copy=False) @ self.bends.reshape(f.shape[1], -1)).reshape(-1, *x.shape) + x
+
+    def combined(self, weights: np.ndarray | sparray) -> Blended:
+        used, mix = _picked(self.mix, weights)
+        return replace(self, weights=self.weights[used], rest=self.rest[used],
+                       bends=np.ascontiguousarray(self.bends[..., used]), mix=mix)
+
+    def joints(self, regressor: sparray) -> Blended:
+        if self.middle is not None:
+            return self.combined(regressor)
+        above = np.maximum(self.skeleton.parents, 0)              # a joint hangs on the part above it
+        return replace(self, weights=np.eye(len(above))[above], rest=self.places, bends=np.zeros((0, 0, 3, len(above))),
+                       mix=None)
+
+    def plus(self, factor: float, other: PointOperator) -> Blended:
+        assert isinstance(other, Blended), "of the same kind of model"
+        middle = self.middle if self.middle is None or other.middle is None else self.middle.plus(factor, other.middle)
+        return replace(self, rest=self.rest + self.rest.dtype.type(factor) * other.rest, middle=middle,
+                       places=self.places + factor * other.places, origin=self.origin + factor * other.origin,
+                       bent=self.bent + factor * other.bent)
+
+    def scaled(self, factor: float) -> Blended:
+        return replace(self, rest=(factor * self.rest).astype(self.rest.dtype), places=factor * self.places,
+                       bent=factor * self.bent, middle=None if self.middle is None else self.middle.scaled(factor))
+
+    def astype(self, dtype: Any) -> Blended:
+        weights, rest, bends = (a.astype(dtype, copy=False) for a in (self.weights, self.rest, self.bends))
+        return replace(self, weights=weights, rest=rest, bends=bends)
+
+    def joined(self, other: Blended) -> Blended:
+        """These points and then others of the same body."""
+        mix = csr_array(block_diag([eye_array(one.count) if one.mix is None else one.mix for one in (self, other)]))
+        weights, rest = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in ("weights", "rest"))
+        return replace(self, weights=weights, rest=rest, bends=np.concatenate([self.bends, other.bends], axis=-1),
+                       mix=mix)
+
+
+def hung(skeleton: Skeleton, R: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of part rotations (B, J, 3, 3) and joints (..., J, 3): `y_j - R j` (B, ..., J, 3), and `y_j`, the root's zero."""
+    R = R.reshape(len(R), *(1,) * (joints.ndim - 2), *R.shape[1:])
+    y = np.zeros(np.broadcast_shapes(R.shape[:-1], joints.shape))
+    for j in range(1, len(skeleton.parents)):
+        p = skeleton.parents[j]
+        y[..., j, :] = y[..., p, :] + (R[..., p, :, :] @ (joints[..., j, :] - joints[..., p, :])[..., None])[..., 0]
+    return y - (R @ joints[..., None])[..., 0], y
+
+
+def _picked(mix: Mix, weights: np.ndarray | sparray) -> tuple[np.ndarray | slice, Mix]:
+    """Which vertices combinations (K, L) of points, `mix` of n vertices, need, and how they are mixed of those."""
+    rows = chosen_rows(weights) if mix is None else None
+    if rows is not None:
+        return rows, None
+    if isinstance(weights, np.ndarray):
+        return slice(None), weights if mix is None else weights @ mix
+    whole = csr_array(weights if mix is None else weights @ csr_array(mix))
+    used, place = np.unique(whole.indices, return_inverse=True)
+    return used, csr_array((whole.data, place, whole.indptr), shape=(whole.shape[0], len(used)))
+
+
+def _mixed(y: np.ndarray, mix: Mix) -> np.ndarray:
+    """(..., L) combinations of (..., n)."""
+    return y if mix is None else np.asarray(y.reshape(-1, y.shape[-1]) @ mix.T).reshape(*y.shape[:-1], mix.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedBlended(ShapedPoints):
+    """Points of a skinned body of free shape: the template's own body, the mean person, and by each beta the change of
+    rest vertices (K, n, 3), joints (K, J, 3), origin (K, 3) and the products of the middle (K, M, 1, 3), metres.
+    """
+
+    own: Blended
+    mean: Blended
+    rest: np.ndarray
+    joints: np.ndarray
+    origin: np.ndarray
+    middle: np.ndarray
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.mean.skeleton
+
+    @property
+    def count(self) -> int:
+        return self.mean.count
+
+    @property
+    def n_betas(self) -> int:
+        return len(self.rest)
+
+    @property
+    def load(self) -> int:
+        return self.mean.load
+
+    def operator(self, betas: np.ndarray | None = None) -> Blended:
+        if betas is None:
+            return self.own
+        betas, mean = self._checked(betas), self.mean
+        rest, joints, origin, middle = (np.tensordot(betas, by_beta[:len(betas)], axes=1)
+                                        for by_beta in (self.rest, self.joints, self.origin, self.middle))
+        held = None if mean.middle is None else replace(mean.middle, basis=mean.middle.basis + middle)
+        return replace(mean, rest=mean.rest + rest, places=mean.places + joints, origin=mean.origin + origin,
+                       middle=held)
+
+    def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
+        pose = np.asarray(pose, dtype=np.float64)
+        poses = pose.reshape(-1, *pose.shape[-2:])
+        R = self.skeleton.part_rotations(poses)
+        out = np.swapaxes(hung(self.skeleton, R, self.joints)[0], -1, -2) @ self.mean.weights.T       # (B, K, 3, n)
+        G = (np.swapaxes(R.reshape(*R.shape[:2], 9), 1, 2) @ self.mean.weights.T).reshape(len(R), 1, 3, 3, -1)
+        for k in range(3):
+            out += G[:, :, :, k] * self.rest[:, None, :, k]
+        out = _mixed(out, self.mean.mix)
+        if self.mean.middle is not None:
+            out -= np.swapaxes(self._middles.turned(poses), -1, -2)[..., None]
+        out += self.origin[..., None]
+        return np.moveaxis(out, -1, 1).swapaxes(-1, -2).reshape(*pose.shape[:-2], self.count, 3, self.n_betas)
+
+    @cached_property
+    def _middles(self) -> Products:
+        """The change of the middle by all betas, as if each were a point."""
+        assert self.mean.middle is not None, "a body that is held by its middle"
+        return replace(self.mean.middle, basis=np.moveaxis(self.middle[:, :, 0], 0, 1))
+
+    def combined(self, weights: np.ndarray | sparray) -> ShapedBlended:
+        used, _ = _picked(self.mean.mix, weights)
+        return replace(self, own=self.own.combined(weights), mean=self.mean.combined(weights), rest=self.rest[:, used])
+
+    def joined(self, other: ShapedPoints) -> ShapedBlended:
+        assert isinstance(other, ShapedBlended), "of the same model"
+        return replace(self, own=self.own.joined(other.own), mean=self.mean.joined(other.mean),
+                       rest=np.concatenate([self.rest, other.rest], axis=1))
+
+    def along(self, directions: np.ndarray) -> ShapedBlended:
+        return self._each(lambda by_beta: np.tensordot(directions, by_beta, axes=1))
+
+    def first(self, n_betas: int) -> ShapedBlended:
+        return self._each(lambda by_beta: by_beta[:n_betas])
+
+    def _each(self, change: Callable[[np.ndarray], np.ndarray]) -> ShapedBlended:
+        """The same with other changes by betas."""
+        return replace(self, rest=change(self.rest), joints=change(self.joints), origin=change(self.origin),
+                       middle=change(self.middle))

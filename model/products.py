@@ -1,0 +1,185 @@
+"""Points of a SCAPE body: linear in products of a feature δ and the rotation of a part, one matrix product for a batch.
+
+    Y = Σ_m δ_m T_m R_mᵀ + origin + trans
+
+`T_m` is stitched once from the edges that the product contributes.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array, sparray
+
+from scanprep.geometry import rotations
+from scanprep.skeleton.tree import Skeleton
+
+from .bilinear import ShapedPoints
+from .features import PoseFeatures
+from .linear import PointOperator, chosen_rows
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """The products of a `feature` (M,) and the rotation of a `part` (M,) in which the vertices of a fixed body are
+    linear.
+    """
+
+    features: PoseFeatures
+    part: np.ndarray
+    feature: np.ndarray
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.features.skeleton
+
+    @property
+    def count(self) -> int:
+        """M, the number of products."""
+        return len(self.part)
+
+    def weights(self, pose: np.ndarray) -> np.ndarray:
+        """(..., M, 3, 3) of δ R at poses (..., J, 3), radians."""
+        R = self.skeleton.part_rotations(pose)[..., self.part, :, :]
+        return self.features.evaluate(pose)[..., self.feature, None, None] * R
+
+
+@dataclass(frozen=True, eq=False)
+class Products(PointOperator):
+    """Points whose places are a sum of products, T (M, L, 3), metres."""
+
+    terms: Terms
+    basis: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.terms.skeleton
+
+    @property
+    def count(self) -> int:
+        return self.basis.shape[1]
+
+    @property
+    def load(self) -> int:
+        return self.terms.count + 4 * len(self.skeleton.parents)
+
+    @cached_property
+    def _flat(self) -> np.ndarray:
+        return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(3 * self.terms.count, self.count)
+
+    def turned(self, pose: np.ndarray) -> np.ndarray:
+        W = np.moveaxis(self.terms.weights(pose), -3, -2)                     # (..., i, m, j)
+        W = W.reshape(-1, self._flat.shape[0]).astype(self._flat.dtype, copy=False)
+        return (W @ self._flat).reshape(*pose.shape[:-2], 3, self.count)
+
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        terms, skeleton = self.terms, self.skeleton
+        J, M, L, leading = len(skeleton.parents), terms.count, self.count, pose.shape[:-2]
+        R = skeleton.part_rotations(pose)
+        turned = self.basis @ np.swapaxes(R[..., terms.part, :, :], -1, -2)   # (..., M, L, 3)
+        gather = np.zeros((*leading, J, M))                                   # C_p = Σ_m δ_m T_m R_pᵀ
+        gather[..., terms.part, np.arange(M)] = terms.features.evaluate(pose)[..., terms.feature]
+        below = skeleton.descends.T.astype(float) @ gather                    # all that hangs below each joint
+        sway = np.moveaxis(terms.features.derivative(pose)[..., terms.feature, :, :], -3, -1)   # (..., J, 3, M)
+        both = np.concatenate([below, sway.reshape(*leading, 3 * J, M)], axis=-2) @ turned.reshape(*leading, M, -1)
+        carried = both[..., :J, :].reshape(*leading, J, L, 3)
+        columns = both[..., J:, :].reshape(*leading, J, 3, L, 3)
+        turn = R @ rotations.right_jacobian(pose)                             # world turn per parameter, in columns
+        # ω × x = x @ hat(ω)ᵀ for every column ω of `turn`
+        columns += carried[..., None, :, :] @ np.swapaxes(rotations.hat(np.swapaxes(turn, -1, -2)), -1, -2)
+        y = carried[..., 0, :, :] + (self.origin + trans)[..., None, :]
+        return y, columns.reshape(*leading, 3 * J, L, 3)
+
+    def combined(self, weights: np.ndarray | sparray) -> Products:
+        return replace(self, basis=_combined(self.basis, weights))
+
+    def plus(self, factor: float, other: PointOperator) -> Products:
+        assert isinstance(other, Products), "of the same kind of model"
+        return replace(self, basis=self.basis + self.basis.dtype.type(factor) * other.basis,
+                       origin=self.origin + factor * other.origin)
+
+    def scaled(self, factor: float) -> Products:
+        return replace(self, basis=(factor * self.basis).astype(self.basis.dtype))
+
+    def astype(self, dtype: Any) -> Products:
+        return replace(self, basis=self.basis.astype(dtype, copy=False))
+
+
+def _combined(basis: np.ndarray, weights: np.ndarray | sparray) -> np.ndarray:
+    """T (..., L, 3) of combinations of points."""
+    rows = chosen_rows(weights)
+    if rows is not None:
+        return basis[..., rows, :]
+    if isinstance(weights, np.ndarray):
+        return np.moveaxis(np.tensordot(basis, weights.astype(basis.dtype), axes=(-2, 1)), -1, -2)
+    sparse = csr_array(weights)
+    used, place = np.unique(sparse.indices, return_inverse=True)
+    few = csr_array((sparse.data, place, sparse.indptr), shape=(sparse.shape[0], len(used)))
+    some = np.moveaxis(basis[..., used, :], -2, 0)
+    return np.moveaxis((few @ some.reshape(len(used), -1)).reshape(-1, *some.shape[1:]), 0, -2)
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedProducts(ShapedPoints):
+    """Points that are bilinear in (1, β) and products: T of every term (M, L, 3), metres, for the template's own body
+    and the mean person, and its change (K, M, L, 3) for one standard deviation of each beta.
+    """
+
+    terms: Terms
+    own: np.ndarray
+    mean: np.ndarray
+    change: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.terms.skeleton
+
+    @property
+    def count(self) -> int:
+        return self.own.shape[1]
+
+    @property
+    def n_betas(self) -> int:
+        return len(self.change)
+
+    @property
+    def load(self) -> int:
+        return self.terms.count
+
+    def operator(self, betas: np.ndarray | None = None) -> Products:
+        if betas is None:
+            return Products(self.terms, self.own, self.origin)
+        betas = self._checked(betas)
+        return Products(self.terms, self.mean + np.tensordot(betas, self.change[:len(betas)], axes=1), self.origin)
+
+    def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
+        pose = np.asarray(pose, dtype=np.float64)
+        by_beta = self._changes.turned(pose).reshape(*pose.shape[:-2], 3, self.n_betas, self.count)
+        return np.moveaxis(by_beta, -1, -3)
+
+    @cached_property
+    def _changes(self) -> Products:
+        """The changes of all points by all betas, as if each were a point."""
+        K, M, L, _ = self.change.shape
+        return Products(self.terms, np.moveaxis(self.change, 0, 1).reshape(M, K * L, 3), np.zeros(3))
+
+    def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
+        own, mean, change = (_combined(T, weights) for T in (self.own, self.mean, self.change))
+        return replace(self, own=own, mean=mean, change=change)
+
+    def joined(self, other: ShapedPoints) -> ShapedProducts:
+        assert isinstance(other, ShapedProducts), "of the same model"
+        own, mean, change = (np.concatenate([getattr(self, name), getattr(other, name)], axis=-2)
+                             for name in ("own", "mean", "change"))
+        return replace(self, own=own, mean=mean, change=change)
+
+    def along(self, directions: np.ndarray) -> ShapedProducts:
+        K, change = len(directions), self.change
+        return replace(self, change=(directions @ change.reshape(len(change), -1)).reshape(K, *change.shape[1:]))
+
+    def first(self, n_betas: int) -> ShapedProducts:
+        return replace(self, change=self.change[:n_betas])
