@@ -41,7 +41,7 @@ def fast_path(model: BodyModel, batch: int = 256) -> dict:
     rng = np.random.default_rng(0)
     poses = rng.normal(0, 0.3, (batch, len(model.skeleton.parents), 3))
     exact = model.vertices(poses[:4])
-    result = {"features": model.terms.features.count, "terms": model.terms.count,
+    result = {"features": model.n_features, "terms": model.terms.count if hasattr(model, "terms") else model.n_features,
               "solve_ms": 1e3 * _best(lambda: model.vertices(poses[0])),
               "build_s": _best(lambda: model.subject(), 3)}
     for dtype in (np.float64, np.float32):

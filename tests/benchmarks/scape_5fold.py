@@ -76,8 +76,8 @@ def run(learn: Learn, template: Mesh, training: np.ndarray, held: np.ndarray, sk
     learned = time.perf_counter()
     fitter = PoseFitter(model.subject())
     errors = [1e3 * fitter.fit(body).mean for body in held]
-    return {"error_mm": np.round(errors, 2).tolist(), "features": model.terms.features.count,
-            "terms": model.terms.count, "learn_s": learned - start,
+    return {"error_mm": np.round(errors, 2).tolist(), "features": model.n_features,
+            "terms": model.terms.count if hasattr(model, "terms") else model.n_features, "learn_s": learned - start,
             "fit_s_per_pose": (time.perf_counter() - learned) / len(held),
             "chosen": {k: v for k, v in model.info.items() if isinstance(v, float | int | str) and k != "digest"}}
 
