@@ -73,6 +73,11 @@ class Blended(PointOperator):
     def load(self) -> int:
         return 16 * len(self.skeleton.parents) * max(1, len(self.rest) // max(1, self.count))
 
+    @cached_property
+    def _share(self) -> np.ndarray:
+        """(L,) what the weights of each point sum to: 1, but for columns that motions are made of."""
+        return np.ones(self.count) if self.mix is None else np.asarray(self.mix.sum(axis=1)).ravel()
+
     def turned(self, pose: np.ndarray) -> np.ndarray:
         poses, n = pose.reshape(-1, *pose.shape[-2:]), len(self.rest)
         out = np.empty((len(poses), 3, self.count), dtype=self.rest.dtype)
@@ -85,7 +90,7 @@ class Blended(PointOperator):
                 y += M[:, :, k] * x[:, k, None]
             out[some] = _mixed(y, self.mix)
         if self.middle is not None:
-            out -= self.middle.turned(poses)
+            out -= self.middle.turned(poses) * self._share
         return out.reshape(*pose.shape[:-2], 3, self.count)
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -109,7 +114,7 @@ class Blended(PointOperator):
         columns = np.swapaxes(_mixed(columns, self.mix), -1, -2).reshape(*leading, 3 * J, self.count, 3)
         if self.middle is not None:
             held, by_pose = self.middle.columns(pose, np.zeros(3))
-            y, columns = y - held, columns - by_pose
+            y, columns = y - held * self._share[:, None], columns - by_pose * self._share[:, None]
         return y + (self.origin + trans)[..., None, :], np.ascontiguousarray(columns)
 
     def _rigid(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

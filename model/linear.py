@@ -64,7 +64,7 @@ class PointOperator(ABC):
 
     @abstractmethod
     def combined(self, weights: np.ndarray | sparray) -> PointOperator:
-        """Linear combinations of the points, with weights (K, L) whose rows sum to 1."""
+        """Linear combinations of the points, with weights (K, L); `origin` counts once, whatever their rows sum to."""
 
     @abstractmethod
     def plus(self, factor: float, other: PointOperator) -> PointOperator:
