@@ -9,6 +9,8 @@ COMMANDS = {
     "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
     "view": ("Meshes, scans, models, motions and results in the browser.", "completion.viewing.cli:view_files"),
+    "measure": ("Stature, girths, lengths and widths of bodies; or a body that has them.",
+                "completion.measuring.cli:measure_bodies"),
     "pick": ("Landmarks of scans, clicked in the browser.", "scanprep.viewer.cli:pick_landmarks"),
     "learn": ("Registered meshes -> a body model.", "model.learning.cli:learn"),
     "model": ("Look into a body model and pose it.", "model.cli:group"),

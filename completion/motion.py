@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from model.linear import Subject
+from model.motion.files import StoredMotion, check_ours, read_motion_file
+from model.motion.onto import BodyMotion
 from scanprep.geometry import storage
-from scanprep.ranges import BETAS, TINY, TURNS, Range
 
 SURFACE_MODEL = "scape"
+OF_MARKERS = ("marker_residuals", "marker_labels", "converged", "marker_trusted")       # what else our files hold
 Progress = Callable[[int, int], None]            # called with (done, total)
 
 
@@ -97,14 +99,19 @@ class Motion:
             np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
 
     @staticmethod
+    def of(found: BodyMotion) -> Motion:
+        """A motion that came from no markers."""
+        none = np.zeros((len(found.poses), 0))
+        return Motion(found.poses, found.trans, found.betas, found.rate, none, gender=found.gender,
+                      trusted=none.astype(bool))
+
+    @staticmethod
     def load(path: str | Path) -> Motion:
         """Read a file of `save`, or a body-model motion file of the same kind from elsewhere."""
-        stored = storage.load_arrays(path, "a motion (.npz)")
-        lacking = [name for name in ("poses", "trans") if name not in stored]
-        if lacking:
-            raise storage.StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
+        stored = read_motion_file(path, OF_MARKERS)
+        check_ours(path, stored, f"; scape animate {Path(path).name} -m MODEL -o OUT puts it on a model")
         with storage.taking_apart(path, "a whole motion"):
-            return _restored(path, stored)
+            return _restored(stored)
 
 
 def spread_frames(length: int, count: int) -> np.ndarray:
@@ -112,25 +119,13 @@ def spread_frames(length: int, count: int) -> np.ndarray:
     return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(int))
 
 
-def _restored(path: str | Path, a: dict[str, np.ndarray]) -> Motion:
-    """The motion of a file's arrays."""
-    kind = storage.text(a, "surface_model_type", "")
-    if kind != SURFACE_MODEL:
-        raise storage.StorageError(f"{path}: expected surface_model_type '{SURFACE_MODEL}', found '{kind}'")
-    rate = a.get("mocap_frame_rate", a.get("mocap_framerate"))
-    if rate is None:
-        raise storage.StorageError(f"{path}: expected mocap_frame_rate or mocap_framerate")
-    Range(TINY).check(float(rate), "mocap_frame_rate")
-    T, shape = len(a["poses"]), a["poses"].shape[1:]
-    poses = storage.numbers(a, "poses", T, *shape).astype(np.float64).reshape(T, -1, 3)
+def _restored(stored: StoredMotion) -> Motion:
+    """The motion of a file, with what it tells of markers."""
+    a, T = stored.more, len(stored.poses)
     labels = tuple(str(label) for label in a.get("marker_labels", ()))
-    betas = storage.numbers(a, "betas", None).astype(np.float64) if "betas" in a else np.zeros(0)
-    BETAS.check(betas, "betas")
-    TURNS.check(poses, "poses")
     residuals = (storage.numbers(a, "marker_residuals", T, len(labels), finite=False) if "marker_residuals" in a
                  else np.full((T, len(labels)), np.nan))
     converged = storage.numbers(a, "converged", T, kinds="b") if "converged" in a else np.ones(T)
     trusted = a.get("marker_trusted", np.zeros((0, 0)))
-    return Motion(poses, storage.numbers(a, "trans", T, 3).astype(np.float64), betas if betas.size else None,
-                  float(rate), residuals, labels, storage.text(a, "gender", "neutral"), converged.astype(bool),
-                  trusted.astype(bool))
+    return Motion(stored.poses, stored.trans, stored.betas, stored.rate, residuals, labels, stored.gender,
+                  converged.astype(bool), trusted.astype(bool))

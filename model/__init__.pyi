@@ -12,7 +12,6 @@ from .evaluation.errors import shape_errors as shape_errors
 from .evaluation.sampling import sample_bodies as sample_bodies
 from .evaluation.sampling import specificity as specificity
 from .export.bvh import write_bvh as write_bvh
-from .export.bvh_read import read_bvh as read_bvh
 from .export.correctives import write_body_npz as write_body_npz
 from .export.glb import write_skinned_glb as write_skinned_glb
 from .export.rig import make_rig as make_rig
@@ -34,6 +33,11 @@ from .learning.sexes import learn_by_sex as learn_by_sex
 from .learning.skinning import SkinConfig as SkinConfig
 from .learning.skinning import learn_skinning as learn_skinning
 from .linear import Subject as Subject
+from .measurement.find import find_tapes as find_tapes
+from .measurement.measure import Measurements as Measurements
+from .measurement.measure import measure as measure
+from .measurement.wanted import body_with_measurements as body_with_measurements
+from .motion.bvh import read_bvh as read_bvh
 from .posing.character import CharacterConfig as CharacterConfig
 from .posing.character import character_model as character_model
 from .posing.poses import find_mirror as find_mirror

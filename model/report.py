@@ -57,7 +57,7 @@ def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np
     skeleton, betas = model.skeleton, np.zeros(1)
     rest = np.zeros((len(skeleton.parents), 3))
     body = model.template.with_vertices(model.vertices(rest, betas))
-    joints = skeleton.joint_regressor(model.template) @ body.vertices
+    joints = model.joint_regressor @ body.vertices
     examples = model.pose_examples[np.argsort(-np.abs(model.pose_examples[:, 1:]).sum(axis=(1, 2)), kind="stable")]
     chosen = np.linspace(0, max(len(examples) - 1, 0) // 2, min(count, len(examples))).astype(int)
     poses = examples[chosen].reshape(-1, *rest.shape)

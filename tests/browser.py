@@ -71,3 +71,12 @@ def wait_until(page, expression, seconds=10.0):
     while not page.evaluate(expression):
         assert time.monotonic() < end, f"{expression} did not become true; errors of the page: {page.errors}"
         page.wait_for_timeout(20)
+
+
+def take_away(page, names):
+    """Choose landmarks of the second pane by their names in the list, and press Delete."""
+    for name in names:
+        page.locator(".sk-names li").filter(has_text=name).first.click()
+        wait_until(page, f"program.state.chosen === '{name}'")
+        page.keyboard.press("Delete")
+        wait_until(page, f"!('{name}' in program.state.panes[1].places)")

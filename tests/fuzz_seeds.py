@@ -20,10 +20,10 @@ from completion.motion import Motion
 from completion.partial.completion import Completion, load_completion, save_completion
 from completion.partial.masks import read_mask
 from model.export.bvh import write_bvh
-from model.export.bvh_read import read_bvh
-from model.export.cli import read_motion
 from model.files import load_model
 from model.learning.cli import _read_sexes
+from model.motion.bvh import read_bvh
+from model.motion.onto import read_motion
 from model.posing.cli import _read_betas, _read_turns
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
 from scanprep.correspondence.correspondences import Correspondences, read_correspondences, write_correspondences
@@ -182,6 +182,14 @@ def _add_landmarks(body: Mesh, place: Any, add: Any, text: Any) -> None:
          lambda path: read_landmark_vertices(path, body), check)
     text("words.txt", "".join(f"{x} {y} {z} {n}\n" for n, x, y, z in rows),
          lambda path: read_landmarks(path, body), check)
+    text("slicer.fcsv", "# CoordinateSystem = LPS\n" + "".join(
+        f"{i},{1e3 * x},{1e3 * y},{1e3 * z},0,0,0,1,1,1,0,{n},,\n" for i, (n, x, y, z) in enumerate(rows)),
+         lambda path: read_landmarks(path, body), check)
+    text("table.csv", "name,x,y,z\n" + "".join(f"{n},{x},{y},{z}\n" for n, x, y, z in rows),
+         lambda path: read_landmarks(path, body), check)
+    text("opensim.xml", "<MarkerSet>" + "".join(
+        f'<Marker name="{n}"><body>a</body><location>{x} {y} {z}</location></Marker>' for n, x, y, z in rows)
+         + "</MarkerSet>", lambda path: read_landmarks(path, body), check)
     text("slicer.mrk.json", json.dumps({"markups": [{
         "type": "Fiducial", "coordinateSystem": "RAS", "coordinateUnits": "m", "controlPoints": [
             {"label": n, "position": [x, y, z], "positionStatus": "defined"} for n, x, y, z in rows]}]}),
@@ -294,7 +302,7 @@ def _add_tables(body: Mesh, place: Any, add: Any, text: Any) -> None:
     text("pose.json", '{"part1": [0, 0.5, 0], "part2": [1, 0, 0]}', _read_turns,
          lambda found: finite(*found.values()))
     write_mesh(place("views/a.ply"), body)
-    text("cameras.json", '{"a": [0, 1, 2.5]}', lambda path: _read_views(path.parent / "views", path, None),
+    text("views/cameras.json", '{"a": [0, 1, 2.5]}', lambda path: _read_views(path.parent, None),
          lambda found: finite(*(camera for _, camera in found)))
     marked = np.arange(len(body.vertices)) % 3 == 0
     np.save(path := place("mask.npy"), marked)

@@ -61,8 +61,10 @@ class Glb:
             for channel in animation["channels"]:
                 target, sampler = channel["target"], animation["samplers"][channel["sampler"]]
                 values = self.array(sampler["output"])
-                if target["path"] == "weights":
-                    weights = values.reshape(-1, len(weights))[frame].astype(float)
+                if target["path"] == "weights":                    # may have keys of its own
+                    time = self.array(animation["samplers"][0]["input"])[frame, 0]
+                    keys = self.array(sampler["input"])[:, 0]
+                    weights = np.array([np.interp(time, keys, w) for w in values.reshape(len(keys), -1).T])
                 elif target["path"] == "translation":
                     local[target["node"]][0] = values[frame].astype(float)
                 else:

@@ -39,12 +39,12 @@ def arguments(folder, output, *more):
 
 
 def track_quickly(frames: cli.FramesArg, output: cli.Output, model: cli.ModelOrNone, landmarks: cli.Path,
-                  subject: str | None = None, surfaces: bool = False, rate: float = 25.0, keys: int = 6,
+                  subject: str | None = None, surfaces: bool = False, rate: float = 25.0,
                   smoothing: int = 2, shape_frames: int = 3, *, space: cli.Workspace) -> cli.Outcome:
     """The command with settings that make haste."""
     config = replace(SETTINGS, shape_frames=shape_frames, smoothing=smoothing)
     return cli.track_frames(frames, output, model, rate, landmarks=landmarks, subject=subject, unit="m",
-                            surfaces=surfaces, keys=keys, config=config, space=space)
+                            surfaces=surfaces, config=config, space=space)
 
 
 def track(*argv):

@@ -178,6 +178,7 @@ def test_the_good_files_are_good(place, capsys):
     assert main(ANIMATE.replace("-o out", "-o out2").split()) == 0
     assert {"completed.ply", "predicted.ply", "completion.npz", "picture.png", "report.html", "report.json"} == {
         p.name for p in (place / "out").glob("[!.]*")}
-    assert {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "residuals.csv",
+    assert {"motion.npz", "animation.glb", "motion.bvh", "motion.trc",
+            "joint_angles.csv", "joint_centres.csv", "residuals.csv",
             "subject.json", "layout.json",
             "report.html", "report.json"} == {p.name for p in (place / "out2").glob("[!.]*")}

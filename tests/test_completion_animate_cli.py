@@ -8,15 +8,18 @@ from config_files import config_file
 from glb_reader import Glb
 
 from completion.__main__ import main
+from completion.mocap.files import motion_files
 from completion.mocap.files.markers import MarkerSequence, write_markers
-from completion.mocap.files.motion_files import write_glb
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
+from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures import scene
+from scanprep.pictures.camera import upright
 
 FRAMES = 30
 BETAS = np.array([0.9, -0.6, 0.4])
-WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "residuals.csv",
+WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "motion.trc",
+           "joint_angles.csv", "joint_centres.csv", "residuals.csv",
            "report.html"}
 
 
@@ -82,15 +85,41 @@ def test_a_person_and_the_motion_from_markers(place, tmp_path):
     assert "On another person" in page and "With a body that changes" in page and ">M29<" in page
 
 
-def test_the_glb_lasts_as_long_as_the_motion(place, tmp_path):
+def test_the_glb_shows_every_frame_at_its_time(place, tmp_path):
     assert run(place, place / "walk.csv", "-o", tmp_path / "out", "--subject", "template") == 0
     motion = Motion.load(tmp_path / "out" / "motion.npz")
-    write_glb(tmp_path / "few.glb", motion, worm_with_prior().subject(None), keys=6)
-    for path, keys in ((tmp_path / "out" / "animation.glb", FRAMES), (tmp_path / "few.glb", 6)):
-        glb = Glb(path.read_bytes())
-        times = glb.array(glb.json["animations"][0]["samplers"][0]["input"])[:, 0]
-        assert len(times) == keys and times[0] == 0 and times[-1] == pytest.approx((FRAMES - 1) / 60, rel=1e-5)
+    glb, body = Glb((tmp_path / "out" / "animation.glb").read_bytes()), worm_with_prior().subject(None)
+    for sampler in glb.json["animations"][0]["samplers"]:
+        assert np.allclose(glb.array(sampler["input"])[:, 0], np.arange(FRAMES) / 60)
+    shown = np.stack([glb.skinned(t) for t in range(FRAMES)]) @ turn_up(upright(body.template)[0])
+    off = 1000 * np.linalg.norm(shown - motion.vertices(body), axis=2)
+    figures = told(tmp_path / "out")
+    assert figures["animation.glb, distance from the exact body, mean"] == pytest.approx(off.mean(), rel=1e-3)
+    assert off.mean() < 1 and figures["the same, largest"] == pytest.approx(off.max(), rel=1e-3)
     assert motion.betas is None
+
+
+@pytest.mark.parametrize("changing", [False, True])
+def test_a_long_motion_is_shown_at_its_own_times(tmp_path, changing, monkeypatch):
+    """Of 53 frames the bodies of 20 are asked for: 2.7 frames apart, which even times would shift by half of one."""
+    monkeypatch.setattr(motion_files, "KEYS", 20)
+    t = np.linspace(0, 3, 53)[:, None, None]
+    poses = 0.4 * np.sin(t * np.array([2.0, 3, 1]) + np.arange(4)[:, None])
+    motion = Motion(poses, np.c_[t[:, 0, 0], 0 * t[:, 0], 0 * t[:, 0]], None, 24.0, np.zeros((53, 0)))
+    body = worm_with_prior().subject(None)
+    place = motion.trans[:, None]
+    exact = place + (motion.vertices(body) - place) * (1 + 0.2 * np.sin(t) * changing)
+    motion_files.write_glb(tmp_path / "a.glb", motion, body, exact.__getitem__ if changing else None)
+    glb = Glb((tmp_path / "a.glb").read_bytes())
+    samplers = glb.json["animations"][0]["samplers"]
+    frames = np.round(24 * glb.array(samplers[-1]["input"])[:, 0]).astype(int)
+    assert len(frames) == (20 if changing else 53)
+    assert np.allclose(24 * glb.array(samplers[-1]["input"])[:, 0], frames, atol=1e-4)
+    weights = glb.array(samplers[-1]["output"]).reshape(len(frames), -1)
+    assert weights.min() >= 0 and weights.max() <= 1
+    places = np.stack([glb.skinned(t) for t in range(53)])
+    off = np.linalg.norm(places @ turn_up(upright(body.template)[0]) - exact, axis=2)
+    assert off[frames].mean() < 1e-3 and off.mean() < 2e-3
     assert not (tmp_path / "out" / "subject.json").exists()
 
 

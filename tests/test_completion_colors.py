@@ -3,9 +3,11 @@ import warnings
 
 import numpy as np
 import pytest
+from glb_reader import Glb
 
 from completion.partial.colors import ColorConfig, blend, carry_colors, colored_views
 from scanprep.geometry.files import PointCloud
+from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
@@ -113,6 +115,10 @@ def _at(points):
 def test_a_textured_file_comes_back(tmp_path):
     write_textured(tmp_path / "square.glb", Texture(SQUARE, UV, IMAGE))
     again = read_texture(tmp_path / "square.glb")
+    np.testing.assert_array_equal(again.mesh.vertices, np.float32(SQUARE.vertices))      # turned to y, and back
+    glb = Glb((tmp_path / "square.glb").read_bytes())
+    normals = glb.array(glb.primitive["attributes"]["NORMAL"])
+    np.testing.assert_allclose(normals, SQUARE.vertex_normals @ turn_up(tallest(SQUARE.vertices)).T, atol=1e-6)
     found = Surface(again.mesh).closest(np.array([[0.3, 0.6, 0], [0.9, 0.1, 0]]))
     faces, bary = _at([[0.3, 0.6, 0], [0.9, 0.1, 0]])
     np.testing.assert_allclose(again.sample(found.faces, found.bary), Texture(SQUARE, UV, IMAGE).sample(faces, bary),

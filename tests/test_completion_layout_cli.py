@@ -1,16 +1,20 @@
 """`scape layout`: what is listed, shown and carried, and what is refused in one line."""
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from people_bodies import small_people
 
 from completion.__main__ import main
+from completion.bodies import at_rest
 from completion.mocap.marker_sets import pictures, transfer
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import layout_names, named_layout
+from completion.mocap.marker_sets.named import layout_names, named_layout, read_layout
+from completion.mocap.marker_sets.opensim import opensim_markers
 from completion.mocap.marker_sets.pictures import marker_rows, picture_layout
 from scanprep import read_mesh, write_landmarks, write_mesh
+from scanprep.geometry.landmark_reading import read_marker_set
 from scanprep.registration.nonrigid import Registration
 from scanprep.synthetic.people import Person
 
@@ -49,6 +53,35 @@ def test_a_layout_is_shown_on_a_model(tmp_path):
     assert main(["layout", "show", "mosh67", "-m", str(tmp_path / "model.npz"), "-o", str(tmp_path / "out")]) == 0
     assert len(MarkerLayout.load(tmp_path / "out" / "layout.json").labels) == 67
     assert "upper_arm" in (tmp_path / "out" / "report.html").read_text()
+    file = tmp_path / "out" / "markerset.xml"
+    assert len(read_marker_set(file, file.read_bytes())) == 67
+
+
+# places in the marker set of OpenSim's model gait2392, metres, of markers that sit on the same bones
+GAIT2392 = {"RFWT": ("pelvis", (0.02, 0.03, 0.128)), "LFWT": ("pelvis", (0.02, 0.03, -0.128)),
+            "RKNE": ("femur_r", (0.0, -0.404, 0.05)), "RANK": ("tibia_r", (-0.005, -0.41, 0.053)),
+            "RHEE": ("calcn_r", (-0.02, 0.02, 0.0))}
+
+
+def test_markers_are_on_the_bodies_of_opensim():
+    """Near those of its own model; by frames in which every marker of the body is again where it was."""
+    model = small_people()
+    body = at_rest(model)
+    skeleton = replace(model.skeleton, joints=model.skeleton.joint_regressor(model.template) @ body.vertices)
+    layout = read_layout("cmu41", body, np.array(model.info["people_vertices"]))
+    found = opensim_markers(layout, body, skeleton)
+    assert list(found) == list(layout.labels)
+    for label, (name, place) in GAIT2392.items():
+        assert found[label][0] == f"/bodyset/{name}"
+        assert np.linalg.norm(found[label][1] - place) < 0.05, (label, found[label])
+    places = dict(zip(layout.labels, layout.place(body), strict=True))
+    for side in "RL":                               # distances between markers of one body are kept
+        shin, ankle = f"{side}SHN", f"{side}ANK"
+        assert found[shin][0] == found[ankle][0]
+        apart = np.linalg.norm(found[shin][1] - found[ankle][1])
+        assert apart == pytest.approx(np.linalg.norm(places[shin] - places[ankle]))
+    with pytest.raises(ValueError, match="person's parts"):
+        opensim_markers(layout, body, replace(skeleton, names=tuple(f"part{j}" for j in range(len(skeleton.names)))))
 
 
 def test_the_picture_shows_every_marker(person):
@@ -91,7 +124,8 @@ def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, mon
     np.testing.assert_allclose(MarkerLayout.load(out, 9380).select(["C7", "LELB"]).place(target),
                                named_layout("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
     assert out.with_suffix(".png").exists() and len(read_mesh(out.with_suffix(".registered.ply")).vertices) == 9380
-    figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "b.layout.report.json").read_text())["metrics"]}
+    told = json.loads((tmp_path / "b.layout.json.report.json").read_text())
+    figures = {m["metric"]: m["value"] for m in told["metrics"]}
     assert figures["target not covered"] == pytest.approx(6) and figures["landmarks"] == 3
 
 

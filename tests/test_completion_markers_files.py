@@ -54,7 +54,7 @@ def agree(found, expected, tolerance=1e-9):
     np.testing.assert_allclose(found.positions, expected.positions, atol=tolerance)
 
 
-@pytest.mark.parametrize(("suffix", "tolerance"), [(".csv", 1e-8), (".c3d", 1e-6)])
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".csv", 1e-8), (".c3d", 1e-6), (".trc", 6e-9)])
 @pytest.mark.parametrize("rate", [120.0, 59.94, 1000 / 3, 30.0])
 def test_round_trip(tmp_path, suffix, tolerance, rate):
     seq = sequence(np.random.default_rng(0), rate=rate)
@@ -195,8 +195,8 @@ def test_missing_empty_folder_and_foreign_files(tmp_path, suffix, data, word):
 def test_a_name_of_no_known_format(tmp_path):
     (tmp_path / "a.bvh").write_text("HIERARCHY")
     refused(tmp_path / "a.bvh", ".c3d", "'.bvh'")
-    with pytest.raises(MarkerFileError, match=r"a\.trc: expected a name ending in \.csv or \.c3d"):
-        write_markers(tmp_path / "a.trc", sequence(np.random.default_rng(4)))
+    with pytest.raises(MarkerFileError, match=r"a\.txt: expected a name ending in \.c3d, \.trc, \.csv"):
+        write_markers(tmp_path / "a.txt", sequence(np.random.default_rng(4)))
 
 
 @pytest.mark.parametrize("part", [0.001, 0.05, 0.3, 0.6, 0.9])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import wait_until
+from browser import take_away, wait_until
 from completion_bodies import MARKS, POSE, TRANS, half_view, worm_with_prior
 from config_files import config_file
 
@@ -136,11 +136,7 @@ def test_a_folder_is_mended_in_the_browser_and_the_command_keeps_it(place, new_p
         wait_until(page, READY)
         assert page.locator(".sk-verdict").get_attribute("data-verdict") == "failed"
         assert page.locator(".sk-drop").is_hidden() and page.get_by_role("button", name="save").is_disabled()
-        for name in WRONG:
-            page.locator(".sk-names li").filter(has_text=name).first.click()
-            wait_until(page, f"program.state.chosen === '{name}'")
-            page.keyboard.press("Delete")
-            wait_until(page, f"!('{name}' in program.state.panes[1].places)")
+        take_away(page, WRONG)
         assert "changed since" in page.locator(".sk-verdict strong").inner_text()
         page.get_by_role("button", name="complete again").click()
         wait_until(page, "program.state.working === null && !program.state.completed.outdated", 60)

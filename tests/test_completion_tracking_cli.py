@@ -177,9 +177,9 @@ def changed(before, after):
 
 
 @pytest.mark.parametrize("given, files", [
-    ((), set()), (("--keys", 4), {"animation.glb"}),
-    (("--smoothing", 0), {"motion.npz", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "animation.glb",
-                          "report.html"})])
+    ((), set()),
+    (("--smoothing", 0), {"motion.npz", "motion.bvh", "motion.trc", "joint_angles.csv", "joint_centres.csv",
+                          "animation.glb", "report.html"})])
 def test_what_is_made_of_frames_does_not_follow_them_again(again, given, files):
     folder, out, numbers = again
     before = contents(out)

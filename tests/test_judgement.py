@@ -15,16 +15,17 @@ from scanned_shapes import ball as sphere
 from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import main
 from completion.mocap.animate.work import Work as Follow
-from completion.mocap.pose.robust import motion_problem
+from completion.mocap.pose.robust import hardly_seen, motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.person import PersonConfig
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
+from completion.tracking.cli import wrong_size
 from completion.tracking.sequence import tracking_problem
 from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
-from model.learning.scape import judge_model, learning_problem
+from model.learning.scape import judge_model, learn_scape, learning_problem
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.alignment.views import align_views, views_problem
 from scanprep.batch.room import Room
@@ -35,6 +36,7 @@ from scanprep.judgement import Judgement
 from scanprep.pictures import scene
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.skeleton.find import skeleton_problem
+from scanprep.skeleton.tree import Skeleton
 
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
@@ -90,7 +92,7 @@ def test_a_command_says_that_its_result_means_nothing(place, capsys, case):
     assert main(command.split()) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if "THE RESULT MEANS NOTHING" in line]
     assert len(said) == 1 and all(word in said[0] for word in words), said
-    told = json.loads(Path("out.report.json").read_text())
+    told = json.loads(Path("out.ply.report.json").read_text())
     assert Path("out.ply").exists() and told["judgement"]["verdict"] == "failed"
     assert told["judgement"]["reasons"][0] in said[0]
     if case == "ten points":                                        # there is nothing to converge to
@@ -181,6 +183,25 @@ def test_a_body_that_is_not_found_in_the_frames_means_nothing():
     assert "no frame shows anything" in tracking_problem(nothing)
 
 
+def test_frames_that_cannot_show_the_body_mean_nothing():
+    """Specks explain themselves well: a hand can be laid over them in every frame."""
+    person = worm_with_prior().subject(None)
+    points, unseen = person.template.vertices, PointCloud(np.zeros((0, 3)))
+    half = PointCloud(points[points[:, 2] > np.median(points[:, 2])])
+    assert wrong_size([[PointCloud(points)], [half]], person) is None and wrong_size([[half]], person) is None
+    assert wrong_size([[], [unseen], [PointCloud(points[:9]), PointCloud(points)]], person) is None
+    assert "0.01 times as large" in wrong_size([[PointCloud(0.01 * points)]] * 9, person)
+
+
+def test_a_motion_of_hardly_any_frames_is_to_be_looked_at():
+    residuals = np.full((10, 5), np.nan)
+    residuals[:5, :3] = residuals[5:, :2] = 0.004
+    motion = Motion(np.zeros((10, 4, 3)), np.zeros((10, 3)), None, 30.0, residuals, tuple("abcde"))
+    assert hardly_seen([motion]) == ()
+    (told,) = hardly_seen([motion, dataclasses.replace(motion, residuals=np.full((10, 5), np.nan))])
+    assert told.startswith("15 of 20 frames show fewer than 3 markers")
+
+
 def test_unsure_correspondences_mean_nothing():
     vertices, points = np.arange(5), np.zeros((5, 3))
     assert correspondences_problem(Correspondences(vertices, points, np.full(5, 0.8))) is None
@@ -199,6 +220,14 @@ def test_models_mean_nothing_when_their_errors_are_a_hands_width():
     assert "--unit" in learning_problem(model, 1000 * body[None])
     wrong = dataclasses.replace(model, info={"left_out_error": 0.2})
     assert "200 mm" in learning_problem(wrong) and "too few poses" in learning_problem(wrong)
+
+
+def test_a_model_of_meshes_that_are_all_alike_means_nothing():
+    body = worm_with_prior().template
+    bodies = np.tile(body.vertices, (4, 1, 1))
+    whole = Skeleton(np.zeros(len(body.faces), dtype=int), np.array([-1]), body.vertices.mean(axis=0)[None], ("body",))
+    model = learn_scape(body, bodies, bodies, whole)
+    assert "neither in pose nor in shape" in judge_model(model).why and judge_model(model).verdict == "failed"
 
 
 def test_a_model_says_which_joints_it_never_saw_bend():

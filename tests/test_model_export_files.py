@@ -9,11 +9,11 @@ from glb_reader import Glb
 from model_bodies import random_poses, worm_model
 
 from model.export.bvh import part_ends, write_bvh
-from model.export.bvh_read import read_bvh
 from model.export.cli import export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
 from model.export.rig import joint_places, make_rig, turn_up
+from model.motion.bvh import read_bvh
 from scanprep.command_line import run
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
@@ -52,7 +52,7 @@ def test_a_viewer_sees_the_skinned_motion(rig, motion, up):
 def test_at_rest_nothing_is_moved_and_weights_are_as_gltf_wants_them(rig):
     glb = Glb(skinned_glb(rig, up=1))
     assert np.abs(glb.skinned() - rig.mesh.vertices).max() < 1e-6
-    assert np.abs(glb.morphed([0, 0, 0]) - rig.mesh.vertices).max() < 1e-6
+    assert np.abs(glb.morphed([0] * 6) - rig.mesh.vertices).max() < 1e-6
     world = glb.matrices()
     skin = glb.json["skins"][0]
     inverse = glb.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
@@ -71,38 +71,41 @@ def test_at_rest_nothing_is_moved_and_weights_are_as_gltf_wants_them(rig):
     assert np.abs(spread - rig.weights).max() < 1e-6
 
 
-@pytest.mark.parametrize("k", [0, 1, 2])
-def test_morph_targets_are_betas(model, rig, k):
+@pytest.mark.parametrize(("k", "sign"), [(0, 1), (1, -1), (2, 1)])
+def test_morph_targets_are_betas(model, rig, k, sign):
     glb = Glb(skinned_glb(rig, up=1))
-    assert glb.json["meshes"][0]["extras"]["targetNames"] == ["beta 1", "beta 2", "beta 3"]
-    weights, betas = np.zeros(3), np.r_[BETAS, 0]
-    weights[k], betas[k] = 2, betas[k] + 2
+    assert glb.json["meshes"][0]["extras"]["targetNames"] == [
+        "beta 1 +3", "beta 1 -3", "beta 2 +3", "beta 2 -3", "beta 3 +3", "beta 3 -3"]
+    weights, betas = np.zeros(6), np.r_[BETAS, 0]
+    weights[2 * k + (sign < 0)], betas[k] = 2 / 3, betas[k] + 2 * sign
     body = model.vertices(np.zeros((4, 3)), betas)
     assert np.abs(glb.skinned(weights=weights) - body).max() < 1e-6
-    one = Mesh(rig.mesh.vertices + rig.shapes[k], rig.mesh.faces)
-    assert np.abs(glb.morphed(weights / 2, "NORMAL") - one.vertex_normals).max() < 1e-6
+    one = Mesh(rig.mesh.vertices + 3 * sign * rig.shapes[k], rig.mesh.faces)
+    assert np.abs(glb.morphed(1.5 * weights, "NORMAL") - one.vertex_normals).max() < 1e-6
 
 
 def test_correctives_play_with_the_motion(model, rig, motion):
     poses, trans = 0.3 * motion[0], motion[1]
     subject = model.subject(BETAS)
-    extra = motion_correctives(rig, subject, poses, 5)
-    glb = Glb(skinned_glb(rig, poses, trans, 4.0, extra, up=1))
+    extra = replace(rig, correctives=motion_correctives(rig, subject, poses, 5))
+    glb = Glb(skinned_glb(extra, poses, trans, 4.0, up=1))
     names = glb.json["meshes"][0]["extras"]["targetNames"]
-    assert names == ["beta 1", "beta 2", "beta 3", *(f"corrective {k}" for k in range(1, 6))]
+    assert names[6:] == [f"corrective {k}" for k in range(1, 6)]
+    weights = np.stack([glb.moved(t)[1] for t in range(5)])
+    assert weights.min() >= 0 and weights.max() <= 1, "programs clamp others"
     plain, exact = rig.vertices(poses, trans), subject.vertices(poses, trans)
     for t in range(5):
         assert np.abs(plain[t] - exact[t]).max() > 10 * np.abs(glb.skinned(t) - exact[t]).max()
     with pytest.raises(ValueError, match="correctives: expected the poses"):
-        skinned_glb(rig, correctives=extra)
-    with pytest.raises(ValueError, match="correctives: expected weights for 4 frames, got 5"):
-        skinned_glb(rig, poses[:4], trans[:4], 4.0, extra)
+        skinned_glb(extra)
+    with pytest.raises(ValueError, match="correctives: expected weights of 4 frames, got frame 4"):
+        skinned_glb(extra, poses[:4], trans[:4], 4.0)
 
 
 def test_quaternions_do_not_jump():
     angle = np.linspace(0, 4 * np.pi, 41)
     poses = angle[:, None, None] * np.array([[0.6, 0, 0.8], [0, 1, 0]])
-    q = continuous_quaternions(poses)
+    q = continuous_quaternions(rotations.exp(poses))
     assert ((q[1:] * q[:-1]).sum(axis=-1) > 0.98).all() and np.allclose(np.linalg.norm(q, axis=-1), 1)
     expected = np.concatenate([np.sin(angle / 2)[:, None, None] * np.array([[0.6, 0, 0.8], [0, 1, 0]]),
                                np.broadcast_to(np.cos(angle / 2)[:, None, None], (41, 2, 1))], axis=-1)
@@ -325,14 +328,14 @@ def exported(files, output, *arguments):
     """Metrics of the report of a run that succeeded."""
     assert run(export, "scape model export", [str(files / "model.npz"), "-o", str(files / output), *arguments]) == 0
     place = files / output
-    report = place / "report.json" if place.is_dir() else place.with_suffix(".report.json")
+    report = place / "report.json" if place.is_dir() else place.with_name(f"{output}.report.json")
     return {m["metric"]: m["value"] for m in json.loads(report.read_text())["metrics"]}
 
 
 def test_the_command_writes_what_the_name_says(files, model, rig, motion):
     figures = exported(files, "a.glb", "--motion", str(files / "motion.npz"), "--up", "1", "--correctives", "2")
     glb = Glb((files / "a.glb").read_bytes())
-    assert len(glb.json["meshes"][0]["extras"]["targetNames"]) == 5 == figures["shape targets"] + 2
+    assert len(glb.json["meshes"][0]["extras"]["targetNames"]) == 8 == figures["shape targets"] + 2
     off = np.stack([glb.skinned(t) for t in range(5)]) - model.subject(BETAS).vertices(*motion)
     assert figures["distance from exact body, mean"] == pytest.approx(
         1000 * np.linalg.norm(off, axis=2).mean(), rel=1e-3)
@@ -366,7 +369,7 @@ def test_the_command_refuses_in_one_line(files, arguments, words, capsys, monkey
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.zeros(7)}, "at most the 3 betas"),
+    ({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.ones(7)}, "at most the 3 betas"),
     ({"poses": np.zeros((0, 12))}, "4 parts"), ({"trans": np.zeros((3, 3))}, r"trans: expected shape \(2, 3\)"),
     ({"surface_model_type": np.array("other")}, "surface_model_type 'scape'"),
     ({"mocap_frame_rate": np.array(0.0)}, "rate"), ({}, None)])

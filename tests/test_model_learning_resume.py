@@ -234,7 +234,7 @@ def test_what_is_not_ours_stays(bodies, capsys):
         (bodies / name).write_text("mine")
         assert run(learn, "scape learn", words(bodies, "m.npz")) == 1
         assert name in capsys.readouterr().err and (bodies / name).read_text() == "mine"
-        assert not (bodies / "m.report.json").exists()
+        assert not (bodies / "m.npz.report.json").exists()
         (bodies / name).unlink()
     learned(bodies, "m.npz")
 

@@ -6,14 +6,15 @@ import pytest
 from model_bodies import worm, worm_model
 
 from model.export.bvh import write_bvh
-from model.export.bvh_read import BvhMotion, read_bvh
-from model.export.cli import read_motion
 from model.export.rig import joint_places
 from model.features import linear_features
+from model.motion.bvh import read_bvh
+from model.motion.moving import MovingSkeleton
+from model.motion.onto import read_motion
+from model.motion.roles import find_roles, trunk
 from model.skinning import SkinningModel
 from model.statue.control.files import humanoid
 from model.statue.motion.motions import Follower, _bound, bvh_motion, own_motion, people_motion, write_motion
-from model.statue.motion.retarget import find_roles, trunk
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
@@ -176,7 +177,7 @@ def in_t_pose(poses, table, Q, size=1.0):
     order = [0, 17, *range(1, 17), 18]
     number = np.argsort(order)
     above = np.array([-1 if parents[j] < 0 else number[parents[j]] for j in order])
-    return BvhMotion(tuple(names[j] for j in order), above, (offsets @ Q.T)[order], {}, (Q @ R @ Q.T)[:, order],
+    return MovingSkeleton(tuple(names[j] for j in order), above, (offsets @ Q.T)[order], {}, (Q @ R @ Q.T)[:, order],
                      (y @ Q.T)[:, order], 30.0)
 
 

@@ -273,6 +273,12 @@ def write(output: Output, text: str = "text") -> Outcome:
     return Outcome(output, [Metric("letters", len(text))])
 
 
+def write_alone(output: Output, text: str = "text") -> Outcome:
+    """Write nothing beside it."""
+    output.write_text(text)
+    return Outcome(output, [Metric("letters", len(text))])
+
+
 def write_folder(output: Output) -> Outcome:
     """Write a folder."""
     (output / "inner").mkdir(parents=True)
@@ -301,8 +307,8 @@ def test_an_output_file_that_is_not_ours_stays(tmp_path, capsys):
     out = tmp_path / "a.txt"
     assert command(write, out) == 0 and out.read_text() == "text"
     assert command(write, out, "--text", "other") == 0 and out.read_text() == "other"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.report.json", "a.txt"]
-    report = json.loads((tmp_path / "a.report.json").read_text())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.txt", "a.txt.report.json"]
+    report = json.loads((tmp_path / "a.txt.report.json").read_text())
     assert set(report["written"]) == {"a.txt", "a.more.txt"}
     for name in ("a.txt", "a.more.txt"):
         before = {**tree(tmp_path), name: b"edited"}
@@ -335,7 +341,7 @@ def test_a_command_killed_between_any_two_moves(tmp_path, monkeypatch, at):
         pass
     monkeypatch.undo()
     assert command(write, out, "--text", "other") == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.report.json", "a.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.txt", "a.txt.report.json"]
     assert out.read_text() == (tmp_path / "a.more.txt").read_text() == "other"
 
 
@@ -376,3 +382,23 @@ def test_steps_of_a_file_are_kept_beside_it(tmp_path):
     with beside(out) as space:
         space.drop_record("s")
     assert not home.exists() and out.exists()
+
+
+def test_files_that_differ_in_their_endings_keep_their_reports(tmp_path):
+    """A second output neither takes the report of the first nor, as not made by it, the file itself."""
+    for name in ("walk.glb", "walk.bvh", "walk.glb"):
+        assert command(write_alone, tmp_path / name, "--text", name) == 0
+    for name in ("walk.glb", "walk.bvh"):
+        assert (tmp_path / name).read_text() == name
+        assert set(json.loads((tmp_path / f"{name}.report.json").read_text())["written"]) == {name}
+    assert len(os.listdir(tmp_path)) == 4
+
+
+def test_a_report_without_the_ending_still_tells_what_is_ours(tmp_path):
+    """As they were named once: of the file that they name, and of no other."""
+    assert command(write_alone, tmp_path / "a.txt") == 0
+    (tmp_path / "a.txt.report.json").rename(tmp_path / "a.report.json")
+    (tmp_path / "a.md").write_text("mine")
+    assert command(write_alone, tmp_path / "a.md") == 1 and (tmp_path / "a.md").read_text() == "mine"
+    assert command(write_alone, tmp_path / "a.txt", "--text", "other") == 0
+    assert sorted(os.listdir(tmp_path)) == ["a.md", "a.txt", "a.txt.report.json"]

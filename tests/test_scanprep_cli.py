@@ -163,8 +163,10 @@ def test_decimate_keeps_landmarks(place, tmp_path):
     assert apart.max() < 1e-9
 
 
-def test_decimate_set(place, tmp_path):
-    assert run("decimate-set", place / "set", "--faces", 500, "-o", tmp_path / "small") == 0
+def test_decimate_set(place, tmp_path, capsys):
+    assert run("decimate", place / "set", "--faces", 500, "--method", "fast", "-o", tmp_path / "no") == 1
+    assert "--method: it says nothing about a registered set" in capsys.readouterr().err
+    assert run("decimate", place / "set", "--faces", 500, "-o", tmp_path / "small") == 0
     small, whole = RegisteredSet.load(tmp_path / "small"), RegisteredSet.load(place / "set")
     assert small.names == whole.names and len(small.template.faces) <= 500
     assert small.skeleton.names == whole.skeleton.names
@@ -182,7 +184,7 @@ def test_clean(tmp_path):
     write_points(tmp_path / "raw.xyz", PointCloud(raw.vertices, None, None))
     assert run("clean", tmp_path / "raw.xyz", "-o", tmp_path / "body.xyz") == 0
     assert len(read_points(tmp_path / "body.xyz").points) == 642
-    assert report(tmp_path / "body.report.json")["points before"] == 654
+    assert report(tmp_path / "body.ply.report.json")["points before"] == 654
 
 
 def test_fill(tmp_path):
@@ -190,11 +192,11 @@ def test_fill(tmp_path):
     open_body = body.submesh(body.vertices[body.faces].mean(axis=1)[:, 2] < 0.8)[0]
     write_mesh(tmp_path / "open.ply", open_body)
     assert run("fill", tmp_path / "open.ply", "-o", tmp_path / "closed.ply") == 0
-    closed, figures = read_mesh(tmp_path / "closed.ply"), report(tmp_path / "closed.report.json")
+    closed, figures = read_mesh(tmp_path / "closed.ply"), report(tmp_path / "closed.ply.report.json")
     assert closed.is_closed and figures["holes before"] == 1 and figures["fair patches"] == 1
     np.testing.assert_array_equal(closed.vertices[:len(open_body.vertices)], open_body.vertices)
     assert run("fill", tmp_path / "open.ply", "--method", "diffusion", "-o", tmp_path / "diffused.ply") == 0
-    assert report(tmp_path / "diffused.report.json")["diffusion patches"] == 1
+    assert report(tmp_path / "diffused.ply.report.json")["diffusion patches"] == 1
 
 
 def test_views_come_together(tmp_path):
@@ -227,20 +229,20 @@ def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     assert run(*words, "-o", tmp_path / "pairs.json") == 1   # on an egg all pairs are wrong by a third of it
     assert "MEANS NOTHING: 40 pairs were found with a median confidence of 0.03" in capsys.readouterr().err
     found = read_correspondences(tmp_path / "pairs.json")
-    assert len(found) == report(tmp_path / "pairs.report.json")["correspondences"] > 5
+    assert len(found) == report(tmp_path / "pairs.json.report.json")["correspondences"] > 5
     assert 0 <= found.template_vertices.min() and found.template_vertices.max() < 642
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
     beside = [*words[:4], "--config", config_file(tmp_path, points=40)]     # the landmarks of its name beside the scan
     assert run(*beside, "-o", tmp_path / "beside.json") == 1
     assert (tmp_path / "beside.json").read_bytes() == (tmp_path / "pairs.json").read_bytes()
     capsys.readouterr()
-    assert run(*beside, "--ignore-landmarks", "-o", tmp_path / "none.json") == 1
+    assert run(*beside, "--landmarks", "none", "-o", tmp_path / "none.json") == 1
     assert "at least three limbs" in capsys.readouterr().err
     few = read_mesh(scan).vertices[::90]
     write_correspondences(tmp_path / "few.json", Correspondences(np.arange(642)[::90], few, np.ones(len(few))))
     assert run("register", scan, "--template", place / "template.ply", "--correspondences", tmp_path / "few.json",
                "-o", tmp_path / "registered.ply") == 0
-    assert report(tmp_path / "registered.report.json")["vertices with data"] > 95
+    assert report(tmp_path / "registered.ply.report.json")["vertices with data"] > 95
 
 
 def test_files_of_correspondences(tmp_path):
@@ -269,12 +271,20 @@ def test_register_finds_the_landmarks_beside_the_scan(place, tmp_path, ending, q
     points = read_landmarks(place / "scans" / "body0.landmarks.json")
     (tmp_path / f"scan{ending}").write_text(landmark_file(ending, points))
     assert run("register", scan, "--template", place / "template.ply", "-o", tmp_path / "out.ply") == 0
-    figures = report(tmp_path / "out.report.json")
+    figures = report(tmp_path / "out.ply.report.json")
     assert figures["landmarks"] == len(MARKS) and figures["landmark file"] == f"scan{ending}"
     assert figures["distance of landmarks, RMS"] < 30
 
 
 def landmark_file(ending, points):
+    if ending == ".fcsv":
+        rows = "".join(f"{i},{1000 * x},{1000 * y},{1000 * z},0,0,0,1,1,1,0,{name},,\n"
+                       for i, (name, (x, y, z)) in enumerate(points.items()))
+        return f"# CoordinateSystem = LPS\n{rows}"
+    if ending == ".scalismo.json":
+        return json.dumps([{"id": name, "coordinates": list(p)} for name, p in points.items()])
+    if ending.endswith(".csv"):
+        return "name,x,y,z\n" + "".join(f"{name},{x},{y},{z}\n" for name, (x, y, z) in points.items())
     if ending == ".mrk.json":
         return json.dumps({"markups": [{"coordinateUnits": "m", "controlPoints": [
             {"label": name, "position": list(p)} for name, p in points.items()]}]})

@@ -31,7 +31,7 @@ def test_done(tmp_path, capsys):
     out = tmp_path / "a.txt"
     assert command_line.run(work, "scape work", ["--out", str(out), "--weight", "0.25"]) == 0
     assert "0.00123" in capsys.readouterr().out
-    report = json.loads((tmp_path / "a.report.json").read_text())
+    report = json.loads((tmp_path / "a.txt.report.json").read_text())
     assert report["settings"]["settings"] == {"weight": 0.25}
     assert report["metrics"][0] == {"metric": "distance", "value": 0.00123456, "unit": "m"}
     assert {"numpy", "python", "machine"} <= set(report["versions"])

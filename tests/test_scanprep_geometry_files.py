@@ -21,7 +21,9 @@ from scanprep.geometry.files import (
     write_mesh,
     write_points,
 )
+from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
+from scanprep.synthetic.people import BodyShape, Person
 
 TETRAHEDRON = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 EXACT = {".ply": 0, ".ply.gz": 0, ".obj": 1e-11, ".off": 1e-11, ".glb": 1e-6}
@@ -41,7 +43,7 @@ def body(rng, n=200):
 def meshes(draw):
     n = draw(st.integers(3, 12))
     number = st.floats(-4, 4, width=32)
-    vertices = draw(st.lists(st.tuples(number, number, number), min_size=n, max_size=n))
+    vertices = draw(st.lists(st.tuples(number, number, number), min_size=n, max_size=n, unique=True))
     faces = draw(st.lists(st.lists(st.integers(0, n - 1), min_size=3, max_size=3, unique=True), min_size=1,
                           max_size=8))
     return Mesh(np.array(vertices), np.array(faces))
@@ -105,11 +107,37 @@ def test_we_read_what_trimesh_writes_and_others_read_ours(tmp_path, suffix):
     np.testing.assert_allclose(read_mesh(tmp_path / f"a{suffix}").corners, mesh.corners, atol=1e-6)
     write_mesh(tmp_path / f"b{suffix}", mesh)
     theirs = trimesh.load(tmp_path / f"b{suffix}", force="mesh", process=False)
-    np.testing.assert_allclose(theirs.vertices[theirs.faces], mesh.corners, atol=1e-6)
+    shown = mesh.corners @ turn_up(tallest(mesh.vertices)).T if suffix == ".glb" else mesh.corners
+    np.testing.assert_allclose(theirs.vertices[theirs.faces], shown, atol=1e-6)
     if suffix != ".glb":
         write_mesh(tmp_path / f"b{suffix}", Mesh(mesh.vertices, mesh.faces))        # it expects no colours
         v, f = igl.read_triangle_mesh(str(tmp_path / f"b{suffix}"))
         np.testing.assert_allclose(v[f], mesh.corners, atol=1e-6)
+
+
+@pytest.mark.parametrize("up", [0, 1, 2])
+def test_glb_has_y_up_and_comes_back_as_it_was(tmp_path, up):
+    mesh = Mesh(np.float32(np.roll([1.7, 0.3, 0.5], up) * np.random.default_rng(up).uniform(0, 1, (60, 3))),
+                np.arange(60).reshape(20, 3), np.tile([0.2, 0.5, 0.7], (60, 1)))
+    write_mesh(tmp_path / "a.glb", mesh)
+    shown = trimesh.load(tmp_path / "a.glb", force="mesh", process=False).vertices
+    assert np.ptp(shown, axis=0).argmax() == 1 and np.array_equal(shown, np.float32(mesh.vertices @ turn_up(up).T))
+    again = read_mesh(tmp_path / "a.glb", "m")
+    assert np.array_equal(again.vertices, mesh.vertices) and np.array_equal(again.faces, mesh.faces)
+    assert np.allclose(again.colors, mesh.colors, atol=1e-6)
+    data = (tmp_path / "a.glb").read_bytes()                # from elsewhere, or from before there was a mark
+    for ours, theirs in ((b'"up"', b'"xx"'), (b'"scapekit"', b'"someones"')):
+        (tmp_path / "b.glb").write_bytes(data.replace(ours, theirs))
+        assert np.array_equal(read_mesh(tmp_path / "b.glb", "m").vertices, shown)
+
+
+def test_arms_spread_wider_than_a_body_is_tall_do_not_lay_it_over():
+    person = Person(BodyShape()).mesh.vertices
+    width, _, height = np.ptp(person, axis=0)
+    for wide in (0.9, 1.0, 1.1):
+        assert tallest(person * [wide * height / width, 1, 1]) == 2
+        assert tallest(np.roll(person * [wide * height / width, 1, 1], 1, axis=1)) == 0
+    assert tallest(person * [2 * height / width, 1, 1]) == 0
 
 
 def test_glb_places_every_mesh_by_its_node(tmp_path):

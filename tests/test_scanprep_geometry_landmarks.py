@@ -47,10 +47,48 @@ def slicer(points, system, unit="mm", scale=1000):
         + [{"label": "F-9", "position": [0, 0, 0], "positionStatus": "undefined"}]}]}
 
 
+def fiducials(points, system, columns=True):
+    """As 3D Slicer 4 and 5 write them; the last two numbers are of version 5, and say that the last is not placed."""
+    turn = np.array([1, 1, 1]) if system in ("LPS", "1") else np.array([-1, -1, 1])
+    rows = [f"vtkMRMLMarkupsFiducialNode_{i},{','.join(map(str, 1000 * turn * p))},0,0,0,1,1,1,0,\"{name}\",,,2,0\n"
+            for i, (name, p) in enumerate(points.items())]
+    return ("# Markups fiducial file version = 4.11\n" + f"# CoordinateSystem = {system}\n" * bool(system)
+            + "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n" * columns
+            + "".join(rows) + "9,0,0,0,0,0,0,1,1,1,0,F-9,,,0,0\n")
+
+
+def fiducials_3(points):
+    """A fiducial list of 3D Slicer 3, always in RAS."""
+    rows = "".join(f"{name},{-1000 * x},{-1000 * y},{1000 * z},1,1\n" for name, (x, y, z) in points.items())
+    return f"# Fiducial List file F.fcsv\n# version = 2\n# numPoints = 3\n# columns = label,x,y,z,sel,vis\n{rows}"
+
+
+def scalismo(points):
+    return [{"id": name, "coordinates": p, "description": "x"} for name, p in points.items()]
+
+
+def marker_set(points, frame="<socket_parent_frame>/bodyset/torso</socket_parent_frame>"):
+    rows = "".join(f'<Marker name="{name}">{frame}<location>{" ".join(map(str, p))}</location><fixed>true</fixed>'
+                   "</Marker>" for name, p in points.items())
+    return f'<?xml version="1.0"?><OpenSimDocument Version="40000"><MarkerSet name="m"><objects>{rows}</objects>' \
+           "</MarkerSet></OpenSimDocument>"
+
+
+def table(points, heading="name,x,y,z", mark=","):
+    rows = "".join(f'"{name}"{mark}{mark.join(map(str, p))}\n' for name, p in points.items())
+    return f"\ufeff{heading}\n{rows}"
+
+
 TEXT = "# landmarks\n" + "".join(f"{x} {y} {z} {name}\n" for name, (x, y, z) in POINTS.items())
 FORMS = [("a.json", POINTS), ("a.pp", picked(POINTS)), ("a.lnd", caesar(POINTS)), ("a.txt", TEXT),
          ("a.mrk.json", slicer(POINTS, "LPS")), ("b.mrk.json", slicer(POINTS, "RAS")),
-         ("c.mrk.json", slicer(POINTS, "LPS", "m", 1)), ("d.mrk.json", slicer(POINTS, "LPS", ["cm"] * 3, 100))]
+         ("c.mrk.json", slicer(POINTS, "LPS", "m", 1)), ("d.mrk.json", slicer(POINTS, "LPS", ["cm"] * 3, 100)),
+         *((f"{system or 'none'}.fcsv", fiducials(POINTS, system)) for system in ("LPS", "RAS", "0", "1", "")),
+         ("no_columns.fcsv", fiducials(POINTS, "LPS", False)), ("slicer3.fcsv", fiducials_3(POINTS)),
+         ("a.scalismo.json", scalismo(POINTS)), ("scalismo.json", scalismo(POINTS)), ("a.csv", table(POINTS)),
+         ("b.csv", table(POINTS, "Label;X;Y;Z", ";")), ("a.xml", marker_set(POINTS)),
+         ("b.xml", marker_set(POINTS, "<body>torso</body>"))]
+WRITTEN = (".json", ".mrk.json", ".fcsv", ".scalismo.json", ".csv", ".xml", ".pp", ".lnd", ".txt")
 
 
 @pytest.mark.parametrize(("name", "content"), FORMS, ids=[name for name, _ in FORMS])
@@ -93,6 +131,56 @@ def test_vertices_and_points_of_faces_need_the_mesh(tmp_path):
         read_landmarks(path)
 
 
+@pytest.mark.parametrize("ending", WRITTEN)
+def test_every_format_comes_back(tmp_path, ending):
+    rng = np.random.default_rng(0)
+    points = {name: rng.normal(size=3) for name in ("nose", "left knee", "Gr\u00f6\u00dfe", "10th, \"rib\" & <so> on")}
+    write_landmarks(tmp_path / f"a{ending}", points)
+    found = read_landmarks(tmp_path / f"a{ending}")
+    assert list(found) == list(points)
+    np.testing.assert_allclose(np.array([*found.values()]), np.array([*points.values()]), rtol=0, atol=1e-9)
+    write_landmarks(tmp_path / f"mm{ending}", points, "mm")
+    np.testing.assert_allclose(read_landmarks(tmp_path / f"mm{ending}", unit="mm")["nose"], points["nose"], atol=1e-9)
+    write_landmarks(tmp_path / f"again{ending}", found)
+    assert (tmp_path / f"again{ending}").read_bytes() == (tmp_path / f"a{ending}").read_bytes() or ending == ".lnd"
+
+
+@pytest.mark.parametrize("ending", WRITTEN)
+@pytest.mark.parametrize("data", [b"", b"\n\n", bytes(range(256)) * 4, b"\x00\x01\x02"])
+def test_what_holds_no_landmarks_is_one_line(tmp_path, ending, data):
+    (tmp_path / f"a{ending}").write_bytes(data)
+    with pytest.raises(MeshFileError, match=rf"a\{ending}") as told:
+        read_landmarks(tmp_path / f"a{ending}", MESH)
+    assert "\n" not in str(told.value) and len(str(told.value)) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("ending", WRITTEN)
+def test_a_file_cut_off_is_refused_or_has_the_points_before(tmp_path, ending):
+    """Of files of lines the rows before the cut may be there, the last of them shorter; no other is wrong."""
+    write_landmarks(tmp_path / f"a{ending}", {name: np.array(p) for name, p in POINTS.items()})
+    data = (tmp_path / f"a{ending}").read_bytes()
+    for length in range(1, len(data) - 1, 7):
+        (tmp_path / f"b{ending}").write_bytes(data[:length])
+        try:
+            found = read_landmarks(tmp_path / f"b{ending}")
+        except MeshFileError as error:
+            assert f"b{ending}" in str(error) and "\n" not in str(error)
+            continue
+        assert ending in (".fcsv", ".csv", ".lnd", ".txt") or data[length:].strip() in (b"", b"}", b"]")
+        for name in [*found][:-1]:
+            np.testing.assert_allclose(found[name], POINTS[name], atol=1e-9)
+
+
+def test_opensim_reads_our_markers(tmp_path):
+    opensim = pytest.importorskip("opensim", reason="OpenSim's own library is not installed")
+    write_landmarks(tmp_path / "a.xml", {name: np.array(p) for name, p in POINTS.items()})
+    markers = opensim.MarkerSet(str(tmp_path / "a.xml"))
+    assert [markers.get(i).getName() for i in range(markers.getSize())] == list(POINTS)
+    for i, point in enumerate(POINTS.values()):
+        np.testing.assert_allclose([markers.get(i).get_location()[k] for k in range(3)], point, atol=1e-9)
+        assert markers.get(i).getParentFrameName() == "/ground"
+
+
 def test_what_is_written_comes_back(tmp_path):
     write_landmarks(tmp_path / "a.json", {name: np.array(p) for name, p in POINTS.items()})
     for name, point in read_landmarks(tmp_path / "a.json").items():
@@ -126,6 +214,22 @@ def test_what_is_written_comes_back(tmp_path):
     ("a.txt", "0 0 1 nose\n0 0 1\n", ["line 2", "x y z name"]),
     ("a.txt", "0 0 1 nose\n0 zero 1 chin\n", ["line 2", "zero"]),
     ("a.txt", "0 0 1 nose\n0 0 2 nose\n", ["'nose' comes twice"]),
+    ("a.fcsv", fiducials(POINTS, "IJK"), ["CoordinateSystem", "IJK"]),
+    ("a.fcsv", fiducials_3(POINTS).replace("-100.0", "nan"), ["line 5", "label,x,y,z", "nan"]),
+    ("a.fcsv", "# CoordinateSystem = LPS\nnose,1,2\n", ["line 2", "label,x,y,z"]),
+    ("a.csv", "nose,0,0,1\n", ["line 1", "heading with name, x, y, z"]),
+    ("a.csv", "name,x,y,z\nnose,0,0,1\nchin,0,zero,1\n", ["line 3", "zero"]),
+    ("a.csv", "name,x,y,z\nnose,0,0,nan\n", ["line 2", "nan"]),
+    ("a.csv", "name,x,y,z\n", ["found none"]),
+    ("a.scalismo.json", [{"id": "nose", "coordinates": [1, 2]}], ["'nose'", "[1, 2]"]),
+    ("a.scalismo.json", [{"id": "nose"}], ["'nose'"]),
+    ("a.json", '[{"id": "nose", "coordinates": [0, 1, NaN]}]', ["'nose'", "not finite"]),
+    ("a.pp", "<P><point x='1' y='2' z='a' name='b'/></P>", ["MeshLab", "point 1", "'b'"]),
+    ("a.mrk.json", {"markups": [{"controlPoints": [{"label": "a", "position": [1, "b", 2]}]}]}, ["point 0", "x, y, z"]),
+    ("a.xml", marker_set(POINTS).replace("torso", "pelvis", 1), ["'nose' on pelvis", "'left knee' on torso", "TRC"]),
+    ("a.xml", marker_set(POINTS, ""), ["OpenSim", "marker 1 'nose'", "socket_parent_frame"]),
+    ("a.xml", marker_set(POINTS).replace("-0.2", "far"), ["OpenSim", "marker 1 'nose'", "location"]),
+    ("a.xml", "<OpenSimDocument/>", ["found none"]),
 ])
 @pytest.mark.parametrize("read", [read_landmarks, read_landmark_vertices])
 def test_bad_files_say_what_is_wrong(tmp_path, read, name, content, words):

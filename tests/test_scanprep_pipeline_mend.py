@@ -2,7 +2,7 @@
 import time
 
 import pytest
-from browser import wait_until
+from browser import take_away, wait_until
 from scan_folders import MARKS, WITH_PICTURES, ball, contents, write_scans
 
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
@@ -137,11 +137,7 @@ def test_a_set_is_mended_in_the_browser(new_page, place):
         page.goto(server.opening())
         wait_until(page, READY)
         assert page.locator(".sk-verdict").get_attribute("data-verdict") in ("check", "failed")
-        for name in WRONG:
-            page.locator(".sk-names li").filter(has_text=name).first.click()
-            wait_until(page, f"program.state.chosen === '{name}'")
-            page.keyboard.press("Delete")
-            wait_until(page, f"!('{name}' in program.state.panes[1].places)")
+        take_away(page, WRONG)
         assert "changed since" in page.locator(".sk-verdict strong").inner_text()
         page.locator("button", has_text="register again").click()
         wait_until(page, "program.state.verdicts[0].verdict === 'good' && !program.state.working", 60)

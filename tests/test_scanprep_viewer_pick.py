@@ -123,7 +123,8 @@ def test_lists_of_names_come_from_a_file(tmp_path):
             read_names(str(wrong))
 
 
-@pytest.mark.parametrize("ending", [".landmarks.json", ".pp", ".mrk.json", ".lnd", ".txt"])
+@pytest.mark.parametrize("ending", [".landmarks.json", ".pp", ".mrk.json", ".fcsv", ".scalismo.json", ".landmarks.csv",
+                                    ".lnd", ".txt"])
 def test_every_click_is_saved_in_the_format_wanted(folder, person, ending):
     app, file = app_of(folder, ending=".landmarks.txt" if ending == ".txt" else ending), None
     for name in FOUR[:2]:

@@ -64,8 +64,8 @@ class CompleteApp(PickApp):
         Settings, and the landmarks of the model's template; its body is what a person of known shape is.
     scans : paths
     output : folder that results are saved in, one for each scan where there are several
-    dropped : where scans that are dropped are kept, for as long as the app, unless it is somebody else's
     labels : of markers that the person wears, to be clicked too
+    dropped : where scans that are dropped are kept, for as long as the app, unless it is somebody else's
     """
 
     name, title = "complete", "Complete a scan"
@@ -153,7 +153,7 @@ class CompleteApp(PickApp):
     def _figures(self, made: Made) -> list[Metric]:
         assert self.scan is not None
         pairs = pairs_of(made.places, self.work.marks)
-        return figures(self.work, Inputs((self.scan.path,)), made.completion, pairs, made.masked)
+        return figures(self.work, self._inputs(self.scan), made.completion, pairs, made.masked)
 
     def _outdated(self, made: Made) -> bool:
         """Whether landmarks, or anything else that it was made from, were changed since."""
@@ -236,14 +236,11 @@ class CompleteApp(PickApp):
             and not self.work.config.free_scale and made.completion.judgement.verdict != "failed"
         start = made.completion if made is not None and on else None
         scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in names}
-        given = self._given(scan.path)
 
         def work(tell: Callable[[int, int], None]) -> str:
             begin, pairs = time.perf_counter(), pairs_of(places, self.work.marks)
             files = self._files(scan.path, pairs)
-            masked = self._masked(scan, files)
-            done = complete(self._body(known), list(given.views) if isinstance(given, ScanFiles) else given, pairs,
-                            self.work.config, tell, masked, start)
+            done, masked = self._found(scan, files, known, pairs, tell, start)
             with self._lock:
                 self.made[scan.path] = Made(done, files, time.perf_counter() - begin, places, known, masked)
                 self.saved.pop(scan.path, None)
@@ -258,13 +255,11 @@ class CompleteApp(PickApp):
         """Find the body without the landmarks, which tells those that are at wrong places."""
         if self.scan is None or self.working is not None:
             return
-        scan, known, given = self.scan, self.known, self._given(self.scan.path)
-        places = {name: scan.places[name] for name in self._usable(scan)}
+        scan, known, places = self.scan, self.known, {name: self.scan.places[name] for name in self._usable(self.scan)}
 
         def work(tell: Callable[[int, int], None]) -> str:
             files = self._files(scan.path, pairs_of(places, self.work.marks))
-            done = complete(self._body(known), list(given.views) if isinstance(given, ScanFiles) else given, None,
-                            self.work.config, tell, self._masked(scan, files))
+            done, _ = self._found(scan, files, known, None, tell)
             if done.judgement.verdict == "failed":
                 return "the body is not found without landmarks either"
             with self._lock:
@@ -274,6 +269,14 @@ class CompleteApp(PickApp):
             return told if done.judgement.verdict == "good" else f"{told}; but that body is itself doubtful"
 
         self.beside("finding the body without the landmarks", work, send, "it could not be found")
+
+    def _found(self, scan: Clicked, files: ScanFiles, known: bool, pairs: tuple[np.ndarray, np.ndarray] | None,
+               tell: Callable[[int, int], None], start: Completion | None = None
+               ) -> tuple[Completion, np.ndarray | None]:
+        """The body in a scan, and its points that are clothing or hair."""
+        given, masked = self._given(scan.path), self._masked(scan, files)
+        views = list(given.views) if isinstance(given, ScanFiles) else given
+        return complete(self._body(known), views, pairs, self.work.config, tell, masked, start), masked
 
     def _body(self, known: bool) -> BodyModel | Subject:
         if not known:

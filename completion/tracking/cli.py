@@ -14,8 +14,8 @@ from model.posing.cli import read_subject
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
-from scanprep.judgement import Judgement
-from scanprep.ranges import Count, Positive
+from scanprep.judgement import Judgement, extent, unit_problem
+from scanprep.ranges import Positive
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
 from ..motion import Motion
@@ -29,7 +29,7 @@ FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES"
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
-                 keys: Count = 120, config: TrackConfig = TrackConfig(),  # noqa: B008
+                 config: TrackConfig = TrackConfig(),  # noqa: B008
                  *, space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 
@@ -42,8 +42,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     Args:
         frames: Folder of meshes or point clouds, one for each frame; or with one such folder for each camera, all
             cameras in one frame of reference.
-        output: Folder to write motion.npz, animation.glb, motion.bvh, joint_angles.csv, joint_centres.csv,
-            residuals.csv and report.html to.
+        output: Folder to write motion.npz, animation.glb, motion.bvh, motion.trc, motion.mot, joint_angles.csv,
+            joint_centres.csv, residuals.csv and report.html to.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         rate: Frames per second.
         cameras: How files of several cameras in one folder are named, such as "cam{camera}_{frame}.ply".
@@ -53,7 +53,6 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
         unit: Unit of the frames and landmarks.
         surfaces: Write the completed surface of every frame to surfaces/.
-        keys: Largest number of key frames in the GLB.
         config: Settings.
     """
     from ..mocap.files.motion_files import write_glb, write_motion
@@ -79,11 +78,17 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         _page(folder, motion, person, found, frames.name, metrics)
 
     of_motion = done.key, config.smoothing
+    metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, rows(metrics), frames.name), write)
-    space.step("animation", (of_motion, keys),
-               lambda folder: write_glb(folder / "animation.glb", motion, person, keys=keys))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
-                   Judgement.of(tracking_problem(motion)))
+                   Judgement.of(wrong_size(found, person) or tracking_problem(motion)))
+
+
+def wrong_size(frames: FrameFolder, person: Subject) -> str | None:
+    """Why frames cannot show the body, by the largest of a few of them; None where they can."""
+    some = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
+    spans = [extent(np.concatenate([np.zeros((0, 3)), *(view.points for view in frames[t])])) for t in some]
+    return unit_problem(float(np.fmax.reduce(spans)), extent(person.template.vertices), "the frames are", 0.1)
 
 
 def _figures(motion: Motion) -> list[Metric]:

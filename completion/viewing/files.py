@@ -9,6 +9,8 @@ import numpy as np
 
 from model.body import BodyModel
 from model.files import load_model
+from model.motion.files import betas_for, read_motion_file
+from model.motion.onto import read_motion
 from scanprep.cli import Unit
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import is_camera
@@ -28,9 +30,10 @@ from .motions import of_markers, of_motion
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import is_statue, read_statue, statue_folder
 
-PLACES = (".pp", ".json", ".lnd", ".landmarks.txt")
+PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
-SHOWN, TABLES = ("surface", "picture", "model", "motion", "markers"), (".csv", ".txt")     # tables may hold anything
+SHOWN = ("surface", "picture", "model", "motion", "markers")
+TABLES = (".csv", ".txt", ".bvh")    # not shown of folders: they may hold anything, or be of any body
 ENOUGH = 3                           # labels that a recording and a motion have in common
 DEEP = 3                             # folders inside folders that are looked into
 
@@ -226,21 +229,30 @@ class Files:
     # motions
 
     def _motion(self, path: Path, name: str) -> Content:
+        motion, model, notes = self._on_model(path)
+        subject, markers = model.subject(motion.betas, np.float32), self._markers_of(path, motion)
+        soft = soft_tissue_of(path, motion)
+        if soft is None:
+            content = of_motion(name, motion, subject, markers)
+            return replace(content, notes=(*content.notes, *notes))
+        return with_soft_tissue(of_motion(name, motion, subject), soft, model, markers)
+
+    def _on_model(self, path: Path) -> tuple[Motion, BodyModel, tuple[str, ...]]:
+        """A motion on its model, or on the one that was named; of another skeleton what is to be told."""
+        if path.suffix.lower() == ".bvh" or read_motion_file(path).of_family:
+            model = self._model_of(path)
+            found = read_motion(path, model, unit=self.unit)
+            return Motion.of(found), model, tuple(f"{path.name}: {m.name} {m.value}" for m in found.told)
         motion = Motion.load(path)
         model = self._model_of(path, motion)
         parts = len(model.skeleton.parents)
         if motion.poses.shape[1] != parts:
             raise ValueError(f"{path}: expected a motion of the model's {parts} parts, found {motion.poses.shape[1]}; "
                              "name its own model with -m")
-        betas = motion.betas
-        if betas is not None and len(betas) > model.n_betas:
-            raise ValueError(f"{path}: expected at most the {model.n_betas} betas of the model, found {len(betas)}; "
-                             "name its own model with -m")
-        subject, markers = model.subject(betas, np.float32), self._markers_of(path, motion)
-        soft = soft_tissue_of(path, motion)
-        if soft is None:
-            return of_motion(name, motion, subject, markers)
-        return with_soft_tissue(of_motion(name, motion, subject), soft, model, markers)
+        try:
+            return replace(motion, betas=betas_for(path, motion.betas, model)), model, ()
+        except ValueError as problem:
+            raise ValueError(f"{problem}; name its own model with -m") from None
 
     def _markers_of(self, path: Path, motion: Motion) -> MarkerSequence | None:
         """What was measured: the mended recording beside the motion, or one among the files that is laid over it."""
@@ -252,7 +264,7 @@ class Files:
                 return markers
         return None
 
-    def _model_of(self, path: Path, motion: Motion) -> BodyModel:
+    def _model_of(self, path: Path, motion: Motion | None = None) -> BodyModel:
         """The model that was named, that the report beside the motion names, or one among the files."""
         if self.model is not None:
             return self.read_model(self.model)
@@ -260,7 +272,8 @@ class Files:
             name = reported_model(folder / "report.json")
             if name is not None and name.is_file():
                 return self.read_model(name)
-        fitting = [m for m in map(self.read_model, self._found) if len(m.skeleton.parents) == motion.poses.shape[1]]
+        fitting = [m for m in map(self.read_model, self._found)
+                   if motion is None or len(m.skeleton.parents) == motion.poses.shape[1]]
         if not fitting:
             raise ValueError(f"{path}: a motion needs its model; name it with -m, or drop it before")
         return fitting[0]

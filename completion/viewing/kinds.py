@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from model.motion.files import is_motion
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import camera_file, is_picture
 from scanprep.geometry import storage
@@ -22,14 +23,15 @@ CACHED = "cached at "                # in reports, before the file of the model 
 def kind_of(path: Path) -> str:
     """What a file is: model, motion, completion, markers, surface, picture, or words for what it is instead."""
     if zipfile.is_zipfile(path):
-        with storage.taking_apart(path, "a model or a motion"), zipfile.ZipFile(path) as archive:
-            names = [name.removesuffix(".npy") for name in archive.namelist()]
+        names = storage.names_in(path, "a model or a motion")
         if storage.HEADER not in names:
-            return "motion" if "poses" in names else f"an archive of {', '.join(sorted(names)) or 'nothing'}"[:100]
+            return "motion" if is_motion(path) else f"an archive of {', '.join(sorted(names)) or 'nothing'}"[:100]
         kind = storage.kind_of(path)
         return {"scape": "model", "blendscape": "model", "skinning": "model", "completion": "completion"}.get(
             kind, f"a file of kind '{kind}'")
     suffix = path.suffix.lower()
+    if suffix == ".bvh":
+        return "motion"
     if suffix in READERS:
         return "markers"
     if is_picture(path):

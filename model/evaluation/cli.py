@@ -28,7 +28,7 @@ from .sampling import sample_bodies, specificity
 
 def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
              counts: tuple[Count, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
-             seed: Seed = 0, unit: Unit | None = None) -> Outcome:
+             unit: Unit | None = None) -> Outcome:
     """Errors of a model on bodies that it was not trained on, with a page of curves and pictures.
 
     Example: scape model evaluate model.npz --poses held_poses --shapes held_people -o evaluation
@@ -41,7 +41,6 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
         counts: Numbers of shape components to fit people with.
         train_shapes: The people that the model was trained on: adds plain PCA of vertices and specificity.
         subject: Whose poses they are, betas or a mesh; else the template's own body.
-        seed: Of the random bodies.
         unit: Unit of the meshes.
     """
     loaded = load_model(model)
@@ -64,8 +63,8 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
             shapes_found = shape_errors(loaded, people, counts, train, progress=progress)
     if train is not None:
         with bar("bringing training people to rest") as progress:
-            specific = specificity(loaded, train, 100, np.random.default_rng(seed), counts, progress=progress)
-    samples = sample_bodies(loaded, 8, np.random.default_rng(seed)) if loaded.n_betas else None      # on the page
+            specific = specificity(loaded, train, 100, np.random.default_rng(0), counts, progress=progress)
+    samples = sample_bodies(loaded, 8, np.random.default_rng(0)) if loaded.n_betas else None      # on the page
     found = Findings(poses_found, pose_names, posed, shapes_found, people_names, people, specific, samples)
     notes, metrics = _notes(loaded, posed, people), _metrics(loaded, found)
     metrics += [Metric("note", note) for note in notes]
@@ -75,7 +74,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
                                                            if m.name != "note"], notes, progress)
     page.write(output / "report.html")
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
-                                     "train_shapes": train_shapes, "subject": subject, "seed": seed},
+                                     "train_shapes": train_shapes, "subject": subject},
                    judgement=Judgement.of(_problems(loaded, found)))
 
 

@@ -1,4 +1,4 @@
-"""BVH, written: a skeleton with its motion, as animation programs have it; `bvh_read` reads it."""
+"""BVH, written: a skeleton with its motion, as animation programs have it; `motion.bvh` reads it."""
 from __future__ import annotations
 
 import warnings

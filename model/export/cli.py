@@ -1,7 +1,8 @@
 """`scape model export`: a model in the files of other programs."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,109 +12,106 @@ from model.priors import sample_poses
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
 from scanprep.pictures.camera import upright
-from scanprep.ranges import BETAS, Beta
+from scanprep.ranges import Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
+from ..motion.amass import write_amass
+from ..motion.onto import BodyMotion, read_motion
 from .bvh import write_bvh
-from .correctives import motion_correctives, pose_features, spaced, write_body_npz
+from .conventions import for_programs, standing
+from .correctives import motion_correctives, off_exact, pose_features, spaced, write_body_npz
 from .glb import write_skinned_glb
-from .rig import Rig, check_motion, joint_places, make_rig
+from .names import Names, names_of
+from .rig import Rig, joint_places, make_rig
+from .usd import USD, write_points_usd, write_skinned_usd
 
-MOTIONS_OF = "scape"                 # what motion files say they are made for
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
-_TAKES = {"glb": {"betas", "own_body", "motion", "shapes", "correctives", "up"},
-          "bvh": {"betas", "own_body", "motion", "unit", "up"}, "npz": set(), "mesh": {"betas", "own_body"},
-          "folder": {"betas", "own_body", "motion"}}
-
-
-@dataclass(frozen=True, eq=False)
-class _Moves:
-    """A motion as its file has it; without one, poses to measure with."""
-
-    poses: np.ndarray
-    trans: np.ndarray
-    betas: np.ndarray | None
-    rate: float
+_PLACED = {"betas", "own_body", "up", "ground", "front"}
+_BONES = _PLACED | {"motion", "root", "names"}
+_TAKES = {"glb": _BONES | {"shapes", "correctives"}, "usd": _BONES | {"shapes", "correctives"},
+          "point cache": {"betas", "own_body", "motion", "up"}, "bvh": _BONES | {"unit"}, "npz": {"motion"},
+          "mesh": _PLACED, "folder": {"betas", "own_body", "motion"}}
 
 
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
-           motion: Path | None = None, shapes: int | None = None, correctives: int = 0,
-           unit: Unit | None = None, up: Literal[0, 1, 2] | None = None) -> Outcome:
+           motion: Path | None = None, shapes: int | None = None, correctives: int | None = None,
+           unit: Unit | None = None, up: Literal[0, 1, 2] | None = None, root: str | None = None,
+           names: Names | None = None, ground: bool = False, front: bool = False) -> Outcome:
     """Write a model for other programs; what is written follows from the name of the output.
 
-    OUT.glb: a body that hangs on joints, with a morph target for each beta, and its motion. OUT.bvh: the skeleton and
-    its motion. OUT.npz: the whole model as linear blend skinning under the usual array names. OUT.ply, .obj, .stl,
-    .off: the mesh at rest. A folder: the exact mesh of every frame of the motion.
+    OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
+    and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names; with --motion of a
+    model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl, .off: the mesh at rest. A folder: the
+    exact mesh of every frame of the motion. OUT.usd, .usda, .usdc, .usdz: as GLB, in UsdSkel. OUT.points.usd: the exact
+    mesh of every frame in one file.
 
-    GLB, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from the
-    model's own. With --correctives a motion in GLB comes as near as you like.
+    GLB, USD, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from
+    the model's own. In GLB and USD further morph targets bring a motion to it.
 
-    Example: scape model export model.npz --motion walk/motion.npz -o walk.glb
+    Example: scape model export model.npz --motion walk/motion.npz --root pelvis --names mixamo --ground -o walk.glb
 
     Args:
         model: Model file.
-        output: File or folder to write: .glb, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
+        output: File or folder to write: .glb, .usd, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
         betas: Shape in standard deviations, the first of them; else that of the motion, else the mean person.
         own_body: The template's own body.
-        motion: Motion file (.npz), as of scape animate.
-        shapes: Morph targets for so many of the first betas; 10 where there are so many.
-        correctives: Further morph targets by which the motion comes nearer to the exact one.
+        motion: Motion file of scape animate (.npz), or BVH or AMASS, which is brought onto the body.
+        shapes: Morph targets for so many of the first betas, two for each: 3 standard deviations up and down; 10
+            where there are so many.
+        correctives: Further morph targets by which the motion comes nearer to the exact one; as many as bring it within
+            half a millimetre, at most 48; 0 for plain skinning.
         unit: Of the lengths in a BVH file; cm.
-        up: Axis of the model that points up, which GLB and BVH turn to y; else that of the largest extent.
+        up: Axis of the model that points up, which GLB, USD and BVH turn to y; else that of the largest extent.
+        root: Part that the skeleton hangs on, as pelvis.
+        names: Whose names the bones of a person have: mixamo, vrm, h-anim or opensim.
+        ground: Soles on height 0, of the body and of the lowest frame.
+        front: Face to the viewer: +z in GLB, USD and BVH, -y of a mesh with z up.
     """
     kind = _kind(output)
     _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "shapes": shapes,
-                            "correctives": correctives, "unit": unit, "up": up is not None})
+                            "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
+                            "names": names, "ground": ground, "front": front})
     loaded = load_model(model)
-    if kind == "npz":
+    if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded))
-    moves = None if motion is None else read_motion(motion, loaded)
+    chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
+    moves = None if motion is None else read_motion(motion, loaded, chosen)
+    if kind == "npz":
+        assert moves is not None
+        return Outcome(output, _amass(output, model, loaded, moves))
     person = _person(model, loaded, betas, own_body, moves)
-    if kind == "mesh":
-        body = loaded.template.with_vertices(loaded.vertices(np.zeros((len(loaded.skeleton.parents), 3)), person))
-        write_mesh(output, body)
-        return Outcome(output, [Metric("vertices", len(body.vertices)), _size(output)])
     if kind == "folder":
         return Outcome(output, _folder(output, loaded, person, moves))
+    if kind == "point cache":
+        return Outcome(output, _points(output, loaded, person, moves, up))
+    if kind == "mesh":
+        rest = np.zeros((len(loaded.skeleton.parents), 3))
+        body = loaded.template.with_vertices(loaded.vertices(rest, person))
+        body = standing(body, body, up, ground, front)
+        write_mesh(output, body)
+        return Outcome(output, [Metric("vertices", len(body.vertices)), _size(output)])
     if shapes is None:
         # morph targets where nobody says how many
         shapes = 0 if person is None or kind == "bvh" else min(10, loaded.n_betas)
     rig = make_rig(loaded, person, shapes)
     axis = upright(rig.mesh)[0] if up is None else up
+    rig, told = _measured_rig(kind, loaded, person, rig, moves, correctives)
+    moves = moves or BodyMotion(np.zeros((0, len(loaded.skeleton.parents), 3)), np.zeros((0, 3)), person, 30.0)
+    ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, root, names, ground, front)
     if kind == "bvh":
-        return Outcome(output, _bvh(output, loaded, person, rig, moves, unit or "cm", axis))
-    return Outcome(output, _glb(output, loaded, person, rig, moves, correctives, axis))
-
-
-def read_motion(path: Path, model: BodyModel) -> _Moves:
-    """A motion file (`poses`, `trans`, `betas`, `mocap_frame_rate`) of a model's parts, or StorageError."""
-    stored = load_arrays(path, "a motion (.npz)")
-    stored.setdefault("mocap_frame_rate", stored.pop("mocap_framerate", np.array(np.nan)))
-    lacking = [name for name in ("poses", "trans") if name not in stored]
-    if lacking:
-        raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
-    with taking_apart(path, "a whole motion"):
-        made_for = text(stored, "surface_model_type", model.kind)
-        if made_for not in (MOTIONS_OF, model.kind):
-            raise StorageError(f"{path}: expected surface_model_type '{MOTIONS_OF}', found '{made_for}'")
-        J, T = len(model.skeleton.parents), len(np.atleast_1d(stored["poses"]))
-        if not T or stored["poses"].size != T * 3 * J:
-            raise StorageError(f"{path}: expected frames of the model's {J} parts, "
-                               f"found shape {stored['poses'].shape}")
-        betas = stored.get("betas", np.zeros(0))
-        if betas.ndim != 1 or len(betas) > model.n_betas:
-            raise StorageError(f"{path}: expected at most the {model.n_betas} betas of the model, found {betas.shape}")
-        betas = numbers({"betas": betas}, "betas", None).astype(np.float64)
-        BETAS.check(betas, "betas")
-        poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
-        poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
-        return _Moves(poses, trans, betas if betas.size else None, rate)
+        write_bvh(output, ready.skeleton, poses, trans, moves.rate, unit or "cm", axis, ready.mesh)
+        told.insert(0, Metric("unit", unit or "cm"))
+    elif kind == "usd":
+        write_skinned_usd(output, ready, poses, trans, moves.rate, axis)
+    else:
+        write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
+    return Outcome(output, [_size(output), *moves.told, *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
+                            Metric("frames", len(poses)), *told])
 
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
@@ -133,10 +131,13 @@ def _kind(output: Path) -> str:
     ending = "".join(output.suffixes).lower()
     if ending.endswith(_MESHES):
         return "mesh"
+    if output.suffix.lower() in USD:
+        return "point cache" if ".points" in ending else "usd"
     if output.suffix.lower() in (".glb", ".bvh", ".npz"):
         return output.suffix.lower()[1:]
     if output.suffix and not output.is_dir():
-        raise ValueError(f"{output}: expected a name ending in .glb, .bvh, .npz, {', '.join(_MESHES)}, or a folder")
+        raise ValueError(f"{output}: expected a name ending in .glb, .bvh, .npz, .usd, {', '.join(_MESHES)}, "
+                         "or a folder")
     return "folder"
 
 
@@ -147,7 +148,7 @@ def _refuse_the_rest(kind: str, given: dict[str, object]) -> None:
         raise ValueError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {kind}{hint}")
 
 
-def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: _Moves | None
+def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: BodyMotion | None
             ) -> np.ndarray | None:
     """Betas of the body that is asked for; None is the template's own."""
     if own_body and betas:
@@ -169,63 +170,82 @@ def _npz(output: Path, model: BodyModel) -> list[Metric]:
     return [_size(output), Metric("joints", len(model.skeleton.parents)), Metric("shape directions", model.n_betas),
             Metric("pose directions", arrays["posedirs"].shape[-1]),
             Metric("measured on", f"{MEASURED} poses of the prior"),
-            *_distances("exact body, skinning alone", rig.vertices(poses) - exact),
-            *_distances("exact body, with pose directions", rig.vertices(poses, changes=changes) - exact)]
+            *_distances("exact body, skinning alone", np.linalg.norm(rig.vertices(poses) - exact, axis=-1)),
+            *_distances("exact body, with pose directions",
+                        np.linalg.norm(rig.vertices(poses, changes=changes) - exact, axis=-1))]
 
 
-def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: _Moves | None) -> list[Metric]:
+def _amass(output: Path, path: Path, model: BodyModel, moves: BodyMotion) -> list[Metric]:
+    family = str(model.info.get("family") or "")
+    if not family:
+        raise ValueError(f"{path}: a motion under the names of AMASS is one of an imported model of the SMPL family "
+                         f"(scape model import); write {output.stem}.bvh, .glb or a folder")
+    write_amass(output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+    return [_size(output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+            Metric("surface_model_type", family)]
+
+
+def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None) -> list[Metric]:
     if moves is None:
         raise ValueError(f"{output}: expected a motion for a folder of meshes; name it with --motion")
     with bar("writing meshes") as progress:
         paths = write_frames(output, model.subject(person), moves.poses, moves.trans, progress=progress)
-    return [Metric("meshes", len(paths)), Metric("rate", moves.rate, "1/s"),
+    return [Metric("meshes", len(paths)), *moves.told, Metric("rate", moves.rate, "1/s"),
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
 
 
-def _bvh(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: _Moves | None, unit: str, up: int
-         ) -> list[Metric]:
+def _points(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None, up: int | None
+            ) -> list[Metric]:
     if moves is None:
-        write_bvh(output, rig.skeleton, unit=unit, up=up, body=rig.mesh)
-    else:
-        write_bvh(output, rig.skeleton, moves.poses, moves.trans, moves.rate, unit, up, rig.mesh)
-    poses, where = _measured(model, moves)
-    exact = model.operator(person).joints(model.joint_regressor).evaluate(poses)
-    off = joint_places(rig.skeleton, poses) - exact
-    return [_size(output), Metric("joints", len(rig.skeleton.parents)), Metric("unit", unit), Metric("up", "xyz"[up]),
-            Metric("frames", 1 if moves is None else len(moves.poses)), Metric("measured on", where),
-            *_distances("joints of the exact body", off)]
+        raise ValueError(f"{output}: expected a motion for the points of its frames; name it with --motion")
+    subject, count = model.subject(person), len(moves.poses)
+    rest = model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
+    axis = upright(rest)[0] if up is None else up
+    with bar("writing meshes") as progress:
+        def frames() -> Iterator[np.ndarray]:
+            for t in range(count):
+                yield subject.vertices(moves.poses[t], moves.trans[t])
+                progress(t + 1, count)
+
+        write_points_usd(output, rest, frames(), count, moves.rate, axis)
+    return [_size(output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
 
 
-def _glb(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: _Moves | None, count: int, up: int
-         ) -> list[Metric]:
+def _bones(rig: Rig, ready: Rig, names: Names | None) -> list[Metric]:
+    """What became of the skeleton; parts that keep their names although others were asked for."""
+    known = {} if names is None else names_of(rig.skeleton, names)
+    kept = [name for name in rig.skeleton.names if name not in known]
+    return [Metric("joints", len(ready.skeleton.names)), Metric("root", ready.skeleton.names[0]),
+            *([Metric(f"parts without a name of {names}", ", ".join(kept))] if names and kept else [])]
+
+
+def _measured_rig(kind: str, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: BodyMotion | None,
+                  count: int | None) -> tuple[Rig, list[Metric]]:
+    """The rig, for GLB with the correctives of the motion, and how far it is from the exact body."""
     subject = model.subject(person)
-    poses, where = _measured(model, moves)
-    extra, changes = None, None
     if moves is None:
         if count:
             raise ValueError("--correctives: expected the motion that they belong to; name it with --motion")
-        write_skinned_glb(output, rig, up=up)
+        poses, frames = sample_poses(model, MEASURED, np.random.default_rng(0)), np.arange(MEASURED)
+        where = f"{MEASURED} poses of the prior"
     else:
-        if count:
-            extra = motion_correctives(rig, subject, moves.poses, count)
-            changes = extra.changes(spaced(len(moves.poses), MEASURED))
-        write_skinned_glb(output, rig, moves.poses, moves.trans, moves.rate, extra, up)
-    return [_size(output), Metric("joints", len(rig.skeleton.parents)), Metric("shape targets", len(rig.shapes)),
-            Metric("corrective targets", 0 if extra is None else len(extra.shapes)), Metric("up", "xyz"[up]),
-            Metric("frames", 0 if moves is None else len(moves.poses)), Metric("measured on", where),
-            *_distances("exact body", rig.vertices(poses, changes=changes) - subject.vertices(poses))]
-
-
-def _measured(model: BodyModel, moves: _Moves | None) -> tuple[np.ndarray, str]:
-    """Poses in which a skinned body is compared with the exact one, and where they are from."""
-    if moves is None:
-        return sample_poses(model, MEASURED, np.random.default_rng(0)), f"{MEASURED} poses of the prior"
-    chosen = spaced(len(moves.poses), MEASURED)
-    return moves.poses[chosen], f"{len(chosen)} frames of the motion"
+        poses, frames = moves.poses, spaced(len(moves.poses), MEASURED)
+        where = f"{len(frames)} frames of the motion"
+    exact = subject.vertices(poses[frames])
+    told = [Metric("measured on", where)]
+    if kind == "bvh":
+        joints = subject.operator.joints(subject.joint_regressor).evaluate(poses[frames])
+        off = np.linalg.norm(joint_places(rig.skeleton, poses[frames]) - joints, axis=-1)
+        return rig, [*told, *_distances("joints of the exact body", off)]
+    if moves is not None and count != 0:
+        rig = replace(rig, correctives=motion_correctives(rig, subject, poses, count))
+    extra = 0 if rig.correctives is None else len(rig.correctives.shapes)
+    return rig, [Metric("shape targets", 2 * len(rig.shapes)), Metric("corrective targets", extra), *told,
+                 *_distances("exact body", off_exact(rig, poses, None, exact, frames))]
 
 
 def _distances(what: str, off: np.ndarray) -> list[Metric]:
-    distance = 1000.0 * np.linalg.norm(off, axis=-1)
+    distance = 1000.0 * off
     return [Metric(f"distance from {what}, mean", float(distance.mean()), "mm"),
             Metric("the same, 95th percentile", float(np.percentile(distance, 95)), "mm"),
             Metric("the same, largest", float(distance.max()), "mm")]

@@ -4,36 +4,30 @@ With it the arrays of a body model under the names that its users expect.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from model.priors import sample_poses
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 
 from ..body import BodyModel
 from ..features import RotationLift
 from ..linear import Subject
 from ..skinning import SkinningModel
-from .rig import Rig, make_rig
+from .rig import Correctives, Rig, make_rig
 
-AT_ONCE = 32                         # frames that are held at a time
+AT_ONCE = 256                        # frames that are held at a time, of a few points
+SEEN = 100                           # frames whose whole bodies say what is lacking: 200 say the same to 0.02 mm
+POINTS = 600                         # that tell the weights of a frame; all 12,500 tell the same to 0.02 mm
+NEAR = 5e-4                          # metres, root mean square: where no number is asked for, correctives end here
+MOST = 48                            # of them: 2 s of kicks and punches need 11, 15 s need 37
 
-
-@dataclass(frozen=True, eq=False)
-class Correctives:
-    """The changes of the rest mesh that make a skinned motion exact: shapes (C, N, 3), metres, the largest first, and
-    their weights (T, C), of mean square 1.
-    """
-
-    shapes: np.ndarray
-    weights: np.ndarray
-
-    def changes(self, frames: np.ndarray) -> np.ndarray:
-        """The changes (n, N, 3) of the rest mesh in some frames, metres."""
-        return np.tensordot(self.weights[frames], self.shapes, axes=1)
 
 
 def rest_corrections(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarray:
@@ -54,27 +48,74 @@ def _lost(blended: np.ndarray) -> np.ndarray:
     return 1 - np.clip(np.abs(np.linalg.det(blended)), 0, 1)
 
 
-def motion_correctives(rig: Rig, subject: Subject, poses: np.ndarray, count: int, frames: int = 200) -> Correctives:
-    """The `count` shapes that bring a skinned motion (T, J, 3) nearest to that of the exact body, the subject.
+def motion_correctives(rig: Rig, subject: Subject, poses: np.ndarray, count: int | None = None) -> Correctives:
+    """What brings a skinned motion (T, J, 3) to that of the exact body, the subject.
 
-    No more come back than there are frames. They are found from so many `frames` of a longer motion; all frames have
-    their weights.
+    The first corrective holds what is always lacking, with the weight 1; the others are scaled so that their weights
+    go from 0 to 1, since programs clamp others.
+
+    Parameters
+    ----------
+    count : int, optional
+        Of correctives, at most as many as there are frames; else as few as come within `NEAR`.
     """
     poses = np.asarray(poses, dtype=np.float64)
-    seen = poses[spaced(len(poses), frames)]
-    changes = rest_corrections(rig, seen, subject.vertices(seen)).reshape(len(seen), -1)
-    power, modes = np.linalg.eigh(changes @ changes.T)
-    chosen = np.argsort(-power)[:count]
-    chosen = chosen[power[chosen] > 1e-12 * power.max()]
-    basis = modes[:, chosen].T @ changes
-    basis /= np.linalg.norm(basis, axis=1, keepdims=True)
-    weights = np.empty((len(poses), len(basis)))
+    seen = poses[spaced(len(poses), SEEN)]
+    mean, basis = _directions(rest_corrections(rig, seen, subject.vertices(seen)), count)
+    ids = farthest_points(rig.mesh.vertices, min(POINTS, len(rig.mesh.vertices)))
+    few = replace(rig, mesh=Mesh(rig.mesh.vertices[ids], np.zeros((0, 3))), weights=rig.weights[ids],
+                  shapes=np.zeros((0, len(ids), 3)), correctives=None)
+    solve = np.linalg.pinv(basis[:, ids].reshape(len(basis), 3 * len(ids)))
+    points, weights = subject.points(ids), np.empty((len(poses), len(basis)))
     for start in range(0, len(poses), AT_ONCE):
         some = poses[start:start + AT_ONCE]
-        each = rest_corrections(rig, some, subject.vertices(some))
-        weights[start:start + AT_ONCE] = each.reshape(len(some), -1) @ basis.T
-    size = np.sqrt((weights**2).mean(axis=0))
-    return Correctives((basis * size[:, None]).reshape(-1, *rig.mesh.vertices.shape), weights / size)
+        lacking = rest_corrections(few, some, points.evaluate(some)) - mean[ids]
+        weights[start:start + AT_ONCE] = lacking.reshape(len(some), -1) @ solve
+    return _scaled(mean, basis, weights, np.arange(len(poses)))
+
+
+def body_correctives(rig: Rig, poses: np.ndarray, trans: np.ndarray, bodies: Callable[[np.ndarray], np.ndarray],
+                     frames: np.ndarray, count: int | None = None) -> Correctives:
+    """As `motion_correctives`, for bodies that change as they move, or are smoothed.
+
+    Of frames (n,) of the motion `bodies` tells the vertices (n, N, 3), metres; between them the correctives go straight
+    from one to the next.
+    """
+    lacking = np.concatenate([rest_corrections(rig, poses[some], bodies(some) - trans[some, None])
+                              for some in np.array_split(frames, -(-len(frames) // SEEN))])
+    mean, basis = _directions(lacking[spaced(len(frames), SEEN)], count)
+    weights = (lacking - mean).reshape(len(frames), -1) @ basis.reshape(len(basis), mean.size).T
+    return _scaled(mean, basis, weights, frames)
+
+
+def off_exact(rig: Rig, poses: np.ndarray, trans: np.ndarray | None, exact: np.ndarray,
+              frames: np.ndarray) -> np.ndarray:
+    """(n, N) metres: how far the skinned mesh, as programs show it, is from exact bodies (n, N, 3) of some frames."""
+    changes = None if rig.correctives is None else rig.correctives.changes(frames)
+    skinned = rig.vertices(poses[frames], None if trans is None else trans[frames], changes)
+    return np.linalg.norm(skinned - exact, axis=-1)
+
+
+def _directions(lacking: np.ndarray, count: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """The mean (N, 3) of changes (n, N, 3), and the directions (C - 1, N, 3), orthonormal, in which they vary most."""
+    mean = lacking.mean(axis=0)
+    changes = (lacking - mean).reshape(len(lacking), -1)
+    power, modes = np.linalg.eigh(changes @ changes.T)
+    order = np.argsort(-power)
+    power = np.maximum(power[order], 0)
+    left = np.sqrt(np.maximum(power.sum() - np.cumsum(np.r_[0, power]), 0) / lacking[..., 0].size)
+    wanted = min(int(np.argmax(left <= NEAR)), MOST - 1) if count is None else count - 1
+    kept = order[:wanted][power[:wanted] > 1e-12 * max(float((lacking**2).sum()), 1e-12)]
+    basis = modes[:, kept].T @ changes
+    basis /= np.linalg.norm(basis, axis=1, keepdims=True)
+    return mean, basis.reshape(len(basis), *mean.shape)
+
+
+def _scaled(mean: np.ndarray, basis: np.ndarray, weights: np.ndarray, frames: np.ndarray) -> Correctives:
+    """Correctives with weights from 0 to 1 for those (n, C - 1) of a basis about a mean."""
+    low, span = weights.min(axis=0), np.maximum(np.ptp(weights, axis=0), 1e-12)
+    shapes = np.concatenate([(mean + np.tensordot(low, basis, axes=1))[None], basis * span[:, None, None]])
+    return Correctives(shapes, np.column_stack([np.ones(len(weights)), (weights - low) / span]), frames)
 
 
 def spaced(total: int, count: int) -> np.ndarray:

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scanprep.geometry.format_glb import VERTICES, Glb, some_normal
+from scanprep.geometry.format_common import as_light
+from scanprep.geometry.format_glb import VERTICES, Glb, some_normal, turn_up
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.pictures.gltf import skin_material
 from scanprep.pictures.sheets import png_bytes
 
 from ..blend_weights import CARRIERS
-from .correctives import Correctives
-from .rig import Rig, check_motion, turn_up
+from .rig import Rig, check_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +38,13 @@ class Material:
 
 
 def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None,
-                      rate: float = 30.0, correctives: Correctives | None = None, up: int = 2,
-                      material: Material | None = None) -> None:
+                      rate: float = 30.0, up: int = 2, material: Material | None = None) -> None:
     """Write a body that hangs on joints, for any glTF 2.0 viewer, animation program or game engine.
 
-    One node for every joint, where the joint is at rest and with the axes of the world; morph targets `beta 1`,
-    `beta 2`, ... whose weight is added to the beta of this body. The joints stay where they are when such a
-    weight changes, so export a person of another shape with betas of their own. Everything is turned so that
-    y is up, as glTF has it.
+    One node for every joint, where the joint is at rest and with the axes of the rig; morph targets `beta 1 +3`,
+    `beta 1 -3`, ... (`Rig.beta_targets`). The joints stay where they are when such a weight changes, so export a person
+    of another shape with betas of their own. The rig's correctives are further targets, which the motion drives.
+    Everything is turned so that y is up, as glTF has it.
 
     Parameters
     ----------
@@ -55,8 +54,6 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
         A motion: rotations of all joints and places of the root.
     trans : (T, 3) float, metres, optional
     rate : float, frames a second
-    correctives : Correctives, optional
-        What skinning lacks in this motion, as further morph targets that the motion drives.
     up : int
         0, 1 or 2: the axis of the body that points up.
     material : Material, optional
@@ -68,38 +65,31 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
         A motion of other parts, empty, not finite or of another length than the correctives; a rate that is
         not positive; an axis that does not exist.
     """
-    data = skinned_glb(rig, poses, trans, rate, correctives, up, material)
+    data = skinned_glb(rig, poses, trans, rate, up, material)
     with writing(path) as beside:
         beside.write_bytes(data)
 
 
 def skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None, rate: float = 30.0,
-                correctives: Correctives | None = None, up: int = 2, material: Material | None = None) -> bytes:
+                up: int = 2, material: Material | None = None) -> bytes:
     """The bytes of `write_skinned_glb`."""
     U = turn_up(up).T
     rig, glb = rig.turned(up), Glb()
-    names = [f"beta {k + 1}" for k in range(len(rig.shapes))]
-    targets = rig.shapes
-    if correctives is not None:
-        names += [f"corrective {k + 1}" for k in range(len(correctives.shapes))]
-        targets = np.concatenate([targets, correctives.shapes @ U])
+    names, targets = rig.beta_targets()
+    if rig.correctives is not None:
+        names += [f"corrective {k + 1}" for k in range(len(rig.correctives.shapes))]
+        targets = np.concatenate([targets, rig.correctives.shapes])
     mesh: dict[str, Any] = {"name": "body", "primitives": [_primitive(glb, rig, targets, material, U)]}
     if names:
         mesh |= {"weights": [0] * len(names), "extras": {"targetNames": names}}
     document = {"scene": 0, "scenes": [{"nodes": [0, 1]}], "nodes": _nodes(rig), "meshes": [mesh],
-                "skins": [_skin(glb, rig)], **_materials(glb, material)}
+                "skins": [_skin(glb, rig)], **_materials(glb, material, rig.mesh.colors is not None)}
     if poses is not None:
         poses, trans = check_motion(rig.skeleton, poses, trans, rate)
-        animation = _animation(glb, rig, poses @ U, trans @ U, rate)
-        if correctives is not None:
-            if len(correctives.weights) != len(poses):
-                raise ValueError(f"correctives: expected weights for {len(poses)} frames, "
-                                 f"got {len(correctives.weights)}")
-            _drive(glb, animation, correctives.weights, len(names))
-        document["animations"] = [animation]
-    elif correctives is not None:
+        document["animations"] = [_animation(glb, rig, poses @ U, trans @ U, rate, len(names))]
+    elif rig.correctives is not None:
         raise ValueError("correctives: expected the poses that they belong to")
-    return glb.pack(document)
+    return glb.pack(document, up)
 
 
 def four_carriers(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,9 +104,9 @@ def four_carriers(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.pad(joints, ((0, 0), (0, missing))), np.pad(kept, ((0, 0), (0, missing)))
 
 
-def continuous_quaternions(poses: np.ndarray) -> np.ndarray:
-    """Unit quaternions (T, J, 4), scalar last, of poses (T, J, 3), without a change of sign from frame to frame."""
-    q = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:-1], 4)
+def continuous_quaternions(R: np.ndarray) -> np.ndarray:
+    """Unit quaternions (T, J, 4), scalar last, of rotations (T, J, 3, 3), without changes of sign between frames."""
+    q = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(*R.shape[:2], 4)
     same = (q[1:] * q[:-1]).sum(axis=-1, keepdims=True) >= 0
     q[1:] *= np.cumprod(np.where(same, 1, -1), axis=0)
     return q
@@ -130,6 +120,9 @@ def _primitive(glb: Glb, rig: Rig, targets: np.ndarray, material: Material | Non
                        "NORMAL": glb.add(normals, "VEC3", VERTICES), "JOINTS_0": glb.add_joints(joints),
                        "WEIGHTS_0": glb.add(weights, "VEC4", VERTICES)},
         "indices": glb.add_indices(rig.mesh.faces), "material": 0}
+    if rig.mesh.colors is not None:
+        rgba = np.concatenate([as_light(rig.mesh.colors), np.ones((len(base), 1))], axis=1)
+        out["attributes"]["COLOR_0"] = glb.add(rgba, "VEC4", VERTICES)
     if material is not None:
         out["attributes"]["TEXCOORD_0"] = glb.add(material.uv * [1, -1] + [0, 1], "VEC2", VERTICES)
         if material.tangents is not None:
@@ -142,9 +135,10 @@ def _primitive(glb: Glb, rig: Rig, targets: np.ndarray, material: Material | Non
     return out
 
 
-def _materials(glb: Glb, material: Material | None) -> dict[str, Any]:
-    """The material with its images."""
-    out = skin_material() if material is None or material.color is None else skin_material((1, 1, 1))
+def _materials(glb: Glb, material: Material | None, colored: bool) -> dict[str, Any]:
+    """The material with its images; white where the vertices are coloured."""
+    white = colored or (material is not None and material.color is not None)
+    out = skin_material((1, 1, 1)) if white else skin_material()
     images: list[dict[str, Any]] = []
 
     def texture(image: np.ndarray, name: str) -> dict[str, int]:
@@ -169,12 +163,12 @@ def _materials(glb: Glb, material: Material | None) -> dict[str, Any]:
 
 def _nodes(rig: Rig) -> list[dict[str, Any]]:
     """The mesh, then the joints; joint j is node j + 1."""
-    joints, parents = rig.skeleton.joints, rig.skeleton.parents
+    J = len(rig.skeleton.parents)
+    turned = _quaternions(rig, np.zeros((1, J, 3)))[0]
     nodes: list[dict[str, Any]] = [{"name": "body", "mesh": 0, "skin": 0}]
     for j, name in enumerate(rig.skeleton.names):
-        offset = joints[j] - (joints[parents[j]] if j else 0)
-        nodes.append({"name": name, "translation": offset.tolist()})
-        children = np.flatnonzero(parents == j)
+        nodes.append({"name": name, "translation": rig.local_offsets[j].tolist(), "rotation": turned[j].tolist()})
+        children = np.flatnonzero(rig.skeleton.parents == j)
         if len(children):
             nodes[-1]["children"] = (children + 1).tolist()
     return nodes
@@ -182,29 +176,36 @@ def _nodes(rig: Rig) -> list[dict[str, Any]]:
 
 def _skin(glb: Glb, rig: Rig) -> dict[str, Any]:
     J = len(rig.skeleton.parents)
-    inverse = np.tile(np.eye(4), (J, 1, 1))
-    inverse[:, 3, :3] = -rig.skeleton.joints                                  # column after column
+    inverse = np.tile(np.eye(4), (J, 1, 1))                                   # column after column
+    inverse[:, :3, :3] = rig.axes
+    inverse[:, 3, :3] = -np.einsum("jba,jb->ja", rig.axes, rig.skeleton.joints)
     return {"name": "skeleton", "joints": list(range(1, J + 1)), "skeleton": 1,
             "inverseBindMatrices": glb.add(inverse.reshape(J, 16), "MAT4", None)}
 
 
-def _animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: float) -> dict[str, Any]:
-    q = continuous_quaternions(poses)
+def _quaternions(rig: Rig, poses: np.ndarray) -> np.ndarray:
+    """(T, J, 4) what the nodes of the joints are turned by in poses (T, J, 3)."""
+    return continuous_quaternions(rig.local_rotations(poses))
+
+
+def _animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: float, targets: int) -> dict[str, Any]:
+    q = _quaternions(rig, poses)
     times = glb.add(np.arange(len(poses)) / rate, "SCALAR", None, bounds=True)
     places = glb.add(rig.skeleton.joints[0] + trans, "VEC3", None)
     out: dict[str, Any] = {"name": "motion", "samplers": [], "channels": []}
     _channel(out, times, places, 1, "translation")
     for j in range(q.shape[1]):
         _channel(out, times, glb.add(q[:, j], "VEC4", None), j + 1, "rotation")
+    if rig.correctives is not None:
+        frames = rig.correctives.frames
+        if frames[-1] >= len(poses):
+            raise ValueError(f"correctives: expected weights of {len(poses)} frames, got frame {frames[-1]}")
+        if len(frames) < len(poses):
+            times = glb.add(frames / rate, "SCALAR", None, bounds=True)
+        weights = np.zeros((len(frames), targets))                            # those of the betas stay 0
+        weights[:, targets - rig.correctives.weights.shape[1]:] = rig.correctives.weights
+        _channel(out, times, glb.add(weights.ravel(), "SCALAR", None), 0, "weights")
     return out
-
-
-def _drive(glb: Glb, animation: dict[str, Any], weights: np.ndarray, count: int) -> None:
-    """Let the motion drive the last of `count` morph targets with weights (T, C)."""
-    times = animation["samplers"][0]["input"]
-    everything = np.zeros((len(weights), count))
-    everything[:, count - weights.shape[1]:] = weights
-    _channel(animation, times, glb.add(everything.ravel(), "SCALAR", None), 0, "weights")
 
 
 def _channel(animation: dict[str, Any], times: int, values: int, node: int, path: str) -> None:

@@ -1,33 +1,57 @@
 """A body as other programs move it: a mesh that hangs on joints by linear blend skinning."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from scanprep.geometry import rotations
+from scanprep.geometry.format_glb import turn_up
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.gltf import UPRIGHT
 from scanprep.ranges import TURNS
-from scanprep.skeleton.tree import Skeleton
+from scanprep.skeleton.tree import Skeleton, reorder
 
 from ..blend_weights import CARRIERS, skin_weights, strongest
 from ..body import BodyModel
+from ..linear import Subject
 from ..skinning import SkinningModel
+
+SLIDER = 3.0                         # standard deviations that a morph target of a beta reaches at weight 1
+
+
+@dataclass(frozen=True, eq=False)
+class Correctives:
+    """What skinning lacks in one motion: changes of the rest mesh, and how much of each there is over time.
+
+    Between the frames of the weights they go straight from one to the next, as in the files.
+    """
+
+    shapes: np.ndarray               # (C, N, 3) metres, at weight 1
+    weights: np.ndarray              # (n, C), from 0 to 1
+    frames: np.ndarray               # (n,) int, increasing: the frames of the motion that have these weights
+
+    def changes(self, frames: np.ndarray) -> np.ndarray:
+        """The changes (..., N, 3) of the rest mesh in some frames (...) of the motion, metres."""
+        weights = np.stack([np.interp(frames, self.frames, w) for w in self.weights.T], axis=-1)
+        return np.tensordot(weights, self.shapes, axes=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
     """A rest mesh, its skeleton, and how much each joint carries each vertex.
 
-    At rest all parts have the axes of the world. A pose turns every part about its joint, and the root's joint
-    stands at `joints[0] + trans`, as in the models.
+    A pose turns every part about its joint, by axes that are those of the world at rest, and the root's joint stands
+    at `joints[0] + trans`, as in the models. `axes` change neither poses nor surface: they are the frames that a file
+    gives its bones (`local_rotations`, `local_offsets`).
     """
 
     mesh: Mesh                       # at rest: pose and trans are zero
     skeleton: Skeleton               # with the joints of this body
     weights: np.ndarray              # (N, J), rows sum to 1, with at most `CARRIERS` entries that are not zero
     shapes: np.ndarray               # (K, N, 3) metres, change of the rest mesh for one standard deviation of each beta
+    # (J, 3, 3): columns are the axes of each bone at rest, in the world; y along the bone where they are `aimed`
+    axes: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    correctives: Correctives | None = None          # of the one motion that the rig is written with
 
     def __post_init__(self) -> None:
         N, J = len(self.mesh.vertices), len(self.skeleton.parents)
@@ -39,6 +63,10 @@ class Rig:
             raise ValueError(f"weights: expected at most {CARRIERS} for a vertex (see strongest)")
         if self.shapes.ndim != 3 or self.shapes.shape[1:] != (N, 3):
             raise ValueError(f"shapes: expected shape (K, {N}, 3), got {self.shapes.shape}")
+        if not len(self.axes):
+            object.__setattr__(self, "axes", np.tile(np.eye(3), (J, 1, 1)))
+        if self.axes.shape != (J, 3, 3):
+            raise ValueError(f"axes: expected shape {(J, 3, 3)}, got {self.axes.shape}")
 
     def __repr__(self) -> str:
         return f"Rig({self.mesh!r}, {len(self.skeleton.parents)} joints, {len(self.shapes)} shapes)"
@@ -56,11 +84,37 @@ class Rig:
             out += np.einsum("nj,...nb,...jab->...na", self.weights, changes, R, optimize=True)
         return out + self.weights @ offset
 
+    def local_rotations(self, poses: np.ndarray) -> np.ndarray:
+        """(..., J, 3, 3) the bones against the bones they hang on, the root's in the world, of poses (..., J, 3)."""
+        above = np.concatenate([np.eye(3)[None], self.axes[self.skeleton.parents[1:]]])
+        return np.swapaxes(above, -1, -2) @ rotations.exp(poses) @ self.axes
+
+    @property
+    def local_offsets(self) -> np.ndarray:
+        """(J, 3) metres: every joint from the one it hangs on, by the axes of that bone; the root's in the world."""
+        joints, above = self.skeleton.joints, self.skeleton.parents[1:]
+        return np.concatenate([joints[:1], np.einsum("jba,jb->ja", self.axes[above], joints[1:] - joints[above])])
+
+    def beta_targets(self) -> tuple[list[str], np.ndarray]:
+        """Names of morph targets and their changes of the rest mesh (2K, N, 3), metres, at weight 1.
+
+        Two for each beta, `beta 1 +3` and `beta 1 -3`: sliders from 0 to 1 reach so many standard deviations of
+        either sign.
+        """
+        names = [f"beta {k + 1} {sign}{SLIDER:g}" for k in range(len(self.shapes)) for sign in "+-"]
+        changes = SLIDER * np.stack([self.shapes, -self.shapes], axis=1)
+        return names, changes.reshape(-1, *self.mesh.vertices.shape)
+
+    def moved(self, R: np.ndarray, shift: np.ndarray | float = 0.0) -> Rig:
+        """The same body turned by R (3, 3) and then shifted, metres; see `carried` for its poses and places."""
+        extra = self.correctives and replace(self.correctives, shapes=self.correctives.shapes @ R.T)
+        return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices @ R.T + shift), shapes=self.shapes @ R.T,
+                       skeleton=replace(self.skeleton, joints=self.skeleton.joints @ R.T + shift), axes=R @ self.axes,
+                       correctives=extra)
+
     def turned(self, up: int) -> Rig:
         """The same body with the axis `up` turned to +y; poses and trans turn with `turn_up`."""
-        U = turn_up(up).T
-        return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices @ U), shapes=self.shapes @ U,
-                       skeleton=replace(self.skeleton, joints=self.skeleton.joints @ U))
+        return self.moved(turn_up(up))
 
 
 def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0, weights: np.ndarray | None = None
@@ -85,14 +139,75 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     if shapes and betas is None:
         raise ValueError(f"shapes: the template's own body has none, got {shapes}")
     rest = np.zeros((len(model.skeleton.parents), 3))
-    mesh = model.template.with_vertices(model.vertices(rest, betas))
-    joints = model.joint_regressor @ mesh.vertices
-    if weights is None:
-        weights = model.weights if isinstance(model, SkinningModel) else skin_weights(model.template, model.skeleton)
-    changes = np.zeros((0, *mesh.vertices.shape))
-    if shapes:
-        changes = np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)
-    return Rig(mesh, replace(model.skeleton, joints=joints), strongest(weights), changes)
+    if weights is None and isinstance(model, SkinningModel):
+        weights = model.weights
+    rig = subject_rig(model, model.vertices(rest, betas), weights)
+    return replace(rig, shapes=np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)) if shapes else rig
+
+
+def subject_rig(body: BodyModel | Subject, rest: np.ndarray | None = None, weights: np.ndarray | None = None) -> Rig:
+    """The rig, without shapes, of a subject, or of a model with these vertices (N, 3) at rest; as `make_rig`."""
+    skeleton, template = body.skeleton, body.template
+    if rest is None:
+        assert isinstance(body, Subject), "a model has many bodies"
+        rest = body.vertices(np.zeros((len(skeleton.parents), 3)))
+    joints = body.joint_regressor @ rest
+    weights = skin_weights(template, skeleton) if weights is None else weights
+    return Rig(template.with_vertices(rest), replace(skeleton, joints=joints), strongest(weights),
+               np.zeros((0, *rest.shape)))
+
+
+def rerooted(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tuple[Rig, np.ndarray, np.ndarray]:
+    """The same surface in the same motion, with a skeleton that hangs on another part.
+
+    All parts turn as before and all joints between parts stay where they are; the root's own joint is the centroid of
+    the vertices of the part that is now the root, as in the models.
+
+    Parameters
+    ----------
+    rig : Rig
+    poses : (T, J, 3) float, radians
+        T may be 0.
+    trans : (T, 3) float, metres
+    root : str
+        Name of a part.
+
+    Raises
+    ------
+    ValueError
+        A part that the skeleton has not.
+    """
+    old = rig.skeleton
+    if root not in old.names:
+        raise ValueError(f"root: expected a part of the body ({', '.join(old.names)}), got {root!r}")
+    links = np.stack([np.arange(1, len(old.parents)), old.parents[1:]], axis=1)
+    order = reorder(old.part_of_face, links, old.names.index(root))
+    now = np.argsort(order)                                           # new numbers of the old parts
+    parents, joints = np.full(len(order), -1), old.joints[order]
+    for a, b in links:
+        child = a if now[a] > now[b] else b
+        parents[now[child]], joints[now[child]] = now[a + b - child], old.joints[a]
+    new = Skeleton(now[old.part_of_face], parents, joints, tuple(old.names[p] for p in order))
+    new = new.with_root_centred(rig.mesh)
+    R, first = old.part_rotations(poses), order[0]
+    places = joint_places(old, poses, trans)[:, first] + R[:, first] @ (new.joints[0] - old.joints[first])
+    return (replace(rig, skeleton=new, weights=rig.weights[:, order], axes=rig.axes[order]), new.pose_of(R[:, order]),
+            places - new.joints[0])
+
+
+def carried(rig: Rig, poses: np.ndarray, trans: np.ndarray, rest: tuple[np.ndarray, np.ndarray],
+            world: tuple[np.ndarray, np.ndarray]) -> tuple[Rig, np.ndarray, np.ndarray]:
+    """The same body, turned and shifted at rest by (R (3, 3), shift (3,)), and in its motion by those of `world`.
+
+    Poses (T, J, 3) radians, trans (T, 3) metres; T may be 0.
+    """
+    (Q, shift), (W, step) = rest, world
+    moved = rig.moved(Q, shift)
+    places = (rig.skeleton.joints[0] + trans) @ W.T + step
+    turns = poses @ Q.T
+    if len(poses) and not np.array_equal(Q, W):
+        turns[:, 0] = rotations.log(W @ rotations.exp(poses[:, 0]) @ Q.T)
+    return moved, turns, places - moved.skeleton.joints[0]
 
 
 def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
@@ -123,14 +238,3 @@ def check_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None
     if not (np.isfinite(rate) and rate > 0):
         raise ValueError(f"rate: expected a positive number of frames a second, got {rate}")
     return poses, trans
-
-
-def turn_up(up: int) -> np.ndarray:
-    """The rotation (3, 3) that brings an axis to +y; points, poses and trans turn as `x @ turn_up(up).T`.
-
-    A rotation vector turns like a point because the axes of all parts are those of the world at rest.
-    """
-    if up not in UPRIGHT:
-        raise ValueError(f"up: expected 0, 1 or 2, got {up}")
-    axis = np.array(UPRIGHT[up][:3])
-    return rotations.exp(axis / max(float(np.linalg.norm(axis)), 1e-12) * (0 if up == 1 else np.pi / 2)).round()

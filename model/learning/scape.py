@@ -349,12 +349,16 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
         doubts = [f"the poses are all alike: joints {never}"]
     elif len(stiff):
         doubts = [f"the {', '.join(joint_in_words(model.skeleton.names[j]) for j in stiff)} {never}"]
+    elif len(model.skeleton.parents) == 1 and model.n_betas:
+        doubts = ["the body has one part and no joint: it takes no pose"]
     return Judgement.of(learning_problem(model, people), doubts)
 
 
 def learning_problem(model: BodyModel, people: np.ndarray | None = None) -> str | None:
     """Why a model learned with people (S, N, 3) means nothing, with the likely cause; None where it means something."""
     error, body = float(model.info.get("left_out_error", 0.0)), model.template
+    if len(model.skeleton.parents) == 1 and not model.n_betas:
+        return "the meshes differ neither in pose nor in shape: the body has one part, no joint and no shape components"
     spans = [extent(person) for person in people] if people is not None else [extent(body.vertices)]
     wrong = unit_problem(float(np.median(spans)), extent(body.vertices), "the people are")
     if error <= HAND * size(body) and wrong is None:

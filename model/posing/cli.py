@@ -9,6 +9,7 @@ import tyro
 
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
+from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
 from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
@@ -17,9 +18,12 @@ from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
-from ..export.cli import read_motion, write_frames
+from ..export.cli import write_frames
+from ..export.conventions import standing
 from ..files import load_model
 from ..linear import Subject
+from ..motion.files import betas_for
+from ..motion.onto import read_motion
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
@@ -35,7 +39,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
     Args:
         model: Model file.
         body: Mesh with the triangles of the model.
-        poses: Motion file (.npz), as of scape animate; its betas are not used.
+        poses: Motion file of scape animate (.npz), BVH or AMASS; its betas are not used.
         output: Folder for the meshes.
         unit: Unit of the body.
     """
@@ -48,7 +52,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
     with bar("writing meshes") as progress:
         written = write_frames(output, found.subject, moves.poses, moves.trans, progress=progress)
     return Outcome(output, [
-        Metric("meshes", len(written)),
+        Metric("meshes", len(written)), *moves.told,
         Metric("distance from the body in its own pose, mean", 1e3 * found.mean, "mm"),
         Metric("distance from the body in its own pose, largest", 1e3 * found.largest, "mm")],
         judgement=Judgement.of(None if found.mean <= HAND * size(loaded.template) else
@@ -57,7 +61,6 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
 
 def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
               landmarks: Path | None = None, template_landmarks: Path | None = None, unit: Unit | None = None,
-              pictures: bool = True,
               config: CharacterMeshConfig = CharacterMeshConfig()  # noqa: B008
               ) -> Outcome:
     """A character of any triangles as the mean of a model: it moves as people do, betas are offsets from it.
@@ -74,9 +77,12 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
         landmarks: Landmarks of the character; not needed for a mesh with the template's triangles.
         template_landmarks: Landmarks of the template; else those that the model keeps.
         unit: Unit of the character and its landmarks.
-        pictures: Write a picture beside the model.
         config: Settings.
     """
+    from scanprep.pictures.shading import save_png
+
+    from ..report import picture_character
+
     loaded, body = load_model(model), read_mesh(mesh, unit)
     same = np.array_equal(body.faces, loaded.template.faces)
     if landmarks is None and not same:
@@ -87,12 +93,7 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
     with bar("registering") as progress:
         found = register_character(loaded, body, theirs, ours, config, progress)
     found.model.save(output)
-    if pictures:
-        from scanprep.pictures.shading import save_png
-
-        from ..report import picture_character
-
-        save_png(output.with_suffix(".png"), picture_character(found.model))
+    save_png(output.with_suffix(".png"), picture_character(found.model))
     return Outcome(output, _about(loaded, found), {"character": config},
                    judgement=Judgement.of(character_problem(found)))
 
@@ -111,10 +112,10 @@ def _about(model: BodyModel, found: Character) -> list[Metric]:
 
 
 def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[Beta, ...] = (),
-         subject: Path | None = None, own_body: bool = False) -> Outcome:
+         subject: Path | None = None, own_body: bool = False, ground: bool = False, front: bool = False) -> Outcome:
     """Write the mesh of one pose and shape.
 
-    Example: scape model mesh model.npz --betas 2 -1 -o body.ply
+    Example: scape model mesh model.npz --betas 2 -1 --ground --front -o body.ply
 
     Args:
         model: Model file.
@@ -123,6 +124,8 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         betas: Shape in standard deviations, the first of them; the mean person without.
         subject: Betas in JSON or .npz, or a mesh in the model's triangles, instead of --betas.
         own_body: The template's own body instead of the mean person.
+        ground: Lowest point on height 0.
+        front: Face to the viewer: -y where z is up, else +z.
     """
     loaded = load_model(model)
     turns = np.zeros((len(loaded.skeleton.parents), 3))
@@ -142,7 +145,8 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         raise ValueError(f"{model}: it has no shape components; ask for --own-body")
     else:
         vertices = loaded.vertices(turns, np.array(betas if betas else (0.0,)))
-    write_mesh(output, loaded.template.with_vertices(vertices))
+    body = loaded.template.with_vertices(vertices)
+    write_mesh(output, standing(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")])
 
@@ -164,10 +168,8 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     if given is None:
         return model.subject(None)
     if given.suffix in (".json", ".npz"):
-        betas = _read_betas(given)
-        if len(betas) > model.n_betas:
-            raise ValueError(f"{given}: expected at most the {model.n_betas} betas of the model, found {len(betas)}")
-        return model.subject(betas if len(betas) else None)
+        betas = betas_for(given, _read_betas(given), model)
+        return model.subject(betas if betas is not None and len(betas) else None)
     person = read_mesh(given, unit)
     if not np.array_equal(person.faces, model.template.faces):
         raise ValueError(f"{given}: expected the triangles of the model ({model.template}), found {person}; "
@@ -182,7 +184,7 @@ def _read_betas(path: Path) -> np.ndarray:
         found = read_json(path, wanted)
         found = found.get("betas") if isinstance(found, dict) else found
     else:
-        found = load_arrays(path).get("betas")
+        found = load_arrays(path, only=("betas",)).get("betas")
     try:
         betas = np.array(found, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

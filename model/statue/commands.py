@@ -24,8 +24,8 @@ from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
 
-from ..export.cli import read_motion
 from ..files import load_model
+from ..motion.onto import read_motion
 from .cli import LevelArg, MotionArg, StatueArg
 from .control.files import humanoid, read_control
 from .control.model import ControlModel, Statue
@@ -274,9 +274,9 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
                 *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
     else:
         bodies, rate = _following(loaded, motion, model, registered)
-        keys = bodies[::max(1, len(bodies) // 120)]
-        write_animated_glb(output / "statue.glb", fine.faces, np.stack([detailed(body) for body in keys]),
-                           rate * len(keys) / len(bodies), up=up, keys=len(keys))
+        step = max(1, len(bodies) // 120)
+        write_animated_glb(output / "statue.glb", fine.faces, np.stack([detailed(body) for body in bodies[::step]]),
+                           rate / step, up=up)
         rows = [Metric("follows", str(model))]
     shown = bodies[::max(1, len(bodies) // 24)]
     with bar("rendering") as progress:

@@ -16,6 +16,7 @@ from ..blend_weights import strongest
 from ..export.glb import Material, write_skinned_glb
 from ..export.rig import Rig, turn_up
 from ..features import linear_features
+from ..motion.retarget import Retargeted
 from ..skinning import SkinningModel
 from .control.chart import Chart
 from .control.files import humanoid, humanoid_markers, read_control, write_control
@@ -24,7 +25,6 @@ from .detail.maps import read_map, write_map
 from .detail.subdivision import Subdivision, subdivide
 from .detail.texels import chart_tangents, normal_image, vertex_of_row
 from .motion.motions import people_motion
-from .motion.retarget import StatueMotion
 
 KIND, VERSION = "statue", 1
 CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
@@ -122,7 +122,7 @@ def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine:
 def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarray | None = None,
                      subdivision: Subdivision | None = None, texture: np.ndarray | None = None,
                      normals: np.ndarray | None = None, heights: np.ndarray | None = None,
-                     motion: StatueMotion | None = None, up: int = 2) -> None:
+                     motion: Retargeted | None = None, up: int = 2) -> None:
     """Write a statue for any glTF 2.0 viewer, animation program or game engine; the axis `up` points up.
 
     glTF knows linear blend skinning only: joints carry the detailed vertices themselves, while `Reconstruction` moves

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Annotated
 
-from .ownership import HOME, ForeignFileError, refusal, refuse_any, report_path, written_of
+from .ownership import HOME, ForeignFileError, refusal, refuse_any, written_of
 from .workspace import Workspace
 
 FileWorkspace = Annotated[Workspace, "steps of a command whose output is a file; they are kept beside it"]
@@ -46,7 +46,7 @@ def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
     output = Path(output)
     space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)
     with _opened(space):                    # first what a killed run had finished comes to its place, and is ours
-        if output.is_dir() and not (output / HOME).is_dir() and not written_of(report_path(output)):
+        if output.is_dir() and not (output / HOME).is_dir() and not written_of(output):
             refuse_any(output)
         if output.is_file() and not space.is_ours(output.name):
             raise ForeignFileError(refusal(output))

@@ -43,18 +43,28 @@ class Ownership:
 
 
 def report_path(output: Path) -> Path:
-    """Where the report of an output stands: in a folder, beside a file."""
-    return output / "report.json" if output.is_dir() else output.with_suffix(".report.json")
+    """Where the report of an output stands: in a folder; beside a file, as `walk.glb.report.json`.
+
+    With the whole name: files that differ in their endings only, `walk.glb` and `walk.bvh`, keep a report each.
+    """
+    return output / "report.json" if output.is_dir() else output.with_name(f"{output.name}.report.json")
 
 
-def written_of(report: Path) -> dict[str, str]:
-    """File -> digest of all that a command wrote, as its report tells; nothing where there is no such report."""
-    try:
-        with storage.taking_apart(report, "a report"):
-            told = storage.read_json(report, "a report")["written"]
-    except storage.StorageError:
-        return {}
-    return {**told, report.name: Digests().of_file(report)} if isinstance(told, dict) else {}
+def written_of(output: Path) -> dict[str, str]:
+    """File -> digest of all that a command wrote for an output, as its report tells; nothing where there is none.
+
+    Paths are from the folder of the report on. Reports of files were once named without the ending, and count too.
+    """
+    earlier = [] if output.is_dir() else [output.with_suffix(".report.json")]
+    for report in (report_path(output), *earlier):
+        try:
+            with storage.taking_apart(report, "a report"):
+                told = storage.read_json(report, "a report")["written"]
+        except storage.StorageError:
+            continue
+        if isinstance(told, dict) and (report not in earlier or output.name in told):
+            return {**told, report.name: Digests().of_file(report)}
+    return {}
 
 
 def refuse_any(folder: Path) -> None:

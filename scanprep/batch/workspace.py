@@ -73,8 +73,7 @@ class Workspace:
             for record in (place / HOME / "done").glob("*.npz"):
                 found.add((load_header(record) or {"files": {}})["files"], place)
         if self.output is not None:
-            report = report_path(self.output)
-            found.add(written_of(report), report.parent)
+            found.add(written_of(self.output), report_path(self.output).parent)
         return found
 
     def run(self, work: Any, tasks: Sequence[Task], workers: Workers | None = None, progress: Progress | None = None,
@@ -267,9 +266,9 @@ class Workspace:
         record = load_header(self._record(name))
         if record is not None or name != "output" or self.output is None:
             return dict((record or {"files": {}})["files"])
-        report = report_path(self.output)                   # an output that is a file keeps no record of it
-        place = report.parent.relative_to(self.folder)
-        return {(place / file).as_posix(): digest for file, digest in written_of(report).items()}
+        # an output that is a file keeps no record of it
+        place = report_path(self.output).parent.relative_to(self.folder)
+        return {(place / file).as_posix(): digest for file, digest in written_of(self.output).items()}
 
     def _recover(self) -> None:
         """What a killed run left: results that were whole come to their place, the others go."""

@@ -1,11 +1,13 @@
 """Files of meshes and points, with errors that say what is wrong.
 
-Vertices keep the order of the file. Coordinates become metres: most files do not say their unit, so either
-the caller does or metres are assumed, with a warning where that would make a giant or a dwarf.
+Vertices keep the order of the file. Only along seams, where vertices are repeated for flat shading or textures and so
+cut the surface apart, equal places become one vertex, and a note says so. Coordinates become metres: most files do not
+say their unit, so the caller does or metres are assumed, with a warning where that would make a giant or a dwarf.
 """
 from __future__ import annotations
 
 import gzip
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ import numpy as np
 from . import format_glb, format_pcd, format_ply, format_stl, format_text, storage
 from .format_common import UNITS, Contents, MeshFileError, check_extent, load_bytes, metres_per_unit
 from .mesh import Mesh
+from .seams import merged_mean, seams_closed
 
 __all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "read_mesh", "read_points",
            "read_registered", "read_scan", "write_mesh", "write_points"]
@@ -53,7 +56,10 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     Returns
     -------
     Mesh
-        In metres. From STL, which has no vertices of its own, equal corners make one vertex.
+        In metres. From STL, which has no vertices of its own, equal corners make one vertex. In other formats the
+        borders that run through the very same places are closed: a vertex that is repeated there becomes the first
+        of its place, with the mean of their colours, and `of_file` tells which. Other vertices stay as they are. A
+        UserWarning says so, and names the objects of a file that holds several.
 
     Raises
     ------
@@ -66,11 +72,27 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     if contents.faces is None or not len(contents.faces):
         raise MeshFileError(f"{path}: expected a mesh, found {len(contents.vertices)} vertices and no faces")
     try:
-        mesh = Mesh(contents.vertices, contents.faces, contents.colors)
+        mesh = _seamless(path, Mesh(contents.vertices, contents.faces, contents.colors))
     except ValueError as error:
         raise MeshFileError(f"{path}: {error}") from None
+    if len(contents.objects) > 1:
+        told = ", ".join(f"{name} ({count} triangles)" for name, count in contents.objects[:6])
+        more = ", ..." if len(contents.objects) > 6 else ""
+        warnings.warn(f"{path}: {len(contents.objects)} objects were taken for one mesh: {told}{more}", stacklevel=2)
     scale = metres_per_unit(path, mesh.vertices, unit)
     return mesh if scale == 1 else mesh.with_vertices(scale * mesh.vertices)
+
+
+def _seamless(path: Path, mesh: Mesh) -> Mesh:
+    """The mesh with its seams closed, if it has any."""
+    vertex_of = seams_closed(mesh.vertices, mesh.faces)
+    if vertex_of is None:
+        return mesh
+    _, first = np.unique(vertex_of, return_index=True)
+    colors = None if mesh.colors is None else merged_mean(mesh.colors, vertex_of)
+    warnings.warn(f"{path}: {len(vertex_of) - len(first)} of {len(vertex_of)} vertices repeat others along seams "
+                  "(flat shading or textures) and were merged with them", stacklevel=3)
+    return Mesh(mesh.vertices[first], vertex_of[mesh.faces], colors, vertex_of)
 
 
 def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") -> None:

@@ -29,6 +29,7 @@ class Contents:
     faces: np.ndarray | None = None         # (F, 3)
     normals: np.ndarray | None = None       # (N, 3)
     colors: np.ndarray | None = None        # (N, 3) in [0, 1]
+    objects: tuple[tuple[str, int], ...] = ()       # name and triangles of each, where the format has objects
 
 
 def load_bytes(path: Path) -> bytes:
@@ -137,8 +138,12 @@ class Lines:
 
 
 def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
-             numbers: Sequence[int] | None = None) -> np.ndarray:
+             numbers: Sequence[int] | None = None, vertices: np.ndarray | None = None) -> np.ndarray:
     """Triangles (F, 3) of polygons of `sizes` (P,) corners, each cut into a fan around its first corner.
+
+    Where two polygons would be cut along one line, or one along an edge of another, it is a fan around a later corner.
+    Vertex numbers alone decide, so that a mesh is cut alike in all its poses; of `vertices` (count, 3) a UserWarning
+    tells how many polygons are so bent or hollow that they fold over where they are cut.
 
     `corners` are their vertices, of `count`, one polygon after the other; `numbers` the lines of the polygons.
     MeshFileError for fewer than three corners, or a vertex out of range.
@@ -158,9 +163,61 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
         raise MeshFileError(f"{where(p)} refers to vertex {corners[outside[0]]}, expected 0..{count - 1}")
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
+    first = _cuts_that_meet_nothing(sizes, corners, count)
     of = np.repeat(np.arange(len(sizes)), sizes - 2)
-    within = np.arange(len(of)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
-    return np.stack([corners[start[of]], corners[start[of] + within + 1], corners[start[of] + within + 2]], axis=1)
+    within = np.arange(len(of)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2) + first[of]
+    size, begin = sizes[of], start[of]
+    faces = np.stack([corners[begin + first[of]], corners[begin + (within + 1) % size],
+                      corners[begin + (within + 2) % size]], axis=1)
+    if vertices is not None and len(folded := _folded(vertices, faces, of)):
+        warnings.warn(f"{path}: {len(folded)} polygons fold over where they are cut into triangles, the first is face "
+                      f"{folded[0]}: cut them in the program they are from", stacklevel=4)
+    return faces
+
+
+def _folded(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """The polygons some of whose triangles (F, 3), `of` (F,) them, face away from the whole."""
+    c = vertices[faces]
+    with np.errstate(all="ignore"):                          # what is not finite is refused later
+        area = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+        whole = np.zeros((of[-1] + 1, 3))
+        np.add.at(whole, of, area)
+        return np.unique(of[(area * whole[of]).sum(axis=1) < -1e-6 * (whole[of]**2).sum(axis=1)])
+
+
+def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) -> np.ndarray:
+    """(P,) the corner of each polygon from which it is cut: the first whose cuts are no edges of other polygons."""
+    start = np.cumsum(sizes) - sizes
+    following = np.arange(len(corners)) + 1
+    following[start + sizes - 1] = start
+    sides = _edge_key(corners, corners[following], count)
+    first, large = np.zeros(len(sizes), dtype=np.int64), np.flatnonzero(sizes > 3)
+    of = np.repeat(large, sizes[large] - 3)
+    within = np.arange(len(of)) - np.repeat(np.cumsum(sizes[large] - 3) - (sizes[large] - 3), sizes[large] - 3) + 2
+    cuts = _edge_key(corners[start[of]], corners[start[of] + within], count)
+    _, which, times = np.unique(cuts, return_inverse=True, return_counts=True)
+    crowded = np.isin(cuts, sides) | (times[which] > 1)
+    if not crowded.any():
+        return first
+    users: dict[int, list[int]] = {}
+    for key, p in zip(np.r_[sides, cuts[~crowded]].tolist(), np.r_[np.repeat(np.arange(len(sizes)), sizes),
+                                                                  of[~crowded]].tolist(), strict=True):
+        users.setdefault(key, []).append(p)
+    rings = [set(ring.tolist()) for ring in np.split(corners, start[1:])]
+    for p in np.unique(of[crowded]):
+        ring, n = corners[start[p]:start[p] + sizes[p]], int(sizes[p])
+        ways = [_edge_key(ring[k], ring[(k + np.arange(2, n - 1)) % n], count).tolist() for k in range(n)]
+        # polygons that repeat each other meet however they are cut
+        met = [sum(not (rings[q] <= rings[p] or rings[p] <= rings[q]) for key in way for q in users.get(key, ()))
+               for way in ways]
+        first[p] = int(np.argmin(met))
+        for key in ways[first[p]]:
+            users.setdefault(key, []).append(int(p))
+    return first
+
+
+def _edge_key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    return np.minimum(a, b) * count + np.maximum(a, b)
 
 
 def as_colors(values: np.ndarray, kind: np.dtype) -> np.ndarray:

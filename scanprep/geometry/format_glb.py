@@ -1,4 +1,9 @@
-"""GLB, the binary form of glTF 2.0: all triangles of the scene, each mesh where its node puts it."""
+"""GLB, the binary form of glTF 2.0: all triangles of the scene, each mesh where its node puts it.
+
+glTF has y up and no body here has an axis that is up, so what is written is turned: by `tallest`, or by the axis that
+the caller knows. The file names that axis in `asset.extras`, and the reader turns it back. A file that names none comes
+from elsewhere, or was written before there was a name: it is read as it stands.
+"""
 from __future__ import annotations
 
 import json
@@ -16,13 +21,16 @@ from .mesh import Mesh
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 VERTICES, _INDICES = 34962, 34963     # what a graphics card will use the numbers for
 _NUMBERS = {np.dtype(kind).str: number for number, kind in _COMPONENTS.items()}
+GENERATOR = "scapekit"
+_TURNS = {"x": 0, "y": 1, "z": 2}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 def read(path: Path, data: bytes) -> Contents:
     """The meshes of the scene one after the other, in scene coordinates; points and lines are left out.
 
-    A mesh that hangs on joints is taken as it is stored, in its bind pose.
+    The axes are those of the body where the file tells which of them was turned to y. A mesh that hangs on joints is
+    taken as it is stored, in its bind pose.
     """
     tree, binary = chunks_of(path, data)
     with storage.taking_apart(path, "a whole GLB file", MeshFileError), np.errstate(all="ignore"):
@@ -36,10 +44,12 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
+    objects: list[tuple[str, int]] = []
     start, most = 0, 10**6 + 4 * len(binary)    # many nodes may show one mesh, but not without end
-    for _, node, matrix in nodes_of(tree):
+    for number, node, matrix in nodes_of(tree):
         if "mesh" not in node:
             continue
+        before = len(faces)
         matrix = np.eye(4) if "skin" in node else matrix
         placed: dict[int, int] = {}                      # primitives may share their vertices
         for primitive in item(tree["meshes"], node["mesh"])["primitives"]:
@@ -60,11 +70,46 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             most -= count + 3 * len(corners) + 1
             if most < 0:
                 raise ValueError("it shows its meshes too often")
+        if len(faces) > before:
+            name = node.get("name") or tree["meshes"][node["mesh"]].get("name") or f"node {number}"
+            objects.append((str(name), sum(map(len, faces[before:]))))
     if not faces:
         raise MeshFileError(f"{path}: expected a mesh, found a GLB file without triangles")
     shades = [c for c in colors if c is not None]
-    return Contents(np.concatenate(vertices), np.concatenate(faces), None,
-                    np.concatenate(shades) if len(shades) == len(colors) else None)
+    return Contents(np.concatenate(vertices) @ turn_up(up_of(tree)), np.concatenate(faces), None,
+                    np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects))
+
+
+def turn_up(up: int) -> np.ndarray:
+    """The rotation (3, 3) that brings an axis to +y; points, poses and trans turn as `x @ turn_up(up).T`.
+
+    A rotation vector turns like a point because the axes of all parts are those of the world at rest.
+    """
+    if up not in (0, 1, 2):
+        raise ValueError(f"up: expected 0, 1 or 2, got {up}")
+    return np.array([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], np.eye(3), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]][up])
+
+
+def tallest(vertices: np.ndarray) -> int:
+    """The axis that is probably up: that of the largest extent.
+
+    Where the next one is nearly as large, as of somebody with the arms spread, it is the next one if the body is alike
+    on both sides of the first, and not of that.
+    """
+    extent = np.ptp(vertices, axis=0)
+    first, second = np.argsort(-extent, kind="stable")[:2]
+    sided = [np.histogram(vertices[:, axis], 10)[0] for axis in (first, second)]
+    here, there = (np.abs(count - count[::-1]).sum() / len(vertices) for count in sided)
+    spread = extent[second] > 0.85 * extent[first] and here < 0.25 and here < 0.5 * there
+    return int(second if spread else first)
+
+
+def up_of(tree: dict[str, Any]) -> int:
+    """The axis of the body that was turned to y, as the file says; 1, none was turned, where it does not."""
+    asset = tree.get("asset")
+    if not isinstance(asset, dict) or asset.get("generator") != GENERATOR or not isinstance(asset.get("extras"), dict):
+        return 1
+    return _TURNS.get(str(asset["extras"].get("up")), 1)
 
 
 def item(values: list[Any], number: Any) -> Any:
@@ -174,16 +219,18 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
 def encode(contents: Contents, double: bool) -> bytes:
     """A GLB file of one mesh with normals, in single precision whatever `double` says."""
     assert contents.faces is not None, "a GLB file is written for meshes"
-    glb, normals = Glb(), some_normal(Mesh(contents.vertices, contents.faces))
+    up = tallest(contents.vertices)
+    vertices = contents.vertices @ turn_up(up).T
+    glb, normals = Glb(), some_normal(Mesh(vertices, contents.faces))
     indices = glb.add_indices(contents.faces)
-    attributes = {"POSITION": glb.add(contents.vertices, "VEC3", VERTICES, bounds=True),
+    attributes = {"POSITION": glb.add(vertices, "VEC3", VERTICES, bounds=True),
                   "NORMAL": glb.add(normals, "VEC3", VERTICES)}
     if contents.colors is not None:
         attributes["COLOR_0"] = glb.add(as_light(contents.colors), "VEC3", VERTICES)
     return glb.pack({
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}]})
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}]}, up)
 
 
 class Glb:
@@ -231,9 +278,10 @@ class Glb:
                                 "componentType": _NUMBERS[values.dtype.str], **extra})
         return len(self._accessors) - 1
 
-    def pack(self, document: dict[str, Any]) -> bytes:
-        """The file: header, JSON, buffer."""
-        document = {"asset": {"version": "2.0", "generator": "scapekit"}, **document,
+    def pack(self, document: dict[str, Any], up: int) -> bytes:
+        """The file: header, JSON, buffer; its vertices have been turned by `turn_up(up)`."""
+        asset = {"version": "2.0", "generator": GENERATOR, "extras": {"up": "xyz"[up]}}
+        document = {"asset": asset, **document,
                     "buffers": [{"byteLength": len(self._data)}], "bufferViews": self._views,
                     "accessors": self._accessors}
         text = json.dumps(document, separators=(",", ":")).encode()

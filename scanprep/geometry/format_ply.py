@@ -219,7 +219,7 @@ def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]])
         if not isinstance(lists, tuple):
             raise MeshFileError(f"{path}: expected a property list vertex_indices of element face, "
                                 f"found {list(found['face'])}")
-        faces = polygons(path, lists[0], lists[1], len(vertices))
+        faces = polygons(path, lists[0], lists[1], len(vertices), vertices=vertices)
     return Contents(vertices, faces, triple(("nx", "ny", "nz")), colors)
 
 

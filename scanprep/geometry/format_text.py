@@ -29,8 +29,18 @@ def read_obj(path: Path, data: bytes) -> Contents:
         raise MeshFileError(f"{path}: expected an OBJ file with lines 'v x y z', found none")
     table = _vertices(lines, v_rows)
     corners, sizes = _corners(lines, v_rows, f_rows)
-    faces = polygons(path, sizes, corners, len(v_rows), [lines.numbers[row] for row in f_rows])
-    return Contents(table[:, :3], faces, None, np.clip(table[:, 3:6], 0, 1) if table.shape[1] >= 6 else None)
+    faces = polygons(path, sizes, corners, len(v_rows), [lines.numbers[row] for row in f_rows], table[:, :3])
+    colors = np.clip(table[:, 3:6], 0, 1) if table.shape[1] >= 6 else None
+    o_rows = [row for row, start in enumerate(starts) if start in (b"o ", b"o\t")]
+    return Contents(table[:, :3], faces, None, colors, _objects(lines, o_rows, f_rows, sizes))
+
+
+def _objects(lines: Lines, o_rows: list[int], f_rows: list[int], sizes: np.ndarray) -> tuple[tuple[str, int], ...]:
+    """Name and triangles of every object that has any; one object need not be named."""
+    of = np.searchsorted(o_rows, f_rows) - 1
+    names = [text.strip().decode("utf-8", "replace") for text in _after(lines, o_rows)]
+    counts = [(name, int((sizes[of == k] - 2).sum())) for k, name in enumerate(["without a name", *names], -1)]
+    return tuple((name, count) for name, count in counts if count)
 
 
 def _after(lines: Lines, rows: list[int]) -> list[bytes]:
@@ -119,7 +129,7 @@ def read_off(path: Path, data: bytes) -> Contents:
                             f"found {found} lines")
     face = Element("face", f, (Property("corners", "i4", "u1"),))                 # as in PLY; what follows is skipped
     sizes, corners = ascii_element(lines, face, place)[0]["corners"]
-    faces = polygons(path, sizes, corners, n, lines.numbers[place:place + f])
+    faces = polygons(path, sizes, corners, n, lines.numbers[place:place + f], table[:, :3])
     return Contents(table[:, :3], faces, table[:, 3:6] if kind[3] else None, colors)
 
 

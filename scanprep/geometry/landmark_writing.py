@@ -1,9 +1,11 @@
-"""Landmarks in the files of other programs; the counterpart of what `landmarks.py` reads."""
+"""Landmarks in the files of other programs; the counterpart of `landmark_reading`."""
 from __future__ import annotations
 
+import csv
+import io
 import json
-from collections.abc import Callable, Mapping
-from xml.sax.saxutils import quoteattr
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
@@ -26,7 +28,7 @@ def as_bytes(name: str, points: Points, unit: str | None) -> bytes | None:
 
 def _picked_points(points: Points, unit: str | None) -> str:
     """MeshLab's PickPoints."""
-    rows = "".join(f' <point x="{x:.9g}" y="{y:.9g}" z="{z:.9g}" active="1" name={quoteattr(name)}/>\n'
+    rows = "".join(f' <point x="{x:.12g}" y="{y:.12g}" z="{z:.12g}" active="1" name={quoteattr(name)}/>\n'
                    for name, (x, y, z) in _scaled(points, unit or "m"))
     return f"<!DOCTYPE PickedPoints>\n<PickedPoints>\n{rows}</PickedPoints>\n"
 
@@ -39,6 +41,53 @@ def _slicer(points: Points, unit: str | None) -> str:
                                     "controlPoints": controls}]}, indent=1)
 
 
+def _fiducials(points: Points, unit: str | None) -> str:
+    """An .fcsv file of 3D Slicer, in its LPS frame."""
+    columns = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+    rows = [(i + 1, *point, 0, 0, 0, 1, 1, 1, 0, name, "", "")
+            for i, (name, point) in enumerate(_as_text(points, unit or "mm"))]
+    return (f"# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = {columns}\n" + _csv(rows))
+
+
+def _scalismo(points: Points, unit: str | None) -> str:
+    return json.dumps([{"id": name, "coordinates": point.tolist()} for name, point in _scaled(points, unit or "m")],
+                      indent=1)
+
+
+def _table(points: Points, unit: str | None) -> str:
+    return _csv([("name", "x", "y", "z"), *((name, *point) for name, point in _as_text(points, unit or "m"))])
+
+
+def _marker_set(points: Points, unit: str | None) -> str:
+    """A marker set of OpenSim 4, all in the frame of the ground."""
+    return marker_set({name: ("/ground", point) for name, point in _scaled(points, unit or "m")})
+
+
+def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
+    """A marker set of OpenSim 4: name -> the path of the frame, as `/bodyset/pelvis`, and the place in it, metres."""
+    rows = "".join(
+        f"   <Marker name={quoteattr(name)}>\n    <socket_parent_frame>{escape(frame)}</socket_parent_frame>\n"
+        f"    <location>{' '.join(map(repr, map(float, place)))}</location>\n    <fixed>false</fixed>\n   </Marker>\n"
+        for name, (frame, place) in markers.items())
+    return ('<?xml version="1.0" encoding="UTF-8" ?>\n'
+            '<OpenSimDocument Version="40000">\n <MarkerSet name="markerset">\n'
+            f"  <objects>\n{rows}  </objects>\n  <groups />\n </MarkerSet>\n</OpenSimDocument>\n")
+
+
+def _csv(rows: Iterable[Sequence[object]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
+
+
+def _as_text(points: Points, unit: str) -> list[tuple[str, list[str]]]:
+    """Names as cells of a table may have them, and coordinates without loss."""
+    wrong = next((name for name in points if name.splitlines() != [name] or name.strip() != name or "#" in name), None)
+    if wrong is not None:
+        raise ValueError(f"landmarks: '{wrong}' cannot be the name of a landmark in a file of lines; write JSON")
+    return [(name, [repr(float(value)) for value in point]) for name, point in _scaled(points, unit)]
+
+
 def _caesar(points: Points, unit: str | None) -> str:
     """CAESAR's .lnd: number, two codes, distance from the axis, x, y, z, name."""
     rows = [f"{i + 1} 0 0 {np.hypot(x, y):.6f} {x:.6f} {y:.6f} {z:.6f} {_one_line(name)}"
@@ -48,7 +97,8 @@ def _caesar(points: Points, unit: str | None) -> str:
 
 def _rows(points: Points, unit: str | None) -> str:
     """Lines of x, y, z and name."""
-    return "".join(f"{x:.9g} {y:.9g} {z:.9g} {_one_line(name)}\n" for name, (x, y, z) in _scaled(points, unit or "m"))
+    return "".join(f"{x:.12g} {y:.12g} {z:.12g} {_one_line(name)}\n"
+                   for name, (x, y, z) in _scaled(points, unit or "m"))
 
 
 def _scaled(points: Points, unit: str) -> list[tuple[str, np.ndarray]]:
@@ -62,4 +112,5 @@ def _one_line(name: str) -> str:
 
 
 _WRITERS: dict[str, Callable[[Points, str | None], str]] = {
-    ".mrk.json": _slicer, ".pp": _picked_points, ".lnd": _caesar, ".txt": _rows}
+    ".mrk.json": _slicer, ".fcsv": _fiducials, ".scalismo.json": _scalismo, ".csv": _table, ".xml": _marker_set,
+    ".pp": _picked_points, ".lnd": _caesar, ".txt": _rows}

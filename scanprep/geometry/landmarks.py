@@ -1,22 +1,22 @@
-"""Files of landmarks: JSON, MeshLab `.pp`, CAESAR `.lnd`, 3D Slicer `.mrk.json`, and text."""
+"""Files of landmarks: what they mean on a mesh, and which belongs to what; `landmark_reading` has the formats."""
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from . import storage
-from .format_common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
+from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_per_unit
+from .landmark_reading import Entry, entries_of
 from .landmark_writing import as_bytes
 from .mesh import Mesh
 
-LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
+LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt",
+                    ".landmarks.csv", ".fcsv", ".scalismo.json")
 
 
 def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None = None) -> dict[str, np.ndarray]:
@@ -25,13 +25,15 @@ def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None 
     Parameters
     ----------
     path : str or Path
-        JSON `{name: [x, y, z]}`, `{name: vertex}` or `{name: {"face": f, "bary": [a, b, c]}}`; MeshLab `.pp`;
-        CAESAR `.lnd`; 3D Slicer `.mrk.json`; otherwise text with lines `x y z name`.
+        JSON `{name: [x, y, z]}`, `{name: vertex}` or `{name: {"face": f, "bary": [a, b, c]}}`, or of scalismo
+        (`[{"id": name, "coordinates": [x, y, z]}]`); MeshLab `.pp`; CAESAR `.lnd`; 3D Slicer `.mrk.json` and `.fcsv`;
+        `.csv` with a heading `name,x,y,z`; a marker set of OpenSim, `.xml`, whose markers are all in one frame;
+        otherwise text with lines `x y z name`.
     mesh : Mesh, optional
         What vertices and faces refer to.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the coordinates in the file. When it is not given: millimetres for `.lnd`, what the file says for
-        `.mrk.json`, otherwise metres, with a UserWarning where the points span more than 10 m.
+        Unit of the coordinates in the file. When it is not given: millimetres for `.lnd` and `.fcsv`, what the file
+        says for `.mrk.json`, otherwise metres, with a UserWarning where the points span more than 10 m.
 
     Returns
     -------
@@ -72,7 +74,7 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
     out = {}
     for name, value in entries.items():
         if isinstance(value, int):
-            out[name] = value
+            out[name] = _vertex(path, name, value, mesh)
         elif isinstance(value, dict):
             corners = mesh.faces[value["face"]]
             out[name] = int(corners[np.linalg.norm(mesh.vertices[corners] - points[name], axis=1).argmin()])
@@ -128,7 +130,7 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
         The last two in JSON only.
     unit : 'm', 'mm', 'cm' or 'in', optional
         Unit of the coordinates in the file, as it will be given to `read_landmarks`; which expects metres without it,
-        in `.lnd` and `.mrk.json` millimetres.
+        in `.lnd`, `.fcsv` and `.mrk.json` millimetres.
 
     Raises
     ------
@@ -179,32 +181,8 @@ def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mappi
             np.array([scan_landmarks[name] for name in names]))
 
 
-_Entry = np.ndarray | int | dict[str, Any]       # metres, vertex, or face with barycentric coordinates
-
-
-def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, _Entry]:
-    data = load_bytes(path)
-    suffix = path.suffix.lower()
-    own_unit = None
-    pairs: list[tuple[str, _Entry]]
-    with storage.taking_apart(path, "landmarks", MeshFileError):
-        if suffix == ".json":
-            tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused below, by name
-            if not isinstance(tree, dict):
-                raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, "
-                                    f"found a {type(tree).__name__}")
-            if isinstance(tree.get("markups"), list):
-                own_unit, pairs = _slicer(path, tree["markups"], mesh, unit)
-            else:
-                pairs = [(name, _json_entry(path, name, value)) for name, value in tree.items()]
-        elif suffix == ".pp":
-            pairs = _picked_points(path, data)
-        elif suffix == ".lnd":
-            # number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`
-            expected = "a line of a CAESAR .lnd file, seven numbers and a name"
-            own_unit, pairs = "mm", _named_rows(Lines(path, data), 7, expected, "latin-1", b"=")
-        else:
-            pairs = _named_rows(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8")
+def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, Entry]:
+    pairs, own_unit = entries_of(path, load_bytes(path), unit, mesh)
     if not pairs:
         raise MeshFileError(f"{path}: expected landmarks, found none")
     entries = dict(pairs)
@@ -221,86 +199,24 @@ def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, _Entr
     return {name: scale * v if isinstance(v, np.ndarray) else v for name, v in entries.items()}
 
 
-def _place(path: Path, name: str, value: _Entry, mesh: Mesh | None) -> np.ndarray:
+def _place(path: Path, name: str, value: Entry, mesh: Mesh | None) -> np.ndarray:
     if isinstance(value, np.ndarray):
         return value
     if mesh is None:
         kind = "vertex" if isinstance(value, int) else "face"
         raise ValueError(f"mesh: {path} gives landmark '{name}' by {kind}, so the mesh is needed it refers to")
-    what, index, count = (("vertex", value, len(mesh.vertices)) if isinstance(value, int)
-                          else ("face", value["face"], len(mesh.faces)))
-    if not 0 <= index < count:
-        raise MeshFileError(f"{path}: landmark '{name}' refers to {what} {index}, the mesh has 0..{count - 1}")
-    return mesh.vertices[index].copy() if isinstance(value, int) else value["bary"] @ mesh.corners[index]
+    if isinstance(value, int):
+        return mesh.vertices[_vertex(path, name, value, mesh)].copy()
+    _check_number(path, name, "face", value["face"], len(mesh.faces))
+    return value["bary"] @ mesh.corners[value["face"]]
 
 
-def _json_entry(path: Path, name: str, value: Any) -> _Entry:
-    if isinstance(value, int) and not isinstance(value, bool):
-        return value
-    if isinstance(value, dict) and isinstance(value.get("face"), int):
-        bary = _numbers(value.get("bary"))
-        if bary is not None and abs(bary.sum() - 1) < 1e-3:
-            return {"face": value["face"], "bary": bary / bary.sum()}
-    point = _numbers(value)
-    if point is None:
-        raise MeshFileError(f"{path}: landmark '{name}': expected [x, y, z], a vertex or "
-                            f'{{"face": f, "bary": [a, b, c]}}, found {quote(json.dumps(value))}')
-    return point
+def _vertex(path: Path, name: str, number: int, mesh: Mesh) -> int:
+    """The vertex of a mesh that a file calls by this number, which is that in the file of the mesh."""
+    _check_number(path, name, "vertex", number, len(mesh.vertices if mesh.of_file is None else mesh.of_file))
+    return number if mesh.of_file is None else int(mesh.of_file[number])
 
 
-def _numbers(value: Any) -> np.ndarray | None:
-    try:
-        point = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return None
-    return point if point.shape == (3,) else None
-
-
-def _slicer(path: Path, markups: list[Any], mesh: Mesh | None, unit: str | None
-            ) -> tuple[str, list[tuple[str, _Entry]]]:
-    pairs: list[tuple[str, _Entry]] = []
-    own_unit = "mm"
-    with storage.taking_apart(path, "a markups file of 3D Slicer", MeshFileError):
-        for markup in markups:
-            units = markup.get("coordinateUnits", "mm")
-            own_unit = units[0] if isinstance(units, list) else units
-            signs = {"LPS": (1, 1, 1), "RAS": (-1, -1, 1)}[markup.get("coordinateSystem", "LPS")]
-            for i, point in enumerate(markup["controlPoints"]):
-                if point.get("positionStatus", "defined") == "defined":
-                    position = np.array(point["position"], dtype=np.float64)
-                    name = point.get("label", i)
-                    if not isinstance(name, str | int):
-                        raise ValueError(f"point {i} has a label that is no text")
-                    pairs.append((str(name), position.reshape(3) * signs))
-    if str(own_unit) not in UNITS and unit is None:
-        raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
-    if mesh is not None and pairs and all((np.abs(np.asarray(p)) <= FARTHEST).all() for _, p in pairs):
-        points = UNITS[unit or own_unit] * np.array([p for _, p in pairs])
-        tree, flip = cKDTree(mesh.vertices), np.array([-1, -1, 1])
-        if tree.query(points * flip)[0].sum() < tree.query(points)[0].sum():
-            pairs = [(name, np.asarray(p) * flip) for name, p in pairs]
-    return own_unit, pairs
-
-
-def _picked_points(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
-    """Points of MeshLab's PickPoints; those of a template that were not picked are inactive and left out."""
-    with storage.taking_apart(path, "picked points of MeshLab with x, y, z and name", MeshFileError):
-        root = ElementTree.fromstring(data)
-        return [(point.attrib["name"], np.array([float(point.attrib[axis]) for axis in "xyz"]))
-                for point in root.iter("point") if point.attrib.get("active", "1") != "0"]
-
-
-def _named_rows(lines: Lines, count: int, expected: str, encoding: str, heading: bytes | None = None
-                ) -> list[tuple[str, _Entry]]:
-    """Lines of so many numbers, the last three of them x, y, z, and a name; those with `heading` in them left out."""
-    pairs: list[tuple[str, _Entry]] = []
-    for row, line in enumerate(lines.text):
-        if heading is not None and heading in line:
-            continue
-        words = line.split(None, count)
-        try:
-            numbers = [float(word) for word in words[:count]]
-            pairs.append((b" ".join(words[count].split()).decode(encoding), np.array(numbers[-3:])))
-        except (ValueError, IndexError):
-            raise lines.fail(row, expected) from None
-    return pairs
+def _check_number(path: Path, name: str, what: str, number: int, count: int) -> None:
+    if not 0 <= number < count:
+        raise MeshFileError(f"{path}: landmark '{name}' refers to {what} {number}, the mesh has 0..{count - 1}")

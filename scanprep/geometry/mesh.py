@@ -22,6 +22,9 @@ class Mesh:
     faces : (F, 3) int
         Counter-clockwise seen from outside.
     colors : (N, 3) float in [0, 1], optional
+    of_file : (M,) int, optional
+        Which vertex each one of the file has become, where its reader merged some; files of vertex numbers mean those
+        of the file.
 
     Raises
     ------
@@ -32,6 +35,7 @@ class Mesh:
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
+    of_file: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64)
@@ -62,7 +66,7 @@ class Mesh:
 
     def with_vertices(self, vertices: np.ndarray) -> Mesh:
         """The same triangles on other vertices (N, 3)."""
-        return Mesh(vertices, self.faces, self.colors)
+        return Mesh(vertices, self.faces, self.colors, self.of_file)
 
     @cached_property
     def corners(self) -> np.ndarray:

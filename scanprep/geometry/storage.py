@@ -10,7 +10,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -148,9 +148,17 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
         (np.savez_compressed if compress else np.savez)(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
 
 
-def load_arrays(path: str | Path, what: str = "an .npz file") -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file, or StorageError when it is missing, damaged or holds objects."""
-    return _arrays(path, what, None)
+def load_arrays(path: str | Path, what: str = "an .npz file", only: Collection[str] | None = None
+                ) -> dict[str, np.ndarray]:
+    """All arrays of an `.npz` file, or those of some names; StorageError when it is missing, damaged or holds objects.
+    """
+    return _arrays(path, what, only)
+
+
+def names_in(path: str | Path, what: str = "an .npz file") -> tuple[str, ...]:
+    """The names of the arrays in an `.npz` file, without reading them; StorageError when it is missing or damaged."""
+    with taking_apart(path, what), zipfile.ZipFile(path) as archive:
+        return tuple(name[:-4] for name in archive.namelist() if name.endswith(".npy"))
 
 
 def load_array(path: str | Path) -> np.ndarray:
@@ -166,11 +174,11 @@ def kind_of(path: str | Path) -> str:
 
 def load_header(path: str | Path, kind: str) -> dict[str, Any]:
     """The header alone of a file of `save`, whatever its kind and version; StorageError where there is none."""
-    return _header(path, kind, _arrays(path, "an .npz file with a header", HEADER).get(HEADER))
+    return _header(path, kind, _arrays(path, "an .npz file with a header", (HEADER,)).get(HEADER))
 
 
-def _arrays(path: str | Path, what: str, only: str | None) -> dict[str, np.ndarray]:
-    """The arrays of an archive, or the one of this name; numpy's own reader believes what a header promises."""
+def _arrays(path: str | Path, what: str, only: Collection[str] | None) -> dict[str, np.ndarray]:
+    """The arrays of an archive, or those of some names; numpy's own reader believes what a header promises."""
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         members = {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
         unpacked, packed = sum(info.file_size for info in members.values()), os.path.getsize(path)
@@ -180,7 +188,7 @@ def _arrays(path: str | Path, what: str, only: str | None) -> dict[str, np.ndarr
         for name, info in members.items():
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise ValueError(f"array {name}: packed in a way that is not read here")
-            if only is None or name == only:
+            if only is None or name in only:
                 with archive.open(info) as stream:
                     found[name] = _array(stream, info.file_size, name)
         return found
@@ -195,7 +203,8 @@ def _array(stream: IO[bytes], size: int, name: str) -> np.ndarray:
     except Exception:                    # numpy's words advise to allow pickles
         raise ValueError(f"array {name}: its header is damaged") from None
     if kind.kind not in "biufcSU":
-        raise ValueError(f"array {name}: expected numbers or text, found {kind}")
+        pickled = "Python objects, which are not read here, because they can run programs" * kind.hasobject
+        raise ValueError(f"array {name}: expected numbers or text, found {pickled or kind}")
     count = math.prod(shape)
     if min(shape, default=0) < 0 or count * max(kind.itemsize, 1) != size - stream.tell():
         raise ValueError(f"array {name}: expected {count} of {kind}, found {size - stream.tell()} bytes")

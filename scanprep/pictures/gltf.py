@@ -8,12 +8,9 @@ from typing import Any
 import numpy as np
 
 from ..geometry.format_common import as_light
-from ..geometry.format_glb import VERTICES, Glb, some_normal
+from ..geometry.format_glb import VERTICES, Glb, some_normal, turn_up
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
-
-# Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
-UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 1: [0.0, 0.0, 0.0, 1.0], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
 
 
 def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]:
@@ -23,22 +20,22 @@ def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]
 
 
 def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float,
-                       colors: np.ndarray | None = None, up: int = 2, keys: int = 60) -> None:
-    """Write a moving mesh, frames (T, N, 3) at `rate` a second, that any glTF 2.0 viewer plays.
+                       colors: np.ndarray | None = None, up: int = 2) -> None:
+    """Write a moving mesh without a skeleton, frames (T, N, 3) at `rate` a second, that any glTF 2.0 viewer plays.
 
-    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
-    core of glTF is used. Of a longer motion `keys` evenly spaced frames are kept; the axis `up` points up.
+    Every frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
+    core of glTF is used. The axis `up` is turned to y. What has a skeleton is smaller as `write_moving_glb` writes it.
     """
-    write(path, animated_glb(faces, frames, rate, colors, up, keys))
+    write(path, animated_glb(faces, frames, rate, colors, up))
 
 
-def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None, up: int = 2,
-                 keys: int = 60) -> bytes:
+def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None, up: int = 2
+                 ) -> bytes:
     """The bytes of `write_animated_glb`."""
     frames, faces = np.asarray(frames, dtype=float), np.asarray(faces)
-    _check(frames, rate, up, keys)
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(keys, len(frames))).round().astype(int))
-    meshes = [Mesh(frames[t], faces) for t in chosen]
+    _check(frames, rate)
+    U = turn_up(up).T
+    meshes = [Mesh(frame @ U, faces) for frame in frames]
     glb = Glb()
     base, normals = meshes[0].vertices, some_normal(meshes[0])
     attributes = {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
@@ -53,22 +50,22 @@ def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.
     mesh: dict[str, Any] = {"name": "body", "primitives": [primitive]}
     document: dict[str, Any] = {
         "scene": 0, "scenes": [{"nodes": [0]}], "meshes": [mesh],
-        "nodes": [{"name": "body", "mesh": 0, "rotation": UPRIGHT[up]}],
+        "nodes": [{"name": "body", "mesh": 0}],
         "materials": [skin_material((1, 1, 1)) if colors is not None else skin_material()]}
     if count:
         mesh["weights"] = [0] * count
-        mesh["extras"] = {"targetNames": [f"frame {t}" for t in chosen[1:]]}
-        times = glb.add(chosen / rate, "SCALAR", None, bounds=True)
+        mesh["extras"] = {"targetNames": [f"frame {t}" for t in range(1, count + 1)]}
+        times = glb.add(np.arange(count + 1) / rate, "SCALAR", None, bounds=True)
         weights = glb.add(np.eye(count + 1)[:, 1:].ravel(), "SCALAR", None)
         document["animations"] = [{
             "name": "motion", "samplers": [{"input": times, "output": weights, "interpolation": "LINEAR"}],
             "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}]
     else:
         del primitive["targets"]
-    return glb.pack(document)
+    return glb.pack(document, up)
 
 
-def _check(frames: np.ndarray, rate: float, up: int, keys: int) -> None:
+def _check(frames: np.ndarray, rate: float) -> None:
     if frames.ndim != 3 or frames.shape[2] != 3 or not len(frames):
         raise ValueError(f"frames: expected shape (T, N, 3) with at least one frame, got {frames.shape}")
     bad = np.flatnonzero(~np.isfinite(frames).all(axis=(1, 2)))
@@ -76,7 +73,3 @@ def _check(frames: np.ndarray, rate: float, up: int, keys: int) -> None:
         raise ValueError(f"frames: {len(bad)} are not finite, the first is frame {bad[0]}")
     if not rate > 0:
         raise ValueError(f"rate: expected a positive number of frames a second, got {rate}")
-    if up not in UPRIGHT:
-        raise ValueError(f"up: expected 0, 1 or 2, got {up}")
-    if keys < 1:
-        raise ValueError(f"keys: expected at least 1, got {keys}")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.format_common import UNITS
-from ..geometry.format_glb import VERTICES, Glb
+from ..geometry.format_glb import VERTICES, Glb, chunks_of, some_normal, tallest, turn_up, up_of
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
 from ..geometry.surface import Rays, barycentric
@@ -74,7 +74,10 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
         warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
                       "its colours are left out", stacklevel=2)
         return None
-    mesh = Mesh(UNITS[unit or "m"] * np.asarray(loaded.vertices), np.asarray(loaded.faces))
+    vertices = UNITS[unit or "m"] * np.asarray(loaded.vertices)
+    if path.suffix.lower() == ".glb":
+        vertices = vertices @ turn_up(up_of(chunks_of(path, path.read_bytes())[0]))
+    mesh = Mesh(vertices, np.asarray(loaded.faces))
     return Texture(mesh, np.asarray(uv, dtype=np.float64), image)
 
 
@@ -134,8 +137,10 @@ def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
 
 def write_textured(path: str | Path, texture: Texture) -> None:
     """Write a GLB with its picture inside, whole or not at all."""
-    glb = Glb()
-    attributes = {"POSITION": glb.add(texture.mesh.vertices, "VEC3", VERTICES, bounds=True),
+    glb, up = Glb(), tallest(texture.mesh.vertices)
+    U = turn_up(up).T
+    attributes = {"POSITION": glb.add(texture.mesh.vertices @ U, "VEC3", VERTICES, bounds=True),
+                  "NORMAL": glb.add(_normals(texture.mesh) @ U, "VEC3", VERTICES),
                   "TEXCOORD_0": glb.add(texture.uv * [1, -1] + [0, 1], "VEC2", VERTICES)}
     material = skin_material((1, 1, 1))
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
@@ -144,4 +149,11 @@ def write_textured(path: str | Path, texture: Texture) -> None:
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": glb.add_indices(texture.mesh.faces),
                                     "material": 0}]}],
-        "images": [image], "textures": [{"source": 0}]}))
+        "images": [image], "textures": [{"source": 0}]}, up))
+
+
+def _normals(mesh: Mesh) -> np.ndarray:
+    """(N, 3) unit normals, the same for all vertices of one place: they are repeated along the seams of the picture."""
+    _, first, place = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    return some_normal(Mesh(mesh.vertices[first], place[mesh.faces]))[place]

@@ -55,8 +55,18 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
         judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, found)))
 
 
+NO_LANDMARKS = Path("none")          # as `--landmarks none`
+
+
+def _given(scan: Path, landmarks: Path | None) -> Path | None:
+    """The landmark file of a scan: the one named, else the one beside it; `none` is none."""
+    if landmarks == NO_LANDMARKS and not landmarks.exists():
+        return None
+    return landmarks or landmarks_beside(scan)
+
+
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-               template_landmarks: Path | None = None, ignore_landmarks: bool = False, unit: Unit | None = None,
+               template_landmarks: Path | None = None, unit: Unit | None = None,
                config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:  # noqa: B008
     """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
@@ -66,14 +76,13 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         scan: Mesh or point cloud.
         template: Mesh to find on the scan.
         output: JSON file of vertices of the template, points of the scan in metres, and confidence.
-        landmarks: Landmarks of the scan: three at least, spread over the body; else the file of its name beside it,
-            and where there is none the ends of the limbs are looked for.
+        landmarks: Landmarks of the scan: three at least, spread over the body; else the file of its name beside it.
+            With none, or the word none, the ends of the limbs are looked for.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        ignore_landmarks: Leave out the landmark file beside the scan.
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    given = landmarks or (None if ignore_landmarks else landmarks_beside(scan))
+    given = _given(scan, landmarks)
     pairs = _pairs(body, data, template, given, template_landmarks, unit)
     with bar("finding correspondences") as progress:
         found = find_correspondences(body, data, pairs, config, progress)
@@ -86,7 +95,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-                 template_landmarks: Path | None = None, ignore_landmarks: bool = False,
+                 template_landmarks: Path | None = None,
                  correspondences: Path | None = None, unit: Unit | None = None,
                  config: RegistrationConfig = RegistrationConfig()) -> Outcome:  # noqa: B008
     """Bend the template onto one scan.
@@ -97,15 +106,14 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         scan: Mesh or point cloud.
         template: Mesh to bring onto it.
         output: Mesh to write.
-        landmarks: Landmarks of the scan; else the file of its name beside it, where no correspondences are given.
-            With neither landmarks nor correspondences it must be near the template's pose.
+        landmarks: Landmarks of the scan; else the file of its name beside it, where no correspondences are given;
+            the word none leaves it out. With neither it must be near the template's pose.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        ignore_landmarks: Leave out the landmark file beside the scan.
         correspondences: File of scape prep correspond; wrong pairs among them do little harm.
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    given = landmarks or (None if ignore_landmarks or correspondences else landmarks_beside(scan))
+    given = landmarks if correspondences and landmarks is None else _given(scan, landmarks)
     pairs = _pairs(body, data, template, given, template_landmarks, unit)
     hints = read_correspondences(correspondences) if correspondences else None
     with bar("registering") as progress:

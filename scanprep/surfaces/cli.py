@@ -1,4 +1,4 @@
-"""From range views to a clean mesh: `scape prep views`, `merge`, `fill`, `decimate`, `template`, and `decimate-set`."""
+"""From range views to a clean mesh: `scape prep views`, `merge`, `fill`, `decimate`, `template`."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -9,7 +9,7 @@ import tyro
 
 from ..alignment.views import AlignViewsConfig, align_views, views_problem
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
-from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
+from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..decimation.decimate import DecimateConfig, decimate
@@ -27,20 +27,18 @@ from .template import make_template
 ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
 
 
-def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = None, faces: Faces = 14000,
-                      unit: Unit | None = None) -> Outcome:
+def template_of_views(views: ViewsArg, output: Output, faces: Faces = 14000, unit: Unit | None = None) -> Outcome:
     """Merge range views, close the holes, and decimate to a template.
 
     Example: scape prep template views --faces 12000 -o template.ply
 
     Args:
-        views: Folder of range meshes in one frame.
+        views: Folder of range meshes in one frame, and cameras.json: {file name without ending: [x, y, z]}.
         output: Mesh to write.
-        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in the folder.
         faces: Triangles of the template.
         unit: Unit of the views and cameras.
     """
-    seen = _read_views(views, cameras, unit)
+    seen = _read_views(views, unit)
     with bar("making the template") as progress:
         made = make_template(seen, faces, progress=progress)
     write_mesh(output, made)
@@ -74,8 +72,8 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
           for piece in found.components)], {"clean": config})
 
 
-def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, landmarks: Path | None = None,
-                  features: bool = False, unit: Unit | None = None,
+def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None, features: bool = False,
+                  unit: Unit | None = None,
                   config: AlignViewsConfig = AlignViewsConfig()  # noqa: B008
                   ) -> Outcome:
     """Bring range views into one frame, all of them together.
@@ -83,16 +81,15 @@ def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, 
     Example: scape prep views views -o aligned
 
     Args:
-        views: Folder of range meshes: roughly in one frame, unless landmarks or features place them.
+        views: Folder of range meshes, roughly in one frame unless landmarks or features place them, and cameras.json:
+            {file name without ending: [x, y, z]}, each in the frame of its view.
         output: Folder for the moved meshes and their cameras.json.
-        cameras: JSON {file name without ending: [x, y, z]}, each in the frame of its view; else cameras.json in the
-            folder.
         landmarks: Folder of landmark files with the names of the views, which place them first.
         features: Place the views by their shapes alone first.
         unit: Unit of the views, cameras and landmarks.
         config: Settings.
     """
-    seen, names = _read_views(views, cameras, unit), [path.stem for path in list_meshes(views)]
+    seen, names = _read_views(views, unit), [path.stem for path in list_meshes(views)]
     marks = [_view_landmarks(landmarks, name, mesh, unit) for name, (mesh, _) in zip(names, seen, strict=True)] \
         if landmarks else None
     found = align_views(seen, config, landmarks=marks, features=features)
@@ -118,28 +115,26 @@ def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> d
     return read_landmarks(path, view, unit) if path else {}
 
 
-def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
+def merge(views: ViewsArg, output: Output, unit: Unit | None = None,
           config: MergeConfig = MergeConfig()) -> Outcome:  # noqa: B008
     """Merge range views into one surface, open where nothing was seen.
 
     Example: scape prep merge views -o body.ply
 
     Args:
-        views: Folder of range meshes in one frame.
+        views: Folder of range meshes in one frame, and cameras.json: {file name without ending: [x, y, z]}.
         output: Mesh to write.
-        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in the folder.
         unit: Unit of the views and cameras.
         config: Settings.
     """
-    seen = _read_views(views, cameras, unit)
+    seen = _read_views(views, unit)
     with bar("merging views") as progress:
         merged = merge_views(seen, config, progress)
     write_mesh(output, merged)
     return Outcome(output, [Metric("views", len(seen)), *about_mesh(merged)], {"merge": config})
 
 
-def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path | None = None,
-         unit: Unit | None = None,
+def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | None = None,
          config: FillConfig = FillConfig()) -> Outcome:  # noqa: B008
     """Close the holes of a mesh; what was there stays as it was.
 
@@ -148,13 +143,13 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path
     Args:
         mesh: Mesh with holes.
         output: Mesh to write.
-        views: Folder of the range meshes it was merged from: space that they look through is left empty.
-        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in that folder.
+        views: Folder of the range meshes it was merged from, and their cameras.json: space that they look through is
+            left empty.
         unit: Unit of the mesh, the views and the cameras.
         config: Settings.
     """
     before = read_mesh(mesh, unit)
-    seen = _read_views(views, cameras, unit) if views else ()
+    seen = _read_views(views, unit) if views else ()
     holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
         if config.method.startswith("poisson"):
@@ -171,19 +166,27 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
-           config: DecimateConfig = DecimateConfig()) -> Outcome:  # noqa: B008
-    """Fewer triangles for the same surface.
+           config: DecimateConfig = DecimateConfig(),  # noqa: B008
+           of_set: DecimateSetConfig = DecimateSetConfig()) -> Outcome:  # noqa: B008
+    """Fewer triangles for the same surface: of a mesh, or of a registered set, whose parts and landmarks stay in step.
 
     Example: scape prep decimate closed.ply --faces 14000 -o template.ply
 
     Args:
-        mesh: Mesh.
-        output: Mesh to write.
+        mesh: Mesh, or folder of a registered set.
+        output: Mesh to write; of a set a folder, which also holds the map between the two in decimation.npz.
         faces: How many triangles are wanted.
-        landmarks: Landmarks of the mesh, whose vertices stay where they are.
+        landmarks: Landmarks of the mesh, whose vertices stay where they are; a set has its own.
         unit: Unit of the mesh and its landmarks.
-        config: Settings.
+        config: Settings for a mesh.
+        of_set: Settings for a set.
     """
+    if mesh.is_dir():
+        wrong = [name for name, given in (("landmarks", landmarks), ("unit", unit),
+                                          ("method", config.method != DecimateConfig().method)) if given]
+        if wrong:
+            raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
+        return _reduce_set(mesh, output, faces, of_set)
     before = read_mesh(mesh, unit)
     keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
     with bar("decimating") as progress:
@@ -192,30 +195,18 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
     return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
 
 
-def reduce_set(registered: SetArg, output: Output, faces: Faces,
-               config: DecimateSetConfig = DecimateSetConfig()  # noqa: B008
-               ) -> Outcome:
-    """A registered set in fewer triangles: template, meshes, skeleton and landmarks stay in step.
-
-    Example: scape prep decimate-set set --faces 5000 -o small_set
-
-    Args:
-        registered: Folder of a registered set.
-        output: Folder of the smaller one, which also holds the map between the two in decimation.npz.
-        faces: How many triangles are wanted.
-        config: Settings.
-    """
-    before = RegisteredSet.load(registered)
+def _reduce_set(folder: Path, output: Path, faces: int, config: DecimateSetConfig) -> Outcome:
+    before = RegisteredSet.load(folder)
     with bar("decimating") as progress:
         after = write_decimated_set(before, output, faces, config, progress)
     return Outcome(output, [
         Metric("meshes", len(after.entries)), Metric("triangles before", len(before.template.faces)),
-        *about_mesh(after.template)], {"decimate-set": config})
+        *about_mesh(after.template)], {"decimate": config})
 
 
-def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
+def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
     """The range meshes of a folder with the positions of their cameras."""
-    given = cameras or folder / "cameras.json"
+    given = folder / "cameras.json"
     where = storage.read_json(given, "camera positions {name: [x, y, z]}")
     paths = list_meshes(folder)
     with storage.taking_apart(given, "camera positions {name: [x, y, z]} in JSON"):

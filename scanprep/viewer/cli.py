@@ -17,7 +17,7 @@ from .pick import PickApp
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[SCAN ...]")]
 Port = Annotated[int, Range(0, 65535)]
-Ending = Literal["json", "pp", "mrk.json", "lnd", "txt"]
+Ending = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd", "txt"]
 
 
 def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Ending = "json",
@@ -34,12 +34,13 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
         names: Names to offer beside those that are there already: "ten" for people, "caesar" for the 73 of CAESAR, or
             a text file with one name in each line.
         format: Of new landmark files, which are written beside each scan with its name: json, pp (MeshLab),
-            mrk.json (3D Slicer), lnd (CAESAR), txt. A file that is there keeps its format, and a copy of it as it was.
+            mrk.json and fcsv (3D Slicer), scalismo.json, csv, lnd (CAESAR), txt. A file that is there keeps its format,
+            and a copy of it as it was.
         unit: Unit of the scans and of their landmarks; of the mesh, if there are no scans.
         serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
             to reach it is printed.
     """
-    ending = ".landmarks.json" if format == "json" else "." + format
+    ending = (".landmarks." if format in ("json", "csv", "txt") else ".") + format
     if (mesh / "set.json").exists():
         return _mended(mesh, scans, ending, names, unit, serve)
     template = Clicked.found(mesh, ending, None if scans else unit)      # as scape prep run reads it

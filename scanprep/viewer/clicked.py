@@ -50,7 +50,7 @@ class Clicked:
 
     def _read(self, file: Path) -> Places:
         """The landmarks of a file; the mesh is read for them only if they need it, as a folder may be large."""
-        if not file.name.endswith(".mrk.json"):                  # which may be in another frame: the mesh tells
+        if not file.name.endswith((".mrk.json", ".fcsv")):       # which may be in another frame: the mesh tells
             with contextlib.suppress(ValueError):
                 return read_landmarks(file, None, self.unit)
         shape = self.body.shape

@@ -28,8 +28,8 @@ def imported_models(report: dict) -> str:
                      half.get("seconds", ""), *(one[what][figure] for what in ("markers, shape known", "MoSh")
                                                 for figure in ("mean_mm", "seconds")),
                      one["256 bodies of one person"]["seconds"] * 1000))
-    return table(("model", "whole body (mm)", "half view, seen (mm)", "unseen (mm)", "s", "47 markers, shape known (mm)",
-                  "s", "MoSh (mm)", "s", "256 bodies (ms)"), rows)
+    return table(("model", "whole body (mm)", "half view, seen (mm)", "unseen (mm)", "s",
+                  "47 markers, shape known (mm)", "s", "MoSh (mm)", "s", "256 bodies (ms)"), rows)
 
 
 def half_people(report: dict) -> str:
@@ -136,6 +136,27 @@ def worn_markers(report: dict) -> str:
                  [tuple(r[n] for n in names) for r in report["means"]])
 
 
+def measures(report: dict) -> str:
+    """By where the bodies come from; then of every girth; then repeated; then the errors that half views stated."""
+    means = [(r["how"], "girths" if r["girth"] else "others", r["count"], r["mean_mm"], r["bias_mm"], r["largest_mm"])
+             for r in report["means"]]
+    names = list(dict.fromkeys(r["name"] for r in report["by_name"] if "girth" in r["name"]))
+    hows = list(dict.fromkeys(r["how"] for r in report["by_name"]))
+    of = {(r["how"], r["name"]): r["mean_mm"] for r in report["by_name"]}
+    again = {r["name"]: r["mean_mm"] for r in report["repeated_by_name"]}
+    each: Rows = [(name.replace("_", " "), *(of.get((how, name), "") for how in hows), again.get(name, ""))
+                  for name in names]
+    way: Rows = [(r["way"], "girths" if r["girth"] else "others", r["count"], r["mean_mm"], r["largest_mm"])
+                 for r in report["repeated"]]
+    told: Rows = [(f"{r['how']}, {r['people']}", "girths" if r["girths"] else "others", r["stated_rms_mm"],
+                   r["true_rms_mm"], 100 * r["within_1"], 100 * r["within_2"]) for r in report["stated"]]
+    return "\n\n".join((
+        table(("bodies", "", "count", "mean error (mm)", "bias (mm)", "largest (mm)"), means),
+        table(("mean error (mm)", *hows, "men, repeated"), each),
+        table(("men, repeated: carried by", "", "count", "apart, mean (mm)", "largest (mm)"), way),
+        table(("half views, people", "", "stated, RMS (mm)", "true, RMS (mm)", "within 1 (%)", "within 2 (%)"), told)))
+
+
 def wrong_landmarks(report: dict) -> str:
     """Kinds of faults: how many were flagged by the completion, and told rightly by the body found without them."""
     rows: Rows = []
@@ -240,6 +261,17 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "8.1. The body at rest that the completion found, registered: 9.3, 10.6 and 10.3 mm, and 7.9 and 8.5 for two "
         "of the men, in two to three times the time. Where we lose: places on a limb that is rolled about its axis, "
         "and the trunk of bent bodies. Beside other work on two cores."),
+    "measures": (
+        "Measurements of people",
+        "python tests/benchmarks/measures.py -o FOLDER", measures,
+        "Twenty synthetic people against sections of their true triangles by trimesh, in the planes that the true "
+        "vertices carry: scans of four views near rest, registered with ten landmarks, each coordinate clicked with 3 "
+        "mm; half views in random poses, the known person being the registered body; 47 markers, 5 mm beside their "
+        "place. Repeated: six SPRING men, two scans each, registered each for itself. The constants of stated errors "
+        "were chosen on the even people. Where we lose: the under-bust and chest girths of women, as breasts are "
+        "where vertices slide most; upper arms, whose middle slides along the arm by 7 mm; thin limbs come out "
+        "2 to 3 mm small, as a registered mesh cuts corners twice and lies 0.2 mm inside the scan; the trunk of an "
+        "unknown person from one side."),
     "wrong_landmarks": (
         "Landmarks at wrong places",
         "python tests/benchmarks/wrong_landmarks.py -m FOLD_0", wrong_landmarks,

@@ -24,6 +24,7 @@ from ..files.markers import READERS
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
 from ..subject.person import PersonConfig
+from .motions import ENDINGS, MEAN_DISTANCE, is_motion, motion_among
 from .work import MEAN_ERROR, BetasTo, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
@@ -35,19 +36,23 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
                     person: PersonConfig = PersonConfig(),                                         # noqa: B008
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
-    """The motion of a person from markers, and the person.
+    """The motion of a person from markers, and the person; or a motion of another skeleton on a body.
 
     A folder is worked through file by file, each into a folder of its name; called again, it goes on where it was,
     and does anew what has changed.
 
     Example: scape animate walk.c3d -m model.npz --layout cmu41 -o walk
 
+    A motion of another skeleton is BVH, or AMASS (.npz): segments point where they pointed, travel is as long as the
+    legs are, and the report says how far joint centres and segments are off. scape animate walk.bvh -m model.npz -o out
+
     Written are motion.npz (poses, trans, betas, rate), animation.glb, motion.bvh, joint_angles.csv (rotation vectors
-    of every part against its parent, in degrees), joint_centres.csv (metres), residuals.csv and report.html; of a
-    subject that was found also subject.json and layout.json, with loose markers where they are on this person.
+    of every part against its parent, in degrees), joint_centres.csv (metres), residuals.csv, for OpenSim motion.trc
+    (markers, joint centres) and motion.mot (ISB joint angles), and report.html; of a subject that was found also
+    subject.json and layout.json, with loose markers where they are on this person.
 
     Args:
-        markers: C3D, TRC or CSV, or a folder of these.
+        markers: C3D, TRC or CSV of markers, BVH or .npz of a motion, or a folder of these.
         output: Folder to write to.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         layout: Where the markers sit: cmu41, plugingait39, biomech57, helenhayes29, or a JSON file {"markersets":
@@ -55,7 +60,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         subject: Whose body it is: "markers" to find it from them, "template" for the one the model's poses were learned
             from, betas in JSON or .npz, or a mesh in the model's triangles. Without it "markers" where the model has
             betas.
-        unit: Unit of the markers, where the file cannot tell.
+        unit: Unit of the markers, where the file cannot tell; of a BVH, else cm.
         subject_prefix: Whose markers, in a C3D file with several people: what stands before the colon of their labels.
         retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
@@ -64,7 +69,9 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         person: Settings of the person from markers.
         workers: Who works through the files of a folder.
     """
-    found = _marker_files(markers)
+    found = _files(markers)
+    if markers.is_file() and is_motion(markers) and (layout or subject_prefix):
+        raise ValueError(f"{markers}: a motion has no markers; leave out --layout and --subject-prefix")
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
                 None if retarget_to is None else read_subject(loaded, retarget_to, unit),
@@ -84,37 +91,41 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
 
 def _summary(results: Results, count: int) -> list[Metric]:
     off = {name: _error(metrics) for name, metrics in results.values.items()}
+    markers = any(m.name == MEAN_ERROR for metrics in results.values.values() for m in metrics)
     rows = [Metric("files", count), Metric("done before", len(off) - len(results.fresh)),
             Metric("failed", len(results.failures))]
     if off:
-        rows += [Metric("distance of markers, mean of the files", float(np.mean(list(off.values()))), "mm"),
+        what = "markers" if markers else "joint centres"
+        rows += [Metric(f"distance of {what}, mean of the files", float(np.mean(list(off.values()))), "mm"),
                  Metric(f"the same, worst file ({max(off, key=off.__getitem__)})", max(off.values()), "mm")]
     return rows
 
 
 def _error(metrics: list[Metric]) -> float:
-    return next(float(m.value) for m in metrics if m.name == MEAN_ERROR)
+    """Millimetres; 0 for a motion that was copied."""
+    return next((float(m.value) for m in metrics if m.name in (MEAN_ERROR, MEAN_DISTANCE)), 0.0)
 
 
 def _folder_page(results: Results) -> Page:
     """The files, worst first."""
-    page = Page(f"{len(results.values)} marker files followed", "Worst first; each name leads to the page of its file.")
+    page = Page(f"{len(results.values)} files followed", "Worst first; each name leads to the page of its file.")
     if results.failures:
         page.section("Failed").table([(line,) for line in results.failures.values()])
-    page.section("Distance of the markers to where the body puts them, mean")
+    page.section("Distance of markers or joint centres to where the body puts them, mean")
     for name in sorted(results.values, key=lambda name: -_error(results.values[name])):
         page.markup(f'<p><a href="{escape(name)}/report.html">{escape(name)}</a>: '
                     f'{_error(results.values[name]):.1f} mm</p>')
     return page
 
 
-def _marker_files(markers: Path) -> list[Path]:
-    """The file, or the marker files of a folder; files of one name would be written over each other."""
+def _files(markers: Path) -> list[Path]:
+    """The file, or the files of markers and motions in a folder; those of one name would be written over each other."""
     if not markers.is_dir():
         return [markers]
-    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in READERS)
+    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in READERS or motion_among(p))
     if not found:
-        raise ValueError(f"{markers}: expected files ending in {', '.join(READERS)}, found none")
+        raise ValueError(f"{markers}: expected files ending in {', '.join(READERS)}, found none, nor "
+                         f"motions ({', '.join(ENDINGS)})")
     names = [p.stem for p in found]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

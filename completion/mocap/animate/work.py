@@ -1,4 +1,4 @@
-"""One marker file: whose body, its motion, and all that is written of it, with the page."""
+"""One file of markers or of a motion: whose body, its motion, and all that is written of it, with the page."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots
 
 from ...cli import rows
-from ...motion import Motion, spread_frames
+from ...motion import Motion
 from ...motion_pictures import (
     MARKER,
     chart_residuals,
@@ -30,14 +30,16 @@ from ...motion_pictures import (
     worst_frames,
 )
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import KEYS, write_glb, write_motion
+from ..files.motion_files import write_glb, write_motion
+from ..files.opensim import believed
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import hardly_believed, markers_told, motion_problem
+from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
+from .motions import bring, is_motion
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 MEAN_ERROR = "distance of markers, mean"
@@ -59,10 +61,22 @@ class Work:
     person: PersonConfig
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
-        """Follow the markers of a file, write everything into the folder of a room, and return the figures.
-
-        The first says what the motion is worth.
+        """Follow the markers of a file, or bring its motion onto the body, write everything into the folder of a room,
+        and return the figures; the first says what the motion is worth.
         """
+        if is_motion(path):
+            metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, room)
+        else:
+            metrics, motion, body, page = self._followed(path, room)
+        if self.retarget_to is not None:
+            metrics += _other_person(self, self.retarget_to, room.folder, motion, body, page)
+        if self.betas_to is not None:
+            metrics += _changing_body(self, self.betas_to, room.folder, motion, body, page)
+        page.write(room.folder / "report.html")
+        return metrics
+
+    def _followed(self, path: Path, room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
+        """The motion of the markers of a file."""
         sequence = read_markers(path, self.unit, self.who)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
@@ -82,17 +96,11 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        judgement = Judgement.of(problem, (*worn.doubts(), *hardly_believed([motion])))
+        judgement = Judgement.of(problem, (*worn.doubts(), *hardly_seen([motion]), *hardly_believed([motion])))
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
-        write_motion(output, motion, body)
-        write_glb(output / "animation.glb", motion, body)
-        page = motion_page(motion, body, sequence, path.name, rows(metrics))
-        if self.retarget_to is not None:
-            _other_person(self, self.retarget_to, output, motion, body, page)
-        if self.betas_to is not None:
-            _changing_body(self, self.betas_to, output, motion, body, page)
-        page.write(output / "report.html")
-        return metrics
+        write_motion(output, motion, body, believed(motion, sequence))
+        metrics += write_glb(output / "animation.glb", motion, body)
+        return metrics, motion, body, motion_page(motion, body, sequence, path.name, rows(metrics))
 
     def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: Room
                 ) -> tuple[MarkerSequence, PersonFit, Worn]:
@@ -126,22 +134,26 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
         Metric("frames that converged", 100 * float(motion.converged.mean()), "%")]
 
 
-def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page) -> None:
+def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page
+                  ) -> list[Metric]:
     other = retarget(motion, body, person)
     other.save(output / "onto.npz")
-    write_glb(output / "onto.glb", other, person)
+    told = write_glb(output / "onto.glb", other, person)
     page.section("On another person", "The same rotations of the joints; the way over the ground is as much longer as "
                  "the legs are, and the feet are on the ground when those of the first are.")
     page.bodies([moving_pane(other, person)])
+    return told
 
 
-def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page) -> None:
-    shown = spread_frames(len(motion.poses), KEYS)
-    bodies = morphed_vertices(work.model, motion, morph_keys(goal, motion), shown)
-    write_glb(output / "morph.glb", motion, body, bodies)
+def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page
+                   ) -> list[Metric]:
+    def bodies(frames: np.ndarray) -> np.ndarray:
+        return morphed_vertices(work.model, motion, morph_keys(goal, motion), frames)
+
+    told = write_glb(output / "morph.glb", motion, body, bodies)
     page.section("With a body that changes", "Betas change from key to key, straight over time.")
-    page.bodies([moving_pane(motion, body, bodies=lambda frames: morphed_vertices(
-        work.model, motion, morph_keys(goal, motion), frames))])
+    page.bodies([moving_pane(motion, body, bodies=bodies)])
+    return told
 
 
 def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:

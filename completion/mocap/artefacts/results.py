@@ -7,10 +7,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from scanprep.console import say
 from scanprep.geometry import storage
 from scanprep.ranges import Settings
 
 from ..files.c3d import point_table, replace_points, write_c3d
+from ..files.c3d_points import add_points
 from ..files.markers import MarkerSequence, write_markers
 from ..files.text import MarkerFileError
 
@@ -137,7 +139,7 @@ def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> 
 
 
 def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | Path | None = None,
-                  subject: str | None = None, unit: str | None = None) -> None:
+                  subject: str | None = None, unit: str | None = None, joints: MarkerSequence | None = None) -> None:
     """Write the markers of a sequence with all gaps filled, whole or not at all.
 
     In a C3D file, points that were computed have residual 0 and no cameras, as the format says, and measured ones a
@@ -153,6 +155,8 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
         The C3D file that the sequence was read from.
     subject, unit : str, optional
         As `read_markers` was given them for the original.
+    joints : MarkerSequence, optional
+        Joint centres, which a C3D file gets as further points, computed and described as such.
 
     Raises
     ------
@@ -163,15 +167,36 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
     filled = ~artefacts.repaired.seen
     if path.suffix.lower() != ".c3d":
         write_markers(path, sequence)
-    elif original is None:
-        with storage.writing(path) as beside:
+        return
+    source = None if original is None else Path(original)
+    data = None if source is None else source.read_bytes()
+    with storage.writing(path) as beside:
+        if source is None or data is None:
             write_c3d(beside, sequence.positions, sequence.labels, sequence.rate, filled)
-    else:
-        data = Path(original).read_bytes()
-        columns = _columns(Path(original), data, sequence.labels, subject)
-        source = np.where(filled, -1, artefacts.order)
-        with storage.writing(path) as beside:
-            beside.write_bytes(replace_points(Path(original), data, columns, sequence.positions, source, unit))
+        else:
+            columns = _columns(source, data, sequence.labels, subject)
+            beside.write_bytes(replace_points(source, data, columns, sequence.positions,
+                                              np.where(filled, -1, artefacts.order), unit))
+        if joints is not None:
+            _add_joints(source or path, beside, joints, subject, None if source is None else unit)
+
+
+def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject: str | None, unit: str | None) -> None:
+    """Joint centres into a C3D file, under the name of the subject, if labels have one."""
+    data = file.read_bytes()
+    taken = point_table(name, data).labels
+    who = subject or next((label.rpartition(":")[0] for label in taken if ":" in label), "")
+    labels: list[str] = []
+    for label in joints.labels:
+        label = f"{who}:{label}" if who else label
+        while label in taken:
+            label += "_"
+        labels.append(label)
+    told = [f"joint centre of the model ({label})" for label in joints.labels]
+    try:
+        file.write_bytes(add_points(name, data, labels, told, joints.positions, unit))
+    except MarkerFileError as error:                     # the markers are the user's, the joints can be had elsewhere
+        say(f"virtual.c3d has no joint centres: {error}")
 
 
 def _columns(path: Path, data: bytes, labels: tuple[str, ...], subject: str | None) -> np.ndarray:

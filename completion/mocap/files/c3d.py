@@ -17,7 +17,7 @@ from scanprep.geometry.format_common import UNITS
 
 from .text import MarkerFileError, RawMarkers
 
-_BLOCK = 512
+BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
 RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
@@ -82,9 +82,9 @@ class PointTable:
 
 def point_table(path: Path, data: bytes) -> PointTable:
     """Where the points of a C3D file stand."""
-    start = (data[0] - 1) * _BLOCK if data else 0
-    if len(data) < _BLOCK or data[1] != 0x50:
-        raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {_BLOCK} bytes; "
+    start = (data[0] - 1) * BLOCK if data else 0
+    if len(data) < BLOCK or data[1] != 0x50:
+        raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {BLOCK} bytes; "
                               f"found {len(data)} bytes that begin {data[:8]!r}")
     if not 0 < start < len(data) - 4:
         raise MarkerFileError(f"{path}: truncated or damaged: expected C3D parameters at byte {start}, "
@@ -94,8 +94,7 @@ def point_table(path: Path, data: bytes) -> PointTable:
         raise MarkerFileError(f"{path}: expected processor type 84, 85 or 86 in the C3D file, "
                               f"found {numbers.processor}")
     try:
-        parameters = _parameters(data, start + 4, numbers)
-        return _table(data, parameters, numbers)
+        return _table(data, file_parameters(data, numbers), numbers)
     except _Damaged as problem:
         raise MarkerFileError(f"{path}: {problem}") from None
     except (struct.error, IndexError, ValueError, OverflowError) as error:
@@ -111,8 +110,9 @@ def read_c3d(path: Path, data: bytes) -> RawMarkers:
     return RawMarkers(positions, tuple(table.labels[i] for i in table.kept), table.rate, table.unit)
 
 
-def _parameters(data: bytes, place: int, numbers: _Numbers) -> _Parameters:
+def file_parameters(data: bytes, numbers: _Numbers) -> _Parameters:
     """All parameters; a group is known by its number, which may come after its parameters."""
+    place = (data[0] - 1) * BLOCK + 4
     groups: dict[int, str] = {}
     room = len(data)                     # no byte belongs to two parameters
     found: list[tuple[int, str, list[Any]]] = []
@@ -154,13 +154,13 @@ def _values(data: bytes, place: int, numbers: _Numbers) -> tuple[list[Any], int]
 def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTable:
     """Where the points stand, by the header and the parameters."""
     _, points, analog, first, last = (int(n) for n in numbers.words(data[:10], "u2"))
-    start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * _BLOCK
+    start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * BLOCK
     scale = float(numbers.floats(data[12:16])[0])
     width = (4 * points + analog) * (4 if scale < 0 else 2)
     frames = _frames(parameters, first, last, (len(data) - start) // width if width else 0)
     if not points or frames <= 0:
         raise _Damaged(f"expected points, the C3D file holds {points} points in {frames} frames")
-    if start < _BLOCK or not np.isfinite(scale):
+    if start < BLOCK or not np.isfinite(scale):
         raise _Damaged(f"damaged: the header says that the points begin at byte {start}, their scale is {scale}")
     if start + frames * width > len(data):
         raise _Damaged(f"truncated: expected {frames} frames in {start + frames * width} bytes, "

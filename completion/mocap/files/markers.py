@@ -12,7 +12,7 @@ from scanprep.geometry import storage
 from scanprep.geometry.format_common import FARTHEST, UNITS
 
 from .c3d import read_c3d, write_c3d
-from .text import MarkerFileError, RawMarkers, encode_csv, read_csv, read_trc
+from .text import MarkerFileError, RawMarkers, encode_csv, encode_trc, read_csv, read_trc
 
 READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_csv}
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
@@ -171,19 +171,20 @@ def _of_subject(path: Path, labels: tuple[str, ...], subject: str | None) -> tup
 
 
 def write_markers(path: str | Path, sequence: MarkerSequence) -> None:
-    """Write a sequence, whole or not at all: `.csv` in metres, or `.c3d` in millimetres, single precision.
+    """Write a sequence, whole or not at all: `.csv` in metres, `.trc` or, single precision, `.c3d` in millimetres.
 
     Raises
     ------
     MarkerFileError
-        A name that ends in neither.
+        A name that ends in none of these.
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in (".csv", ".c3d"):
-        raise MarkerFileError(f"{path}: expected a name ending in .csv or .c3d, found '{path.suffix}'")
+    if suffix not in READERS:
+        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(READERS)}, found '{path.suffix}'")
+    told = sequence.positions, sequence.labels, sequence.rate
     with storage.writing(path) as beside:
-        if suffix == ".csv":
-            beside.write_bytes(encode_csv(sequence.positions, sequence.labels, sequence.rate))
+        if suffix == ".c3d":
+            write_c3d(beside, *told)
         else:
-            write_c3d(beside, sequence.positions, sequence.labels, sequence.rate)
+            beside.write_bytes(encode_csv(*told) if suffix == ".csv" else encode_trc(*told, path.name))

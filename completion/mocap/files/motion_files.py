@@ -1,19 +1,28 @@
 """Files of a motion: tables of joint angles, joint centres and residuals, BVH and GLB."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from model.export.bvh import write_bvh
+from model.export.conventions import aimed
+from model.export.correctives import body_correctives, motion_correctives, off_exact
+from model.export.glb import write_skinned_glb
+from model.export.rig import subject_rig
 from model.linear import Subject
+from scanprep.console import Metric
 from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
+from .markers import MarkerSequence
+from .opensim import write_opensim
 
-KEYS = 120                           # most key frames in a GLB
+KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
+MEASURED = 40                        # frames in which it is compared with the exact bodies
 
 
 def joint_angles(motion: Motion) -> np.ndarray:
@@ -36,16 +45,21 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     return subject.operator.joints(subject.joint_regressor).astype(np.float64).evaluate(motion.poses, motion.trans)
 
 
-def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
-    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and residuals.csv; times are in seconds."""
-    names, T = subject.skeleton.names, len(motion.poses)
+def write_motion(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None) -> None:
+    """motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; seconds.
+
+    `markers`, of as many frames, go into the TRC.
+    """
+    names, T, centres = subject.skeleton.names, len(motion.poses), joint_centres(motion, subject)
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_table(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
                 np.c_[motion.times, joint_angles(motion).reshape(T, -1)])
     write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, joint_centres(motion, subject).reshape(T, -1)])
-    write_residuals(folder / "residuals.csv", motion)
+                np.c_[motion.times, centres.reshape(T, -1)])
+    write_opensim(folder, motion, subject, centres, markers)
+    if motion.labels:
+        write_residuals(folder / "residuals.csv", motion)
 
 
 def write_residuals(path: Path, motion: Motion) -> None:
@@ -63,18 +77,25 @@ def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
               body=subject.template.with_vertices(rest))
 
 
-def write_glb(path: Path, motion: Motion, subject: Subject, vertices: np.ndarray | None = None,
-              colors: np.ndarray | None = None, keys: int = KEYS) -> None:
-    """An animated GLB that lasts as long as the motion, of at most so many key frames.
+def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np.ndarray], np.ndarray] | None = None,
+              colors: np.ndarray | None = None) -> list[Metric]:
+    """An animated GLB: the subject on its skeleton in every frame, with the correctives that skinning needs.
 
-    `vertices` (n, N, 3), metres, are of the key frames, where the body changes; else it is the subject's.
+    `bodies` tells the vertices (n, N, 3), metres, of frames (n,) where the body changes or is smoothed: at most `KEYS`
+    of them are asked for; `colors` (N, 3) are of the vertices. Returned is how far the file is from the exact bodies.
     """
-    from scanprep.pictures.gltf import write_animated_glb
-
-    chosen, mesh = spread_frames(len(motion.poses), keys), subject.template
-    rate = motion.rate * max(len(chosen) - 1, 1) / max(len(motion.poses) - 1, 1)
-    write_animated_glb(path, mesh.faces, motion.vertices(subject, chosen) if vertices is None else vertices, rate,
-                       colors, upright(mesh)[0], keys)
+    rig, T = subject_rig(subject), len(motion.poses)
+    if bodies is None:
+        extra = motion_correctives(rig, subject, motion.poses)
+    else:
+        extra = body_correctives(rig, motion.poses, motion.trans, bodies, spread_frames(T, KEYS))
+    rig = replace(rig, mesh=replace(rig.mesh, colors=colors), correctives=extra)
+    up, measured = upright(subject.template)[0], spread_frames(T, MEASURED)
+    exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
+    off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
+    write_skinned_glb(path, aimed(rig, up), motion.poses, motion.trans, motion.rate, up)
+    return [Metric(f"{path.name}, distance from the exact body, mean", float(off.mean()), "mm"),
+            Metric("the same, largest", float(off.max()), "mm")]
 
 
 def write_table(path: Path, columns: list[str], rows: np.ndarray) -> None:

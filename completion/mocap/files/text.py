@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +60,25 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
             cells += [""] * (width - len(cells))         # or too few of them where the last markers are missing
         place[:] = _numbers(path, number, cells, width)
     return RawMarkers(table[:, 2:].reshape(frames, count, 3), labels, rate, said.get("Units", "mm").lower())
+
+
+def encode_trc(positions: np.ndarray, labels: Sequence[str], rate: float, name: str) -> bytes:
+    """Positions (T, L, 3), metres, as a TRC file of this name, in millimetres, as OpenSim reads it.
+
+    A missing marker has empty cells; a label has `_` for blanks, which separate there. Lines of numbers end in a tab:
+    OpenSim counts an empty last cell only if there is one behind it.
+    """
+    spelled = [re.sub(r"\s+", "_", label.strip()) or f"marker{i + 1}" for i, label in enumerate(labels)]
+    T, L = positions.shape[:2]
+    lines = [f"PathFileType\t4\t(X/Y/Z)\t{name}",
+             "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+             f"{rate:.9g}\t{rate:.9g}\t{T}\t{L}\tmm\t{rate:.9g}\t1\t{T}",
+             "Frame#\tTime\t" + "\t\t\t".join(spelled) + "\t\t",
+             "\t\t" + "\t".join(f"{axis}{i + 1}" for i in range(L) for axis in "XYZ"), ""]
+    for t, frame in enumerate((1000 * positions).reshape(T, -1).tolist()):
+        cells = ("" if np.isnan(value) else f"{value:.5f}" for value in frame)
+        lines.append(f"{t + 1}\t{t / rate:.9g}\t" + "\t".join(cells) + "\t")
+    return ("\n".join(lines) + "\n").encode()
 
 
 def read_csv(path: Path, data: bytes) -> RawMarkers:

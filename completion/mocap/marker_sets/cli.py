@@ -1,6 +1,8 @@
 """`scape layout`: which marker sets there are, what they look like, and on other bodies."""
 from __future__ import annotations
 
+import contextlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +12,9 @@ import tyro
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome, bar, say
+from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.landmark_writing import marker_set
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
@@ -19,6 +23,7 @@ from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model
 from .layout import MarkerLayout
 from .named import layout_summaries, read_layout
+from .opensim import opensim_markers
 from .symmetry import label_pairs
 
 LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
@@ -54,7 +59,8 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
 
     Example: scape layout show vicon47 -m model.npz -o markers
 
-    Written are layout.png, report.html and layout.json (for --layout of other commands).
+    Written are layout.png, report.html and layout.json (for --layout of other commands); of a person with a skeleton
+    markerset.xml, where each marker sits on the bodies of OpenSim, to begin with in its scale tool.
 
     Args:
         layout: One of `scape layout list`, or a file.
@@ -77,6 +83,9 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     output.mkdir(parents=True, exist_ok=True)
     save_png(output / "layout.png", picture)
     found.save(output / "layout.json")
+    if skeleton is not None:
+        with contextlib.suppress(ValueError):                       # no person's parts
+            storage.write(output / "markerset.xml", marker_set(opensim_markers(found, shown, skeleton)))
     layout_page(layout, shown, found, picture, {m.name: f"{m.text()} {m.unit}" for m in figures}, skeleton
                 ).write(output / "report.html")
     return Outcome(output, [Metric("body", name), *figures], {"layout": layout})
@@ -139,7 +148,9 @@ def _body(model: Path | None, body: Path | None, unit: Unit | None
         return read_mesh(body, unit), None, None, str(body)
     loaded, name = read_model(model)
     kept = loaded.info.get("people_vertices")
-    return at_rest(loaded), loaded.skeleton, None if kept is None else np.array(kept), name
+    rest = at_rest(loaded)
+    skeleton = replace(loaded.skeleton, joints=loaded.skeleton.joint_regressor(loaded.template) @ rest.vertices)
+    return rest, skeleton, None if kept is None else np.array(kept), name
 
 
 def _figures(layout: MarkerLayout, body: Mesh) -> list[Metric]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,11 @@ from ...motion import spread_frames
 from ...motion_pictures import picture_bodies
 from ..artefacts.results import MarkerArtefacts, artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import KEYS, write_glb, write_motion, write_residuals
+from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
+from ..files.opensim import centre_sequence
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.robust import hardly_believed, markers_told, motion_problem
+from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
@@ -73,7 +75,8 @@ class Work:
             figures[take.name] = _write(self, found, take, room, settings)
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
         problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
-        doubts = (*found.result.worn.doubts(), *hardly_believed([take.motion for take in found.takes]))
+        motions = [take.motion for take in found.takes]
+        doubts = (*found.result.worn.doubts(), *hardly_seen(motions), *hardly_believed(motions))
         metrics = [judgement_row(Judgement.of(problems, doubts)), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
@@ -152,27 +155,29 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
         (folder / take.name).mkdir(exist_ok=True)
         return folder / take.name
 
-    def character(folder: Path) -> tuple[np.ndarray, str]:
+    def character(folder: Path) -> tuple[np.ndarray, str, list[Metric]]:
         assert work.character is not None, "asked for"
         return _character(work.character, take, place(folder), factor)
 
     def page(folder: Path) -> None:
         start = time.perf_counter()
         page = take_page(take, metrics)
-        if shown is not None:
+        if shown:
             page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, take_picture(take))
-        doubts = (*found.result.worn.doubts(), *hardly_believed([take.motion]))
+        doubts = (*found.result.worn.doubts(), *hardly_seen([take.motion]), *hardly_believed([take.motion]))
         judgement = Judgement.of(found.problem(take), doubts)
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    room.files(f"{take.name} files", (solved, take.source.path, take.source.who, take.unit, factor),
+    metrics += room.files(f"{take.name} files", (solved, take.source.path, take.source.who, take.unit, factor),
                lambda folder: write_take(place(folder), take, factor))
-    shown: tuple[np.ndarray, str] | None = None if work.character is None else room.files(
-        f"{take.name} character", (solved, work.character, factor), character)
+    shown: list[Any] = []
+    if work.character is not None:
+        *shown, told = room.files(f"{take.name} character", (solved, work.character, factor), character)
+        metrics += told
     room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
     return metrics
 
@@ -189,21 +194,26 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
     result.layout.save(folder / "layout.json")
 
 
-def write_take(folder: Path, take: Take, factor: float = 1.0) -> None:
-    """All files of a sequence but its page; exaggerated.glb where the factor on the change of shape is not 1."""
+def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
+    """All files of a sequence but its page; exaggerated.glb where the factor on the change of shape is not 1.
+
+    Returned is how far the GLB files are from the exact bodies.
+    """
     motion, body, soft = take.motion, take.subject, take.soft
-    write_motion(folder, motion, body)
-    shown = spread_frames(len(motion.poses), KEYS)
-    write_glb(folder / "animation.glb", motion, body, None if soft is None else take.bodies(shown))
+    write_motion(folder, motion, body, take.artefacts.virtual())
+    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
-            write_glb(folder / "exaggerated.glb", soft.motion, body, soft.vertices(take.model, shown, factor))
+            told += write_glb(folder / "exaggerated.glb", soft.motion, body,
+                              partial(soft.vertices, take.model, factor=factor))
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
-                  take.source.who, take.unit)
+                  take.source.who, take.unit,
+                  centre_sequence(joint_centres(motion, body), body.skeleton, motion.rate))
     _write_artefacts(folder, take.artefacts)
+    return told
 
 
 def _write_artefacts(folder: Path, found: MarkerArtefacts) -> None:
@@ -216,20 +226,21 @@ def _write_artefacts(folder: Path, found: MarkerArtefacts) -> None:
                        sorted(rows, key=lambda row: (row[2], row[1])))
 
 
-def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str]:
-    """The motion on a character: character.npz, character.glb; a picture, and what it shows."""
+def _character(character: BodyModel, take: Take, folder: Path, factor: float
+               ) -> tuple[np.ndarray, str, list[Metric]]:
+    """The motion on a character: character.npz, character.glb; a picture, what it shows, how exact the GLB is."""
     if take.soft is not None:
         moving = retarget_soft_tissue(take.soft, take.model, character, factor)
         moving.save(folder / "character.npz")
-        write_character(folder / "character.glb", character, moving, KEYS)
+        told = write_character(folder / "character.glb", character, moving)[1]
         return (picture_transfer(take.model, take.soft, character, moving),
-                "the person, the character, and how far the character's skin is stretched or squeezed")
+                "the person, the character, and how far the character's skin is stretched or squeezed", told)
     body = character.subject(np.zeros(character.n_betas))
     motion = retarget(take.motion, take.subject, body)
     motion.save(folder / "character.npz")
-    write_glb(folder / "character.glb", motion, body)
+    told = write_glb(folder / "character.glb", motion, body)
     frames = spread_frames(len(motion.poses), 8)
-    return picture_bodies(motion, body, motion.vertices(body, frames), frames), ""
+    return picture_bodies(motion, body, motion.vertices(body, frames), frames), "", told
 
 
 def _person_metrics(found: _Found) -> list[Metric]:

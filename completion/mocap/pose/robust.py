@@ -132,6 +132,14 @@ def hardly_believed(motions: Sequence[Motion]) -> tuple[str, ...]:
             ) if out else ()
 
 
+def hardly_seen(motions: Sequence[Motion]) -> tuple[str, ...]:
+    """A reason to look at motions: most of their frames show too few markers to place a body."""
+    few = sum(int((np.isfinite(motion.residuals).sum(axis=1) < 3).sum()) for motion in motions)
+    frames = sum(len(motion.residuals) for motion in motions)
+    return (f"{few} of {frames} frames show fewer than 3 markers: the body there is carried over from the others",
+            ) if few > frames / 2 else ()
+
+
 def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
     """Why a motion from markers of a layout means nothing, and the likely cause; `body` is the model's template."""
     seen = np.isfinite(motion.residuals)

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import harmonic
 from scanprep.pictures.colors import color_bar, heat
@@ -19,7 +20,7 @@ from scanprep.skeleton.tree import Skeleton
 from ...bodies import at_rest
 from ...motion import spread_frames
 from ...motion_pictures import bodies_in_a_row, seconds
-from ..files.motion_files import write_glb
+from ..files.motion_files import KEYS, write_glb
 from ..soft_tissue.soft_tissue import SoftTissue
 from .retarget import AT_ONCE, retarget, world_up
 
@@ -150,14 +151,19 @@ def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, m
     return side_by_side([sheet, bar], columns=1)
 
 
-def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: int = 60) -> np.ndarray:
-    """Write an animated GLB of soft tissue on its character, coloured by the most that its skin is deformed (N,)."""
-    frames = spread_frames(len(soft.motion.poses), keys)
-    fixed, changed = moving_character(character, soft, frames)
-    most = np.asarray(deformation(character.template.faces, fixed, changed).max(axis=0))
-    changed = Creases(at_rest(character), character.skeleton).smoothed(changed, soft.motion.poses[frames])
-    write_glb(path, soft.motion, character.subject(soft.motion.betas), changed, heat(most, 0.0, FULL), keys)
-    return most
+def write_character(path: Path, character: BodyModel, soft: SoftTissue) -> tuple[np.ndarray, list[Metric]]:
+    """Write an animated GLB of soft tissue on its character, coloured by the most that its skin is deformed (N,).
+
+    Returned are these and how far the file is from the exact bodies.
+    """
+    frames = spread_frames(len(soft.motion.poses), KEYS)
+    most = np.asarray(deformation(character.template.faces, *moving_character(character, soft, frames)).max(axis=0))
+    creases = Creases(at_rest(character), character.skeleton)
+
+    def bodies(some: np.ndarray) -> np.ndarray:
+        return creases.smoothed(moving_character(character, soft, some)[1], soft.motion.poses[some])
+
+    return most, write_glb(path, soft.motion, character.subject(soft.motion.betas), bodies, heat(most, 0.0, FULL))
 
 
 REACH = (1, 2, 2, 3, 3, 4)           # rings around inverted triangles that are laid anew, one round each

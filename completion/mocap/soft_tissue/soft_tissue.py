@@ -105,9 +105,9 @@ class SoftTissue:
         self.motion.save(path, **{CHANGES: self.changes})
 
     @staticmethod
-    def is_in(path: str | Path) -> bool:
+    def is_in(path: Path) -> bool:
         """Whether a motion file holds changes of shape."""
-        return CHANGES in storage.load_arrays(path, "a motion")
+        return path.suffix != ".bvh" and CHANGES in storage.names_in(path, "a motion")
 
     @staticmethod
     def load(path: str | Path) -> SoftTissue:

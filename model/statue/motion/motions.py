@@ -13,59 +13,66 @@ from scanprep.correspondence.correlated import find_correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, writing
+from scanprep.geometry.storage import StorageError, taking_apart, writing
 from scanprep.geometry.surface import OrientedPoints, Surface
 from scanprep.registration.nonrigid import Registration, register, registration_problem
 from scanprep.skeleton.tree import Skeleton
 
 from ...body import BodyModel
-from ...export.bvh_read import BvhMotion, read_bvh
 from ...export.rig import check_motion, joint_places
 from ...fitting import fit_shape
 from ...linear import Subject
+from ...motion.amass import moving_body
+from ...motion.bvh import read_bvh
+from ...motion.files import read_motion_file
+from ...motion.moving import MovingSkeleton
+from ...motion.retarget import Pairing, Retargeted, retargeted
+from ...motion.same import copied
 from ..control.model import ControlModel, Statue
 from ..detail.reconstruction import Reconstruction
 from ..detail.subdivision import subdivide
-from .retarget import Pairing, StatueMotion, retargeted
 
 
-def read_statue_motion(statue: Statue, path: Path) -> StatueMotion:
-    """A motion for the skeleton of a statue: BVH, or `.npz` of its own parts or of the synthetic people."""
+def read_statue_motion(statue: Statue, path: Path) -> Retargeted:
+    """A motion for the skeleton of a statue: BVH, AMASS, or `.npz` of its own parts or of the synthetic people."""
+    control, people = statue.control, 16
     if path.suffix.lower() == ".bvh":
-        return bvh_motion(statue.control, statue.pose, read_bvh(path, "cm"))     # travel is scaled by the legs
-    stored = load_arrays(path, "a motion (.npz) or BVH")
-    if "poses" not in stored:
-        raise StorageError(f"{path}: expected a motion, it lacks poses")
-    count = stored["poses"].size // max(3 * len(np.atleast_1d(stored["poses"])), 1)
-    own, people = len(statue.control.skeleton.parents), 16
+        return _named(path, bvh_motion, control, statue.pose, read_bvh(path, "cm"))   # travel is scaled by the legs
+    stored = read_motion_file(path)
+    count, own = stored.poses.shape[1], len(control.skeleton.parents)
     if count == own:
-        return own_motion(statue.control, path)
+        return own_motion(control, path)
+    if stored.of_family:
+        return _named(path, bvh_motion, control, statue.pose, moving_body(stored)[0])
     if count != people:
         raise StorageError(f"{path}: expected the {own} parts of the statue or the {people} of the synthetic people, "
                            f"found {count}; for a motion of a learned model name it with --model")
-    rate = stored.get("mocap_frame_rate", stored.get("mocap_framerate", np.array(60.0)))
-    poses = stored["poses"].astype(np.float64).reshape(-1, people, 3)
-    return people_motion(statue.control, statue.pose, poses, stored.get("trans"), float(rate))
+    return people_motion(control, statue.pose, stored.poses, stored.trans, stored.rate)
 
 
-def own_motion(control: ControlModel, path: str | Path) -> StatueMotion:
+def _named(path: Path, make: Callable[..., Retargeted], *given: object) -> Retargeted:
+    """What a function makes; its ValueError names the file."""
+    try:
+        return make(*given)
+    except ValueError as problem:
+        raise StorageError(f"{path}: {problem}") from None
+
+
+def own_motion(control: ControlModel, path: str | Path) -> Retargeted:
     """A motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
 
     In such files trans is the travel of the middle of part 0, as body models place themselves; here that of the root's
     joint, as in a rig. Skinning moves the one a little against the other.
     """
-    stored = load_arrays(path, "a motion (.npz)")
     J, names = len(control.skeleton.parents), control.skeleton.names
+    stored = read_motion_file(path)
     with taking_apart(path, f"a motion of the statue's {J} parts"):
-        T = len(stored["poses"])
-        poses = numbers({"poses": stored["poses"].reshape(T, -1)}, "poses", None, 3 * J).reshape(T, J, 3)
-        rate = stored["mocap_frame_rate" if "mocap_frame_rate" in stored else "mocap_framerate"]
-        poses, trans = check_motion(control.skeleton, poses, numbers(stored, "trans", T, 3), float(rate))
-        return StatueMotion(poses, trans - middle_drift(control, poses), float(rate),
-                            dict(zip(names, names, strict=True)))
+        poses, trans = check_motion(control.skeleton, stored.poses, stored.trans, stored.rate)
+        return Retargeted(poses, trans - middle_drift(control, poses), stored.rate,
+                          dict(zip(names, names, strict=True)))
 
 
-def write_motion(path: str | Path, control: ControlModel, motion: StatueMotion) -> None:
+def write_motion(path: str | Path, control: ControlModel, motion: Retargeted) -> None:
     """Write a motion as `own_motion` reads it, with the array names that body-model files use."""
     arrays = {"poses": motion.poses.reshape(len(motion.poses), -1),
               "trans": motion.trans + middle_drift(control, motion.poses), "betas": np.zeros(0),
@@ -83,7 +90,7 @@ def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
 
 
 def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
-                  rate: float = 60.0, girdle: float = 0.2) -> StatueMotion:
+                  rate: float = 60.0, girdle: float = 0.2) -> Retargeted:
     """A motion of the synthetic people, poses (T, 16, 3) and trans (T, 3) of the average person, for a statue's `pose`.
 
     The generic control model rests as they do, so the rotations of the parts in the world carry over.
@@ -91,12 +98,12 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     skeleton = _average_person()
     poses, trans = check_motion(skeleton, poses, trans, rate)
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
-    moving = BvhMotion(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
+    moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
                        joint_places(skeleton, poses, trans), rate)
-    return retargeted(Pairing(control, pose, moving), True, girdle)
+    return retargeted(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
 
 
-def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion) -> StatueMotion:
+def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> Retargeted:
     """The motion of a BVH file, by the names of its joints and the directions of its bones, for a statue's `pose`.
 
     A part follows the rotation of its joint against the rest of the file, in which somebody stands upright. A trunk of
@@ -105,7 +112,8 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion) -> Statu
     Upwards is the axis of the file that is nearest to the trunk at rest: y, as BVH says, but some programs write z.
     ValueError for names that say too little.
     """
-    return retargeted(Pairing(control, pose, bvh), False)
+    same = copied(control.skeleton, control.mesh, control.rig.vertices, bvh)
+    return same or retargeted(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
 
 
 @lru_cache(maxsize=1)

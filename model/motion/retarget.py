@@ -1,8 +1,12 @@
-"""Retargeting: poses and travel of one skeleton for another, by the names of joints and the directions of bones."""
+"""A motion of one skeleton on another whose rest pose, bones and parts differ: segments point where they pointed.
+
+Every part of ours that has a counterpart takes its rotation, after that which brings our bone to theirs at rest: the
+directions of the limbs are then those of the motion exactly, and so is the twist about them. A trunk of any number of
+joints is brought to as many as we have.
+"""
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,107 +14,67 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import rotations
+from scanprep.skeleton.tree import Skeleton
 
-from ...export.bvh_read import BvhMotion
-from ...export.rig import check_motion
-from ..control.model import ControlModel
+from ..export.rig import check_motion, joint_places
+from .moving import MovingSkeleton
+from .roles import NEEDED, above, numbered_roles, trunk, way
+from .trunks import grouped, heights, nearest_starts, spread
 
-# What the joints of our parts are called elsewhere, in H-Anim, motion databases and animation programs, in small
-# letters without separators; the first that a skeleton has is taken, and none twice. A knee may be a "leg" (below an
-# "up leg") and a clavicle a "shoulder" (above an "arm"): so the order of the rows matters.
-ROLES = {
-    "humanoid_root": ("sacroiliac", "pelvis", "hips", "humanoidroot", "hip", "root"),
-    "skullbase": ("skullbase", "head", "skull", "neck1", "neck"),
-    "vl5": ("vl5", "spine", "spine1", "spine01", "abdomen", "lowerback", "waist", "torso", "chest", "back")}
-SIDED_ROLES = {
-    "shoulder": ("upperarm", "uparm", "humerus", "arm", "shldr", "shoulder"),
-    "sternoclavicular": ("sternoclavicular", "clavicle", "collar", "collarbone", "shoulder"),
-    "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "radius"),
-    "wrist": ("wrist", "radiocarpal", "hand"),
-    "knee": ("knee", "lowerleg", "lowleg", "shin", "shank", "calf", "tibia", "leg"),
-    "hip": ("upleg", "thigh", "upperleg", "femur", "hip", "leg", "hipjoint"),
-    "ankle": ("ankle", "talocrural", "foot")}
-
-
-def find_roles(names: Sequence[str]) -> dict[str, int]:
-    """The joints that play the parts of the humanoid, {H-Anim name: joint}; case, separators and what stands before a
-    colon do not matter.
-    """
-    plain: dict[str, int] = {}
-    for j, name in enumerate(names):
-        letters = re.sub(r"[^a-z0-9]", "", name.rsplit(":", 1)[-1].lower())
-        letters = re.sub(r"^(mixamorig|bip|jbipc?|def|character)\d*", "", letters)
-        plain.setdefault(re.sub(r"(jnt|bone)$", "", letters), j)
-    forms = dict(ROLES)
-    for word, words in SIDED_ROLES.items():
-        for side, spelt in (("l", ("left", "l")), ("r", ("right", "r"))):
-            forms[f"{side}_{word}"] = tuple(form for each in words for s in spelt for form in (s + each, each + s))
-    out: dict[str, int] = {}
-    for role, words in forms.items():
-        free = [plain[form] for form in words if form in plain and plain[form] not in out.values()]
-        if free:
-            out[role] = free[0]
-    return out
-
-
-def above(parents: np.ndarray, j: int) -> list[int]:
-    """The joint, its parent, and so on up to the root."""
-    chain = [j]
-    while parents[chain[-1]] >= 0:
-        chain.append(int(parents[chain[-1]]))
-    return chain
-
-
-def trunk(parents: np.ndarray, roles: Mapping[str, int]) -> tuple[int, int]:
-    """The lowest joint of the trunk above the pelvis, and the one that carries arms and head; the pelvis for both where
-    the tree has none between.
-    """
-    pelvis = roles["humanoid_root"]
-    chains = [above(parents, roles[role]) for role in ("l_shoulder", "r_shoulder") if role in roles]
-    if len(chains) < 2:
-        lowest = roles.get("vl5", pelvis)
-        return lowest, lowest
-    top = next(j for j in chains[0] if j in chains[1])
-    way = above(parents, top)
-    if pelvis not in way or top == pelvis:
-        lowest = roles.get("vl5", top)
-        return (lowest, top) if lowest in way else (top, top)
-    return way[way.index(pelvis) - 1], top
+Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres
+AT_ONCE = 200                        # frames whose meshes are held at a time
 
 
 @dataclass(frozen=True, eq=False)
-class StatueMotion:
-    """A motion of a statue, by the conventions of the body models."""
+class Retargeted:
+    """A motion that was brought onto a body, by the conventions of the body models."""
 
-    poses: np.ndarray                # (T, J, 3) radians, against the default pose, which is that of the scan
+    poses: np.ndarray                # (T, J, 3) radians, against the body at rest
     trans: np.ndarray                # (T, 3) metres, travel of the root's joint
     rate: float                      # frames a second
-    matched: dict[str, str]          # {part of the statue: joint that it follows}
+    matched: dict[str, str]          # {part of the body: joint that it follows}
     lacking: tuple[str, ...] = ()    # parts that go with the one above them: the motion has no such joint
+    scale: float = 1.0               # of the travel: how much longer our legs are
 
 
 class Pairing:
-    """A statue and a skeleton that moves, both at rest: `P` (J, 3, 3) is how the generic model's parts were rotated to
-    the pose of the scan, `joints` (J, 3) those of the statue in the generic default pose, `ours` and `theirs` the parts
-    and joints by their H-Anim names.
+    """A body and a skeleton that moves, both at rest.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+        With the joints of the body.
+    vertices : Vertices
+        The body's surface in some poses.
+    moving : MovingSkeleton
+    pose : (J, 3) float, radians, optional
+        Of a statue: how the generic model's parts were rotated to the pose of the scan, which is its rest.
+
+    Attributes
+    ----------
+    P : (J, 3, 3) float
+        The rotations of that pose.
+    joints : (J, 3) float, metres
+        Those of the body with that pose undone.
+    ours, theirs : dict
+        Parts and joints by their H-Anim names.
     """
 
-    def __init__(self, control: ControlModel, pose: np.ndarray, moving: BvhMotion) -> None:
-        self.control, self.moving = control, moving
-        skeleton = control.skeleton
-        self.P = skeleton.part_rotations(check_motion(skeleton, np.asarray(pose)[None], None, 1.0)[0][0])
+    def __init__(self, skeleton: Skeleton, vertices: Vertices, moving: MovingSkeleton, pose: np.ndarray | None = None
+                 ) -> None:
+        self.skeleton, self.vertices, self.moving = skeleton, vertices, moving
+        pose = np.zeros(skeleton.joints.shape) if pose is None else np.asarray(pose)
+        self.P = skeleton.part_rotations(check_motion(skeleton, pose[None], None, 1.0)[0][0])
         self.joints = skeleton.joints.copy()
         for j, p in enumerate(skeleton.parents[1:], start=1):
             self.joints[j] = self.joints[p] + self.P[p].T @ (skeleton.joints[j] - skeleton.joints[p])
-        self.ours = find_roles(skeleton.names)
-        self.theirs = find_roles(moving.names)
-        wanted = ("humanoid_root", "l_hip", "r_hip", "l_shoulder", "r_shoulder")
-        for what, found, all_names in (("control model", self.ours, skeleton.names),
-                                       ("motion", self.theirs, moving.names)):
-            missing = [role for role in wanted if role not in found]
+        self.ours = numbered_roles(skeleton.names, skeleton.joints)
+        self.theirs = numbered_roles(moving.names, moving.rest)
+        for what, found, names in (("body", self.ours, skeleton.names), ("motion", self.theirs, moving.names)):
+            missing = [role for role in NEEDED if role not in found]
             if missing:
                 raise ValueError(f"{what}: expected joints named like {', '.join(missing)}, found only "
-                                 f"{', '.join(all_names)}")
+                                 f"{', '.join(names)}"[:400])
         self.axes = _axes(self.joints, self.ours)
         feet = [skeleton.joints[self.ours[r]] for r in ("l_ankle", "r_ankle", "l_hip", "r_hip") if r in self.ours]
         high = skeleton.joints[self.ours.get("skullbase", self.ours["l_shoulder"])] - np.mean(feet[:2], axis=0)
@@ -122,9 +86,8 @@ class Pairing:
         The smallest rotation that brings our bone to theirs, after that of the part above. Feet stand flat, but where
         the legs are far apart at rest (as in the CMU files) they are taken to be square to the shanks from the front.
         """
-        J = len(self.control.skeleton.parents)
         whole = self.whole(aligned)
-        A = dict.fromkeys(range(J), whole)
+        A = dict.fromkeys(range(len(self.joints)), whole)
         for side in "lr" if not aligned else "":
             for chain in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
                 roles = [f"{side}_{name}" for name in chain]
@@ -143,17 +106,42 @@ class Pairing:
                     aside = np.arctan2(left, down)
                     if abs(aside) > np.radians(10):
                         A[self.ours[roles[2]]] = rotations.exp(aside * self.standing(False)[:, 2]) @ whole
+        for j, p in enumerate(self.skeleton.parents.tolist()):
+            if p >= 0 and j not in self.ours.values():
+                A[j] = A[p]                                             # fingers, toes, a second piece of a thigh
         return A
 
-    def trunk(self) -> np.ndarray:
-        """(T, 3, 3) of the one joint that stands for the trunk of the motion."""
-        moving, theirs = self.moving, self.theirs
-        low, top = trunk(moving.parents, theirs)
-        rest, R, y = moving.rest, moving.rotations, moving.places
-        roles = [role for role in ("l_shoulder", "r_shoulder", "skullbase") if role in theirs]
-        points = rest[[theirs[role] for role in roles]]
-        there = np.einsum("tab,kb->tka", R[:, top], points - rest[top]) + (y[:, top] - y[:, low])[:, None]
-        return rotations.project(np.einsum("tka,kb->tab", there, points - rest[low]))
+    def middle(self) -> tuple[list[int], list[int]]:
+        """Our parts from the pelvis to the one that carries the arms, and from there to the head, all with ends."""
+        parents, ours = self.skeleton.parents, self.ours
+        arms = [way(parents, ours["humanoid_root"], ours[f"{side}_shoulder"]) for side in "lr"]
+        carrier = [part for part in arms[0] if part in arms[1]][-1]
+        head = ours.get("skullbase", carrier)
+        return way(parents, ours["humanoid_root"], carrier), way(parents, carrier, head)
+
+    def trunk(self) -> tuple[dict[int, np.ndarray], dict[int, str]]:
+        """The rotation (T, 3, 3) of each of our parts between pelvis and head, without both, and what it follows."""
+        moving, R = self.moving, self.moving.rotations
+        below, beyond = self.middle()
+        parts, low, top = below[1:], *trunk(moving.parents, self.theirs)
+        pelvis = self.theirs["humanoid_root"]
+        joints = way(moving.parents, low, top)
+        if pelvis not in above(moving.parents, top) and "vl5" in self.theirs:      # a tree that hangs on the chest
+            joints = way(moving.parents, pelvis, top)[1:]
+        necks = way(moving.parents, top, self.theirs.get("skullbase", top))
+        if len(joints) < len(parts):
+            out, told = spread(moving, [pelvis, *joints] if joints[0] != pelvis else joints, parts)
+        elif parts:
+            links = [b if self.skeleton.parents[b] == a else a for a, b in pairwise(below)]
+            starts = nearest_starts(heights(self.joints, links, self.ours), heights(moving.rest, joints, self.theirs))
+            carried = [self.theirs[role] for role in ("l_shoulder", "r_shoulder", "skullbase") if role in self.theirs]
+            out, told = grouped(moving, joints, starts, parts, carried)
+        else:
+            out, told = {}, {}
+        more = spread(moving, necks, beyond[1:])
+        for part in beyond[1:-1]:
+            out[part], told[part] = more[0][part], more[1][part]
+        return {part: np.broadcast_to(M, R[:, 0].shape) for part, M in out.items()}, told
 
     def world(self, aligned: bool) -> np.ndarray:
         """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards at
@@ -174,25 +162,29 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retargeted(pair: Pairing, aligned: bool, girdle: float = 0.2) -> StatueMotion:
-    """The motion of the pair's skeleton on its statue; `aligned`: the generic model rests as that skeleton does.
+def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
+    """The motion of the pair's skeleton on its body; `aligned`: the body rests as that skeleton does.
 
     Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' angle above the level.
+    Travel is scaled as the legs are, about the origin of the file; `here`: it begins where the body stands at rest.
     """
-    moving, skeleton = pair.moving, pair.control.skeleton
+    moving, skeleton = pair.moving, pair.skeleton
     A = pair.alignment(aligned)
     role_of = {part: role for role, part in pair.ours.items()}
-    M = np.empty((len(moving.places), len(skeleton.parents), 3, 3))     # from the generic model's axes to the world
+    between, told = pair.trunk()
+    M = np.empty((len(moving.places), len(skeleton.parents), 3, 3))     # from the body's own axes to the world
     lacking, matched = [], {}
     for j, name in enumerate(skeleton.names):
         role = role_of.get(j, "")
-        if role == "vl5":
-            low, top = trunk(moving.parents, pair.theirs)
-            M[:, j] = pair.trunk() @ A[j]
-            matched[name] = moving.names[low] if low == top else f"{moving.names[low]} to {moving.names[top]}"
+        if j in between:
+            M[:, j] = between[j] @ A[j]
+            matched[name] = told[j]
         elif role in pair.theirs:
             M[:, j] = moving.rotations[:, pair.theirs[role]] @ A[j]
             matched[name] = moving.names[pair.theirs[role]]
+        elif name in moving.names:
+            M[:, j] = moving.rotations[:, moving.names.index(name)] @ A[j]
+            matched[name] = name
         else:
             lacking.append(name)
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
@@ -200,7 +192,8 @@ def retargeted(pair: Pairing, aligned: bool, girdle: float = 0.2) -> StatueMotio
     V = pair.world(aligned)
     R = V @ M @ np.swapaxes(pair.P, -1, -2)
     poses = skeleton.pose_of(R)
-    return StatueMotion(poses, _travel(pair, V, R, poses), moving.rate, matched, tuple(lacking))
+    scale = _leg(skeleton.joints, pair.ours, pair.theirs) / _leg(moving.rest, pair.theirs, pair.ours)
+    return Retargeted(poses, _travel(pair, V, poses, scale, here), moving.rate, matched, tuple(lacking), scale)
 
 
 def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
@@ -218,21 +211,24 @@ def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
 
 
-def _travel(pair: Pairing, V: np.ndarray, R: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray, scale: float, here: bool) -> np.ndarray:
     """(T, 3) travel of the root's joint, with the middle between the hips where that of the motion is, scaled."""
-    control, up = pair.control, pair.up
-    joints = control.skeleton.joints
+    skeleton, joints = pair.skeleton, pair.skeleton.joints
     ours = [pair.ours["l_hip"], pair.ours["r_hip"]]
     theirs = [pair.theirs["l_hip"], pair.theirs["r_hip"]]
-    middle = joints[ours].mean(axis=0)
-    scale = _leg(joints, pair.ours, pair.theirs) / _leg(pair.moving.rest, pair.theirs, pair.ours)
     place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
-    place = place - place[0] + middle
-    trans = place + R[:, 0] @ (joints[0] - middle) - joints[0]
-    lowest = np.concatenate([(control.rig.vertices(poses[k:k + 200], trans[k:k + 200]) @ up).min(axis=1)
-                             for k in range(0, len(poses), 200)])
-    # percentile: some frames may err
-    return trans + ((control.mesh.vertices @ up).min() - np.percentile(lowest, 5)) * up
+    if here:
+        place = place - place[0] + joints[ours].mean(axis=0)
+    trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)
+    return trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
+
+
+def lift(vertices: Vertices, poses: np.ndarray, trans: np.ndarray, up: np.ndarray) -> float:
+    """How far a motion must rise for its lowest points to be where those of the body at rest are, metres."""
+    still = (vertices(np.zeros((1, *poses.shape[1:])), np.zeros((1, 3))) @ up).min()
+    lowest = np.concatenate([(vertices(poses[k:k + AT_ONCE], trans[k:k + AT_ONCE]) @ up).min(axis=1)
+                             for k in range(0, len(poses), AT_ONCE)])
+    return float(still - np.percentile(lowest, 5))                      # percentile: some frames may err
 
 
 def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]) -> float:

@@ -2,8 +2,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,36 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from scanprep.geometry.storage import LARGEST, LARGEST_TEXT, StorageError, read_bytes
 
-from .bvh import UNITS
+from ..export.bvh import UNITS
+from .moving import MovingSkeleton
 
 _DEEPEST = 500                       # joints below each other: more is no skeleton
 
 
-@dataclass(frozen=True, eq=False)
-class BvhMotion:
-    """A skeleton and its motion, in the axes of the file, which has y up."""
-
-    names: tuple[str, ...]           # of the J joints in the order of the file, parent before child
-    parents: np.ndarray              # (J,) int, -1 at the root
-    offsets: np.ndarray              # (J, 3) metres, each joint from its parent at rest, where no joint is turned
-    ends: dict[int, np.ndarray]      # End Sites by number of their joint: (3,) metres from it, at rest
-    rotations: np.ndarray            # (T, J, 3, 3) of every joint in the world: `R_j = R_parent(j) R`
-    places: np.ndarray               # (T, J, 3) metres, of every joint in the world
-    rate: float                      # frames a second
-
-    def __repr__(self) -> str:
-        return f"BvhMotion({len(self.names)} joints, {len(self.places)} frames at {self.rate:g} 1/s)"
-
-    @cached_property
-    def rest(self) -> np.ndarray:
-        """(J, 3) float, metres: the joints where no joint is turned, the root at its offset."""
-        out = self.offsets.copy()
-        for j in range(1, len(out)):
-            out[j] += out[self.parents[j]]
-        return out
-
-
-def read_bvh(path: str | Path, unit: str) -> BvhMotion:
+def read_bvh(path: str | Path, unit: str) -> MovingSkeleton:
     """Read a BVH file.
 
     Turns are taken in the order of the channels, each about axes that turn with the part. Position channels of the
@@ -72,7 +47,7 @@ def read_bvh(path: str | Path, unit: str) -> BvhMotion:
     table, rate = _read_motion(words, joints)
     R, places = _posed(joints, table, metre)
     names, parents, offsets, _ = zip(*joints, strict=True)
-    return BvhMotion(names, np.array(parents), metre * np.array(offsets),
+    return MovingSkeleton(names, np.array(parents), metre * np.array(offsets),
                      {j: metre * np.array(end) for j, end in ends.items()}, R, places, rate)
 
 

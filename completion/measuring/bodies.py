@@ -1,0 +1,157 @@
+"""Bodies that files hold: registered, completed, or as betas of a model."""
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from model.body import BodyModel
+from model.measurement.tapes import Tapes
+from model.posing.cli import read_subject
+from scanprep.cli import Unit
+from scanprep.dataset import RegisteredSet
+from scanprep.geometry.files import list_meshes, read_mesh
+from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
+from scanprep.geometry.mesh import Mesh
+
+from ..partial.completion import load_completion
+from ..viewing.kinds import reported_model
+
+COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"      # files that tell what a folder is
+
+LEAN, RAISED = 25.0, 75.0            # degrees of a shin, and of an arm, from hanging, on somebody who stands
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One body to be measured.
+
+    `betas`: it is that of a model in the pose of its template. `path` is where it comes from, for landmarks and
+    messages; `expected_error` (N,), metres.
+    """
+
+    name: str
+    mesh: Mesh
+    path: Path
+    betas: bool = False
+    expected_error: np.ndarray | None = None
+
+
+def read_bodies(paths: Sequence[Path], model: BodyModel | None, unit: Unit | None) -> list[Body]:
+    """All bodies of files and folders, in the triangles of one template.
+
+    Raises
+    ------
+    ValueError
+        None, betas without a model, or other triangles.
+    """
+    found = [body for path in paths for body in _bodies(path, model, unit)]
+    if not found:
+        raise ValueError("BODY: expected at least one body, found none")
+    first = found[0].mesh if model is None else model.template
+    whose = found[0].path if model is None else "the model"
+    for body in found:
+        if not np.array_equal(body.mesh.faces, first.faces):
+            raise ValueError(f"{body.path}: expected the triangles of {whose} ({first}), found {body.mesh}; register "
+                             "the template to it first (scape prep register), or measure it in a call of its own")
+    return found
+
+
+def model_of(paths: Sequence[Path]) -> Path | None:
+    """The model that the reports of folders name; None where none does, or it is gone."""
+    for path in paths:
+        folders = [path, *(p.parent for p in sorted(path.glob("*/report.json")))] if path.is_dir() else [path.parent]
+        for folder in folders:
+            name = reported_model(folder / "report.json")
+            if name is not None and name.is_file():
+                return name
+    return None
+
+
+def _bodies(path: Path, model: BodyModel | None, unit: Unit | None) -> Iterator[Body]:
+    """The bodies of one file or folder."""
+    if not path.exists():
+        raise ValueError(f"{path}: there is no such file or folder")
+    if not path.is_dir():
+        yield _of_file(path, model, unit)
+    elif (path / "set.json").exists():
+        whole = RegisteredSet.load(path)
+        for entry in whole.entries:
+            yield Body(entry.name, whole.template.with_vertices(whole.vertices([entry.name])[0]), path)
+    elif (path / COMPLETED).exists():
+        done = load_completion(path)
+        yield Body(path.name, done.completed, path, expected_error=done.expected_error)
+    elif (path / PERSON).exists() or (path / MOTION).exists():
+        known = path / PERSON if (path / PERSON).exists() else path / MOTION
+        yield _of_betas(path.name, known, model)
+    else:
+        inner = sorted({p.parent for name in (COMPLETED, PERSON, MOTION) for p in path.glob(f"*/{name}")})
+        for folder in inner:
+            yield from _bodies(folder, model, unit)
+        for mesh in [] if inner else list_meshes(path):
+            yield _of_file(mesh, model, unit)
+
+
+def _of_file(path: Path, model: BodyModel | None, unit: Unit | None) -> Body:
+    """A mesh, or betas."""
+    if path.suffix.lower() in (".json", ".npz"):
+        return _of_betas(path.name.split(".")[0], path, model)
+    error = None
+    if path.name == "completed.ply" and (path.parent / COMPLETED).exists():
+        error = load_completion(path.parent).expected_error
+    return Body(path.name.split(".")[0], read_mesh(path, unit), path, expected_error=error)
+
+
+def _of_betas(name: str, path: Path, model: BodyModel | None) -> Body:
+    if model is None:
+        raise ValueError(f"{path}: betas need their model; name it with -m")
+    body = read_subject(model, path).vertices(np.zeros((len(model.skeleton.parents), 3)))
+    return Body(name, model.template.with_vertices(body), path, betas=True)
+
+
+def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | None) -> tuple[Mesh, dict[str, int]]:
+    """The template that tapes are found on, and its landmarks.
+
+    The model's, which keeps its own; else that of the set; else the first body. Landmarks are in the file given, or
+    beside, or known by the triangles: those of the synthetic people.
+    """
+    from scanprep.synthetic.landmarks import landmarks
+    from scanprep.synthetic.topology import load
+
+    first = bodies[0] if bodies else None
+    template = model.template if model is not None else _template(first)
+    if given is not None:
+        return template, read_landmark_vertices(given, template)
+    if model is not None and model.info.get("landmarks"):
+        return template, dict(model.info["landmarks"])
+    if first is not None and (beside := _beside(first.path)) is not None:
+        return template, read_landmark_vertices(beside, template)
+    if np.array_equal(template.faces, load().mesh.faces):
+        return template, landmarks()
+    whose = "the model" if model is not None else "" if first is None else str(first.path)
+    raise ValueError(f"{whose}: measuring begins at landmarks of the template, and there are none; name a file of them "
+                     "with --landmarks (scape pick makes one), or a model that keeps them with -m")
+
+
+def check_standing(tapes: Tapes, body: Body) -> None:
+    """Refuse a body as the template of others if its legs bend or its arms are not below the shoulders."""
+    for name, (first, second) in tapes.limbs.items():
+        way = second.at(tapes.template.vertices) - first.at(tapes.template.vertices)
+        angle = float(np.degrees(np.arccos(-way @ tapes.axes[0] / np.linalg.norm(way))))
+        if angle > (LEAN if name.endswith("shin") else RAISED):
+            raise ValueError(f"{body.path}: it is the template of all bodies, as no model is named, and does not stand "
+                             f"upright: the {name} is {angle:.0f} degrees from it; name one that stands first, or the "
+                             "model with -m")
+
+
+def _template(first: Body | None) -> Mesh:
+    assert first is not None
+    return RegisteredSet.load(first.path).template if (first.path / "set.json").exists() else first.mesh
+
+
+def _beside(path: Path) -> Path | None:
+    if path.is_dir():
+        return path / "landmarks.json" if (path / "landmarks.json").exists() else None
+    return landmarks_beside(path)

@@ -1,0 +1,188 @@
+"""The command `scape measure`."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from model.body import BodyModel
+from model.files import load_model
+from model.measurement.catalogue import CATALOGUE
+from model.measurement.find import find_tapes
+from model.measurement.measure import Measurements, measure, stands
+from model.measurement.tapes import Tapes
+from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
+from model.posing.transfer import own_body
+from scanprep.cli import MM, Output, Unit
+from scanprep.console import Metric, Outcome, bar, say
+from scanprep.geometry.files import write_mesh
+from scanprep.geometry.storage import write_json
+from scanprep.geometry.tables import write_table
+from scanprep.judgement import Judgement
+
+from ..cli import ModelOrNone, read_model
+from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
+from .page import measures_page
+
+BodiesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[BODY ...]")]
+TOLD = 3                             # reasons of each kind that a judgement names
+
+
+def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone = None,
+                   landmarks: Path | None = None, unit: Unit | None = None, to: tuple[str, ...] = ()) -> Outcome:
+    """Stature, girths, lengths and widths of bodies, or the body that has some.
+
+    Example: scape measure completed -m model.npz -o measures.csv
+
+    Example: scape measure -m model.npz --to stature=1.80 waist=0.85 -o body.ply
+
+    Args:
+        bodies: Meshes in the triangles of one template or model, folders of them, registered sets, folders of scape
+            complete and mosh, or betas of a model (JSON, .npz).
+        output: Table to write (.csv), in metres, one line a body; beside it a page of the same name (.html) with the
+            tapes on the bodies. With --to the mesh of the body; its betas are written beside it, for --subject.
+        model: Model of the bodies, else the one that their report names: who does not stand as its template does is
+            brought into that pose first. Without any the template is that of the set, else the first body.
+        landmarks: Where the landmarks are on the template, else those that the model keeps, or of the file beside the
+            bodies.
+        unit: Unit of meshes.
+        to: Measurements in metres that a body is to have, such as stature=1.80 waist=0.85; the rest is as probable as
+            it can be. Needs a model, or takes that of the synthetic people.
+    """
+    if to:
+        if bodies:
+            raise ValueError("--to makes a body from measurements: expected no BODY with it")
+        return _wanted(to, output, *read_model(model), landmarks)
+    if not bodies:
+        raise ValueError("BODY: expected at least one body to measure, or --to with measurements of one to make")
+    if output.suffix.lower() != ".csv":
+        raise ValueError(f"{output}: expected the name of a table, such as measures.csv")
+    named = model or model_of(bodies)
+    loaded = None if named is None else load_model(named)
+    read = read_bodies(bodies, loaded, unit)
+    tapes = find_tapes(*landmarks_of(landmarks, read, loaded))
+    if loaded is None:
+        check_standing(tapes, read[0])
+    found, stood = _measured(read, loaded, tapes)
+    names = [body.name for body in read]
+    write_measures(output, names, found)
+    measures_page(names, stood, found, tapes).write(output.with_suffix(".html"))
+    return Outcome(output, _figures(names, found), {"model": None if named is None else str(named)},
+                   judgement=judged(names, found))
+
+
+def _measured(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
+              ) -> tuple[list[Measurements], list[np.ndarray]]:
+    """The measurements of bodies, and their vertices (N, 3) as they were measured."""
+    found, stood = list[Measurements](), list[np.ndarray]()
+    with bar("measuring") as progress:
+        for number, body in enumerate(bodies):
+            vertices, axes = _standing(body, model, tapes)
+            stood.append(vertices)
+            found.append(measure(vertices, tapes, axes, body.expected_error))
+            progress(number + 1, len(bodies))
+    return found, stood
+
+
+def _standing(body: Body, model: BodyModel | None, tapes: Tapes) -> tuple[np.ndarray, np.ndarray | None]:
+    """The vertices (N, 3) of a body in the standard pose, with all its detail, and the axes it then has.
+
+    It is as it was, its axes to be found, where it stands so already, or there is no model.
+    """
+    vertices = body.mesh.vertices
+    if body.betas or model is None or stands(vertices, tapes):
+        return vertices, tapes.axes if body.betas else None
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    return own_body(model, vertices).subject.vertices(rest), tapes.axes
+
+
+def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurements]) -> None:
+    """One line a body: its name, measurements in metres, their expected errors, and why some are missing."""
+    columns = list(CATALOGUE)
+
+    def line(name: str, mine: Measurements) -> list[str]:
+        values, errors = mine.values, mine.errors
+        notes = [*mine.turned, *(f"{word}: {why}" for word, why in mine.missing.items())]
+        return [name, *(f"{values[c]:.4f}" if c in values else "" for c in columns),
+                *(f"{errors[c]:.4f}" if c in errors else "" for c in columns), "; ".join(notes)]
+
+    write_table(path, ["body", *columns, *(f"{c}_error" for c in columns), "note"], map(line, names, found))
+
+
+def judged(names: Sequence[str], found: Sequence[Measurements]) -> Judgement:
+    """Whether bodies were measured as people are: in the standard pose, completely, and in the right unit."""
+    absurd, doubts = list[str](), list[str]()
+    for name, mine in zip(names, found, strict=True):
+        out = [word for word, value in mine.values.items()
+               if not 0.7 * CATALOGUE[word].low <= value <= 1.3 * CATALOGUE[word].high]
+        if len(out) > len(mine.values) / 2:
+            absurd.append(f"{name}: no person measures so, {out[0]} {mine.values[out[0]]:.3g} m: the wrong unit "
+                          "(--unit), or other landmarks?")
+        elif out:
+            doubts.append(f"{name}: {out[0]} is {mine.values[out[0]]:.3g} m")
+        doubts += [f"{name}: {turned}; name the model with -m" for turned in mine.turned[:1]]
+        missing = [word for word in mine.missing if word in CATALOGUE]
+        if missing:
+            doubts.append(f"{name}: no {missing[0].replace('_', ' ')}, {mine.missing[missing[0]]}"
+                          + (f", and {len(missing) - 1} others" if len(missing) > 1 else ""))
+    if absurd and len(absurd) == len(names):
+        return Judgement.of(absurd[:TOLD])
+    told = [*absurd, *doubts]
+    more = [f"{len(told) - TOLD} more, see the table"] if len(told) > TOLD else []
+    return Judgement.of(check=[*told[:TOLD], *more])
+
+
+def _figures(names: Sequence[str], found: Sequence[Measurements]) -> list[Metric]:
+    """All measurements of one body, or how many there are of several."""
+    if len(found) > 1:
+        return [Metric("bodies", len(names)),
+                Metric("measurements of all bodies", sum(len(mine.readings) for mine in found)),
+                Metric("left out", sum(len(mine.missing) for mine in found)),
+                Metric("stature, mean", MM * float(np.mean([mine.values["stature"] for mine in found])), "mm")]
+    only = found[0]
+    return [Metric(f"{name.replace('_', ' ')}" + (f" (± {MM * only.errors[name]:.0f})" if name in only.errors else ""),
+                   round(MM * value, 1), "mm") for name, value in only.values.items()]
+
+
+def _wanted(to: Sequence[str], output: Path, model: BodyModel, name: str, landmarks: Path | None) -> Outcome:
+    """The most probable body with some measurements: its mesh, betas and page."""
+    wanted = checked_wanted(read_measurements(to))
+    tapes = find_tapes(*landmarks_of(landmarks, [], model))
+    made = body_with_measurements(model, tapes, wanted)
+    write_mesh(output, model.template.with_vertices(made.vertices))
+    betas = output.with_name(f"{output.stem}.betas.json")
+    write_json(betas, {"betas": made.betas, "measurements": made.reached, "deviations": made.deviations})
+    title = output.stem
+    measures_page([title], [made.vertices], [measure(made.vertices, tapes, tapes.axes)], tapes).write(
+        output.with_suffix(".html"))
+    say(f"note: the betas are in {betas.name}, for --subject")
+    rows = [Metric(f"{word.replace('_', ' ')}, wanted {MM * value:.0f}", round(MM * made.reached[word], 1), "mm")
+            for word, value in made.wanted.items()]
+    rows += [Metric("from the mean person", made.deviations, "sd"),
+             Metric("people as far from the mean in these measurements", 100 * made.rarer, "%")]
+    return Outcome(output, rows, {"model": name}, judgement=_of_wanted(made))
+
+
+def _of_wanted(made: WantedBody) -> Judgement:
+    missed = [f"{name.replace('_', ' ')} is {MM * made.reached[name]:.0f} mm, not {MM * made.wanted[name]:.0f}: the "
+              "measurements contradict each other, or nobody whom the model knows has them" for name in made.missed]
+    rare = [f"fewer than one person in {1 / max(made.rarer, 1e-6):,.0f} is so far from the mean, by what the model "
+            "knows"] if made.rarer < 1e-3 else []
+    return Judgement.of(check=[*missed, *rare])
+
+
+def read_measurements(words: Sequence[str]) -> dict[str, float]:
+    """Metres by name of `name=value` as they are typed; ValueError for anything else."""
+    given = dict[str, float]()
+    for word in words:
+        name, sign, value = word.partition("=")
+        try:
+            given[name] = float(value)
+        except ValueError:
+            sign = ""
+        if not sign or not np.isfinite(given[name]):
+            raise ValueError(f"--to: expected name=metres, such as waist=0.85, got {word}")
+    return given

@@ -1,0 +1,93 @@
+"""The page of measurements: tapes drawn on the bodies, and a table."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.measurement.catalogue import CATALOGUE
+from model.measurement.measure import Measurements
+from model.measurement.tapes import Girth, Height, Tapes
+from scanprep.cli import MM
+from scanprep.pictures.camera import Camera
+from scanprep.pictures.page import Page
+from scanprep.pictures.scene import Pane
+from scanprep.pictures.shading import Bones, Dots, Shape, Solid
+
+SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies that turn on the page, columns of its table; and in one figure
+SKIN, TAPE, WAY, HEIGHT = (0.86, 0.83, 0.79), (0.80, 0.20, 0.16), (0.10, 0.38, 0.66), (0.25, 0.30, 0.38)
+NO_BREAK = "\u00a0"
+THICK = 0.003                        # metres
+TALL, LOW = 560, 420                 # pixels: height of a figure of one or two bodies, and of more
+BESIDE = 0.045                       # metres between the lines of heights
+
+
+def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Sequence[Measurements], tapes: Tapes
+                  ) -> Page:
+    """The page of `scape measure`, of bodies (N, 3) as they were measured."""
+    several = f"{len(names)} bodies" if len(names) > 1 else names[0]
+    page = Page(f"{several}, measured", "Where the tape ran on each body. Metres in the table file, millimetres here.")
+    shown = range(min(SHOWN, len(names)))
+    for first in shown[::BESIDE_EACH_OTHER]:
+        few = shown[first:first + BESIDE_EACH_OTHER]
+        told = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
+                                 "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
+        page.bodies([_pane(names[k], bodies[k], found[k], tapes, len(few) == 1) for k in few], told,
+                    TALL if len(few) < 3 else LOW)
+    if len(names) > SHOWN:
+        page.text(f"The first {SHOWN} of {len(names)} bodies; all are in the table file.")
+    page.table([(_words(both), *(_cell(found[k], both) for k in shown)) for both in _pairs()
+                if any(name in found[k].readings for k in shown for name in both)],
+               ("mm", *(names[k] for k in shown)))
+    notes = [(names[k], line) for k in shown for line in (
+        *found[k].turned, *(f"no {name.replace('_', ' ')}: {why}" for name, why in found[k].missing.items()))]
+    if notes:
+        page.section("To be looked at").table(notes)
+    page.section("How it is measured").text(
+        "Where each tape runs was found once on the template, from its landmarks and its shape, and goes with the "
+        "vertices: the centre of every girth is the centre of the same ring of skin, and its plane is cut anew on each "
+        "body. Trunk, head and thighs are measured level, arms, shins and neck across their own axis. Lengths along "
+        "the skin are exact shortest ways over the same landmarks.\n\n"
+        "± is the error to be expected from what the scan showed of the body, root mean square; it is known of "
+        "completed bodies. It does not tell how far a landmark is from the bone that the standard names.")
+    return page.table([(_words(both), CATALOGUE[both[0]].standard) for both in _pairs()], ("here", "term and standard"))
+
+
+def _pairs() -> list[tuple[str, ...]]:
+    """The measurements, left and right together."""
+    return [(name, name.replace("_left", "_right")) if name.endswith("_left") else (name,) for name in CATALOGUE
+            if not name.endswith("_right")]
+
+
+def _words(both: tuple[str, ...]) -> str:
+    """As a table has it."""
+    return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", NO_BREAK)
+
+
+def _cell(mine: Measurements, both: tuple[str, ...]) -> str:
+    """Millimetres of one measurement, or of left and right."""
+    return " / ".join(f"{MM * mine.values[name]:,.0f}" + (f" ± {MM * mine.errors[name]:.0f}" if name in mine.errors
+                                                          else "") if name in mine.values else "–" for name in both)
+
+
+def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, labelled: bool) -> Pane:
+    """A body with its tapes; the lines of heights stand beside it, with their names where there is room."""
+    mesh = tapes.template.with_vertices(vertices)
+    up, left, ahead = mine.axes
+    girths, ways, heights = ([mine.readings[n].curve for n in mine.readings if kind(n)] for kind in (
+        lambda n: isinstance(tapes.found[n], Girth),
+        lambda n: not isinstance(tapes.found[n], Girth | Height),
+        lambda n: isinstance(tapes.found[n], Height)))
+    side = float((vertices @ left).max()) + BESIDE
+    beside = [curve + (side + k * BESIDE - curve @ left)[:, None] * left for k, curve in enumerate(heights)]
+    shapes: list[Shape] = [Solid(mesh, SKIN, name="body")]
+    for curves, color, what in ((girths, TAPE, "girths"), (ways, WAY, "lengths and widths"),
+                                (beside, HEIGHT, "heights")):
+        if curves:
+            shapes.append(Bones(np.concatenate([c[:-1] for c in curves]), np.concatenate([c[1:] for c in curves]),
+                                color, THICK, name=what))
+    if beside and labelled:
+        words = [n.replace("_", " ") for n in mine.readings if isinstance(tapes.found[n], Height)]
+        shapes.append(Dots(np.array([c[-1] for c in beside]), HEIGHT, 0.008, labels=words))
+    points = np.concatenate([vertices, *beside])
+    return Pane(shapes, Camera.from_side(points, ahead, up), name)

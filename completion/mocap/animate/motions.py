@@ -1,0 +1,115 @@
+"""A motion of another skeleton (BVH, AMASS) on a body, and what is told of it."""
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import Subject
+from model.motion.error import LEAN, MOST, Followed
+from model.motion.files import is_motion as holds_poses
+from model.motion.onto import BodyMotion, read_motion
+from scanprep.batch.room import Room
+from scanprep.cli import MM
+from scanprep.console import Metric, judgement_row
+from scanprep.geometry.storage import StorageError
+from scanprep.judgement import Judgement
+from scanprep.pictures.page import Page
+from scanprep.pictures.shading import Dots
+
+from ...cli import rows
+from ...motion import Motion
+from ...motion_pictures import MARKER, chart_residuals, frame_panes, moving_pane, played, worst_frames
+from ..files.motion_files import write_glb, write_motion, write_residuals
+
+ENDINGS = (".bvh", ".npz")
+MEAN_DISTANCE = "distance of joint centres, mean"
+
+
+def is_motion(path: Path) -> bool:
+    """Whether a file is to be read as a motion, not as markers."""
+    return path.suffix.lower() in ENDINGS
+
+
+def motion_among(path: Path) -> bool:
+    """Whether a file of a folder is a motion; archives of other things may lie there."""
+    try:
+        return path.suffix.lower() == ".bvh" or (is_motion(path) and holds_poses(path))
+    except StorageError:
+        return False
+
+
+def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, room: Room
+          ) -> tuple[list[Metric], Motion, Subject, Page]:
+    """Bring a motion onto a body and write it into the folder of a room; the figures, and the page to be written."""
+    found = read_motion(path, model, subject, unit)
+    body = subject if subject is not None else model.subject(found.betas)
+    motion = Motion.of(found)
+    metrics = [judgement_row(judged(found.fit)), Metric("model", name), *figures(found)]
+    write_motion(room.folder, motion, body)
+    metrics += write_glb(room.folder / "animation.glb", motion, body)
+    page = Page(f"{path.name}, on the body", "The body in motion" + (
+        ", with dots where the joint centres of the motion's own skeleton would be with bones as long as these."
+        if found.fit else "."))
+    if found.fit is None:
+        page.bodies([moving_pane(motion, body)], "Press the triangle to play, drag the body to turn it.", 520)
+    else:
+        _joints(page, replace(motion, residuals=found.fit.distances, labels=found.fit.names,
+                              trusted=np.ones_like(found.fit.distances, dtype=bool)), body, found.fit, room.folder)
+    return metrics, motion, body, page.section("Figures").table(rows(metrics), ("metric", "value", "unit"))
+
+
+def judged(fit: Followed | None) -> Judgement:
+    """What a motion is worth that was brought onto a body."""
+    reasons = []
+    if fit is not None and fit.angle > MOST:
+        worst = int(fit.angles.mean(axis=0).argmax())
+        reasons.append(f"segments point {fit.angle:.0f} degrees off on average, that to the {_words(fit.names[worst])} "
+                       f"{fit.angles[:, worst].mean():.0f}")
+    if fit is not None and fit.lean > LEAN:
+        reasons.append(f"the trunk of the motion's skeleton leans {fit.lean:.0f} degrees otherwise at rest; does it "
+                       "stand upright there?")
+    return Judgement.of(None, reasons)
+
+
+def figures(found: BodyMotion) -> list[Metric]:
+    """How the motion came onto the body, and how well it follows."""
+    out = [Metric("frames", len(found.poses)), Metric("rate", found.rate, "1/s"), Metric("copied", found.how)]
+    if found.rest:
+        out.append(Metric("rest of its skeleton", found.rest))
+    if found.brought is not None:
+        out += [Metric("parts that follow a joint", f"{len(found.brought.matched)} of {found.poses.shape[1]}"),
+                Metric("travel scaled by", found.brought.scale)]
+        if found.brought.lacking:
+            out.append(Metric("parts without a joint in the motion", ", ".join(found.brought.lacking)))
+    if found.fit is not None:
+        distance = MM * found.fit.distances
+        out += [Metric(MEAN_DISTANCE, MM * found.fit.distance, "mm"),
+                Metric("distance of joint centres, 95th percentile", float(np.percentile(distance, 95)), "mm"),
+                Metric("angle of segments, mean", found.fit.angle, "°"),
+                Metric("angle of segments, 95th percentile", float(np.percentile(found.fit.angles, 95)), "°"),
+                Metric("trunk leans otherwise at rest, allowed for", found.fit.lean, "°")]
+    return out
+
+
+def _joints(page: Page, motion: Motion, body: Subject, fit: Followed, folder: Path) -> None:
+    """The body with the joint centres that it follows; the residuals of `motion` are their distances."""
+    at = fit.wanted[played(motion)[0]]
+    dots = Dots(at[0], MARKER, 0.013, on_top=True, name="joint centres of the motion",
+                labels=tuple(map(_words, fit.names)))
+    page.bodies([moving_pane(motion, body, [(dots, at)])],
+                "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
+    page.section("Joint centres").chart(chart_residuals(motion, "joint centres"),
+                                        "distance of the body's joint centres from those of the motion")
+    page.bodies(frame_panes(motion, body, fit.wanted, worst_frames(motion, 5)), "where they are farthest off", 300)
+    page.table([(_words(name), MM * float(fit.distances[:, i].mean()), float(fit.angles[:, i].mean()))
+                for i, name in enumerate(fit.names)], ("end of the segment", "mean distance (mm)", "mean angle (°)"))
+    write_residuals(folder / "residuals.csv", motion)
+
+
+def _words(joint: str) -> str:
+    """The joint at the end of a segment as a sentence has it."""
+    side = {"l_": "left ", "r_": "right "}.get(joint[:2], "")
+    return {"skullbase": "head", "shoulders": "middle of the shoulders"}.get(joint, side + joint[2:])

@@ -1,0 +1,117 @@
+"""More points for a C3D file that is there, beside its own."""
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.geometry.format_common import UNITS
+
+from .c3d import BLOCK, PointTable, file_parameters, point_table
+from .text import MarkerFileError
+
+_MOST = 255                          # values along one dimension of a parameter, and blocks of all parameters
+
+
+def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Sequence[str], positions: np.ndarray,
+               unit: str | None = None) -> bytes:
+    """The file with computed points (T, M, 3), metres, after its own; these, analog channels and events stay.
+
+    Labels must be new; a point that is NaN is missing. `unit` of a file that says it wrongly.
+    """
+    table = point_table(path, data)
+    if len(positions) != table.frames:
+        raise MarkerFileError(f"{path}: expected a file of {len(positions)} frames, found {table.frames}")
+    if (unit or table.unit) not in UNITS:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{table.unit}'")
+    points = np.zeros((*positions.shape[:2], 4))
+    points[..., :3] = positions / UNITS[unit or table.unit] / (1.0 if table.kind == "f4" else table.scale)
+    points[np.isnan(points).any(axis=2)] = [0, 0, 0, -1]
+    if table.kind == "i2" and np.abs(points).max(initial=0) > 32767:
+        raise MarkerFileError(f"{path}: expected places within {32767 * abs(table.scale):g} {table.unit}, which its "
+                              f"whole numbers reach, got {np.abs(positions).max():g} m")
+    begin = (data[0] - 1) * BLOCK
+    described = [str(text) for text in file_parameters(data, table.numbers).get(("POINT", "DESCRIPTIONS"), [])]
+    described = (described + [""] * len(table.labels))[:len(table.labels)]
+    try:
+        section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions])
+    except (struct.error, IndexError, ValueError, OverflowError, StopIteration) as error:
+        raise MarkerFileError(f"{path}: expected C3D parameters with a group POINT that can take more points "
+                              f"({type(error).__name__} {error})") from None
+    head = bytearray(data[:begin])
+    struct.pack_into(f"{table.numbers.order}H", head, 2, len(table.labels) + len(labels))
+    struct.pack_into(f"{table.numbers.order}H", head, 16, (begin + len(section)) // BLOCK + 1)
+    return bytes(head) + section + _padded(_frames(data, table, points))
+
+
+def _frames(data: bytes, table: PointTable, points: np.ndarray) -> bytes:
+    """Every frame with the new points between its own and its analog channels."""
+    size, T = 4 if table.kind == "f4" else 2, table.frames
+    rows = np.frombuffer(data, np.uint8, T * table.width, table.start).reshape(T, -1)
+    values = points if table.kind == "f4" else np.rint(points)
+    added = np.frombuffer(table.numbers.encoded(values, table.kind), np.uint8).reshape(T, -1)
+    own = 4 * len(table.labels) * size
+    return np.concatenate([rows[:, :own], added, rows[:, own:]], axis=1).tobytes()
+
+
+def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: list[str], descriptions: list[str]
+             ) -> bytes:
+    """The parameters, all but those that tell of the points as they stand there."""
+    records = list(_records(data, begin + 4, table))
+    group = next(-number for number, name, _ in records if number < 0 and name == "POINT")
+    kept = [record for number, name, record in records if not (
+        number == group and (name in ("USED", "DATA_START") or name.startswith(("LABELS", "DESCRIPTIONS"))))]
+    order = table.numbers.order
+    kept.append(_parameter(group, "USED", b"\x02\x00" + struct.pack(f"{order}H", len(labels))))
+    for name, texts in (("LABELS", labels), ("DESCRIPTIONS", descriptions)):
+        for part, first in enumerate(range(0, len(texts), _MOST), start=1):
+            some = texts[first:first + _MOST]
+            width = min(max(map(len, some), default=1) or 1, _MOST)
+            cells = b"".join(text.encode("latin-1", "replace")[:width].ljust(width) for text in some)
+            kept.append(_parameter(group, name + (str(part) if part > 1 else ""),
+                                   bytes([255, 2, width, len(some)]) + cells))
+    start = _parameter(group, "DATA_START", b"\x02\x00\x00\x00")
+    blocks = -(-(4 + sum(map(len, kept)) + 2 * len(kept) + len(start) + 2) // BLOCK)
+    if blocks > _MOST:
+        raise MarkerFileError(f"{path}: expected room for more points, the C3D parameters are full")
+    kept.append(start[:-3] + struct.pack(f"{order}H", begin // BLOCK + blocks + 1) + start[-1:])
+    linked = [_linked(record, order, last=i == len(kept) - 1) for i, record in enumerate(kept)]
+    return _padded(data[begin:begin + 2] + bytes([blocks, table.numbers.processor]) + b"".join(linked))
+
+
+def _parameter(group: int, name: str, values: bytes) -> bytes:
+    """A record without its link: name, type, dimensions and values, and no description."""
+    return bytes([len(name), group]) + name.encode() + values + b"\0"
+
+
+def _linked(record: bytes, order: str, last: bool) -> bytes:
+    """The record with the way to the next one, 0 for the last, after its name."""
+    name = 2 + abs(struct.unpack_from("b", record)[0])
+    return record[:name] + struct.pack(f"{order}H", 0 if last else len(record) - name + 2) + record[name:]
+
+
+def _records(data: bytes, place: int, table: PointTable) -> Iterator[tuple[int, str, bytes]]:
+    """Group, negative for that of a group itself, name, and the bytes of every record without its link."""
+    while place + 2 < len(data) and data[place]:
+        length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
+        link = place + 2 + length
+        step = struct.unpack_from(f"{table.numbers.order}H", data, link)[0]
+        end = link + (step or _last(data, link + 2, group) - link)
+        yield group, data[place + 2:link].decode("latin-1").upper(), data[place:link] + data[link + 2:end]
+        if not step:
+            return
+        place = end
+
+
+def _last(data: bytes, place: int, group: int) -> int:
+    """The byte after a record that links to none, whose values begin at a place."""
+    if group > 0:
+        kind, count = struct.unpack_from("bB", data, place)
+        place += 2 + count + abs(kind) * int(np.prod(list(data[place + 2:place + 2 + count]), initial=1))
+    return place + 1 + data[place]
+
+
+def _padded(data: bytes) -> bytes:
+    return data + b"\0" * (-len(data) % BLOCK)

@@ -1,0 +1,89 @@
+"""Files of a motion for OpenSim: motion.trc of markers and joint centres, motion.mot of joint angles.
+
+Both are in the axes of OpenSim's ground: y up, x where the person faces. Of the recording's own axes each is one, so
+numbers change places and signs and nothing else.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from model.linear import Subject
+from model.motion.roles import numbered_roles
+from scanprep.console import say
+from scanprep.geometry import storage
+from scanprep.pictures.camera import stance
+from scanprep.skeleton.tree import Skeleton
+
+from ...motion import Motion
+from ..joint_angles import JointAngles, anatomical_angles, ground_axes
+from .markers import MarkerSequence, write_markers
+
+_AXES = "+x", "+y", "+z", "-x", "-y", "-z"
+
+
+def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
+                  markers: MarkerSequence | None = None) -> None:
+    """motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot if the body is a person's."""
+    points = centre_sequence(centres, subject.skeleton, motion.rate)
+    try:
+        angles = anatomical_angles(motion, subject, centres)
+    except ValueError as error:
+        say(f"motion.mot is not written: {error}")
+        up, ahead = stance(subject.template, subject.skeleton.part_rotations(motion.poses)[:, 0])
+        ground = ground_axes(np.stack([ahead, up, np.cross(ahead, up)], axis=1), np.eye(3)[None])
+    else:
+        ground = angles.ground
+        if angles.missing:
+            say(f"motion.mot has no angles of {', '.join(angles.missing)}, for which this body has no parts")
+        write_mot(folder / "motion.mot", angles, motion.rate)
+    every = points if markers is None else joined(markers, points)
+    write_markers(folder / "motion.trc", MarkerSequence(every.positions @ ground, every.labels, every.rate))
+
+
+def believed(motion: Motion, markers: MarkerSequence) -> MarkerSequence:
+    """The markers of a motion without those that the body did not believe; unknown ones stay."""
+    doubted = np.isfinite(motion.residuals) & ~motion.trusted
+    return MarkerSequence(np.where(doubted[..., None], np.nan, markers.positions), markers.labels, markers.rate)
+
+
+def joined(markers: MarkerSequence, more: MarkerSequence) -> MarkerSequence:
+    """Both beside each other; of labels that come twice the later ones get a `_` at the end."""
+    labels = list(markers.labels)
+    for label in more.labels:
+        while label in labels:
+            label += "_"
+        labels.append(label)
+    return MarkerSequence(np.concatenate([markers.positions, more.positions], axis=1), tuple(labels), markers.rate)
+
+
+def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> MarkerSequence:
+    """Joint centres (T, J, 3), metres, as points: hip_r_joint, knee_r_joint, ..., others by the part that hangs there.
+
+    The root has no joint and is left out.
+    """
+    return MarkerSequence(centres[:, 1:], centre_labels(skeleton), rate)
+
+
+def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
+    """(J - 1) names of the joints but the root's."""
+    sided = {j: f"{role[2:]}_{role[0]}_joint" for role, j in
+             numbered_roles(skeleton.names, skeleton.joints).items() if role[:2] in ("l_", "r_")}
+    taken = [sided.get(j, f"{name}_joint") for j, name in enumerate(skeleton.names)][1:]
+    return tuple(label if taken.count(label) == 1 else f"{skeleton.names[j]}_joint{j}"
+                 for j, label in enumerate(taken, start=1))
+
+
+def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
+    """Joint angles in degrees, and the middle of the hips in metres, as a motion file (Storage) of OpenSim."""
+    table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :3], angles.pelvis, angles.degrees[:, 3:]]
+    names = ("time", *angles.names[:3], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[3:])
+    axes = [_AXES[int(np.abs(axis).argmax()) + (3 if axis.sum() < 0 else 0)] for axis in angles.ground.T]
+    lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
+             "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
+             f"Axes x, y, z are {', '.join(axes)} of the recording.",
+             *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []), "", "endheader"]
+    lines += ["\t".join(names), *("\t".join(f"{value:.8g}" for value in row) for row in table.tolist())]
+    with storage.writing(Path(path)) as beside:
+        beside.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

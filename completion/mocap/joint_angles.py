@@ -1,0 +1,273 @@
+"""Joint angles as the International Society of Biomechanics (ISB) defines them, of a body that moves.
+
+Wu et al. 2002 (hip, ankle, spine), Wu et al. 2005 (shoulder, elbow, wrist), Grood and Suntay 1983 (knee). Axes of a
+segment point ahead (x), up or towards the trunk (y) and to the right (z). The table in the README has every joint with
+its zero, its signs and what stands in for landmarks that a skeleton does not have.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.linear import Subject
+from model.motion.roles import above, numbered_roles
+from scanprep.geometry import rotations
+
+from ..motion import Motion
+
+UPRIGHT = 0.6                        # cosine: who leans no further on average stands by the model's own axes
+SINGULAR = 1e-9                      # sine of the angle between the first and the third axis
+SIZE = 0.05                          # of how much a frame's angles count, against a jump
+SEQUENCES = {"zxy": (2, 0, 1), "yxy": (1, 0, 1)}
+_SIDED = {                           # column without its side: (proximal segment, distal one, sequence, its signs)
+    ("hip_flexion", "hip_adduction", "hip_rotation"): ("pelvis", "thigh", "zxy", (1, 1, 1)),
+    ("knee_angle", "knee_adduction", "knee_rotation"): ("thigh", "shank", "zxy", (-1, 1, 1)),
+    ("ankle_angle", "ankle_inversion", "ankle_rotation"): ("shank", "foot", "zxy", (1, 1, 1)),
+    ("arm_flex", "arm_add", "arm_rot"): ("trunk", "humerus", "zxy", (1, 1, 1)),
+    ("shoulder_plane", "shoulder_elevation", "shoulder_rotation"): ("trunk", "humerus", "yxy", (1, -1, 1)),
+    ("elbow_flex", "elbow_adduction", "forearm_pronation"): ("humerus", "forearm", "zxy", (1, 1, 1)),
+    ("wrist_flex", "wrist_dev", "wrist_rotation"): ("forearm", "hand", "zxy", (1, 1, 1))}
+_MIDDLE = {("pelvis_tilt", "pelvis_list", "pelvis_rotation"): ("ground", "pelvis", "zxy", (1, 1, 1)),
+           ("lumbar_extension", "lumbar_bending", "lumbar_rotation"): ("pelvis", "trunk", "zxy", (1, 1, 1)),
+           ("neck_extension", "neck_bending", "neck_rotation"): ("trunk", "head", "zxy", (1, 1, 1))}
+_LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "foot": ("ankle", None),
+          "humerus": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "hand": ("wrist", None)}
+_MIRROR = np.diag([1.0, 1.0, -1.0])  # a left joint as the right one that it mirrors
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Three angles of one segment against another.
+
+    `sequence` is of intrinsic rotations, `signs` make them the angles' own; a mirrored joint is turned to the other
+    side of the body before.
+    """
+
+    angles: tuple[str, str, str]
+    proximal: str
+    distal: str
+    sequence: str
+    signs: tuple[int, int, int]
+    mirrored: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """The segments of a person at rest: the part that carries each and the axes (3, 3), columns ahead, up, right."""
+
+    axes: np.ndarray                 # of the whole body
+    parts: dict[str, int]
+    frames: dict[str, np.ndarray]
+    hips: tuple[int, ...]            # joints, of which the pelvis has its place
+
+    def joints(self) -> list[Joint]:
+        """The joints whose two segments are there."""
+        known = {"ground", *self.parts}
+        found = [Joint(names, *rest, False) for names, rest in _MIDDLE.items()]
+        found += [Joint((f"{a}_{side}", f"{b}_{side}", f"{c}_{side}"),
+                        proximal if proximal in ("pelvis", "trunk") else f"{proximal}_{side}", f"{distal}_{side}",
+                        sequence, signs, side == "l")
+                  for side in "rl" for (a, b, c), (proximal, distal, sequence, signs) in _SIDED.items()]
+        return [joint for joint in found if {joint.proximal, joint.distal} <= known]
+
+    def missing(self) -> tuple[str, ...]:
+        """Joints that people have and this body's parts do not, such as "knee_r"."""
+        known = {joint.distal for joint in self.joints()}
+        wanted = ["trunk", "head", *(f"{name}_{side}" for side in "rl" for name in _LIMBS)]
+        joint = {"trunk": "lumbar", "head": "neck"}
+        joint |= {f"{name}_{side}": f"{ends[0]}_{side}" for side in "rl" for name, ends in _LIMBS.items()}
+        return tuple(joint[name] for name in wanted if name not in known)
+
+
+@dataclass(frozen=True, eq=False)
+class JointAngles:
+    """The joint angles of a motion, and where the pelvis is, in the axes of the ground."""
+
+    names: tuple[str, ...]
+    degrees: np.ndarray              # (T, K)
+    pelvis: np.ndarray               # (T, 3) metres, the middle of the hips
+    ground: np.ndarray               # (3, 3) columns: its x, y (up) and z in the axes of the motion
+    missing: tuple[str, ...]         # joints that people have and this body's parts do not
+
+
+def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> Anatomy:
+    """The segments of a person with joints (J, 3) at rest.
+
+    Raises
+    ------
+    ValueError
+        Parts that have not the names of a person's.
+    """
+    roles = numbered_roles(names, joints)
+    pair = next((p for p in (("l_hip", "r_hip"), ("l_shoulder", "r_shoulder")) if {*p} <= roles.keys()), None)
+    low = [roles[r] for r in ("l_ankle", "r_ankle", "l_hip", "r_hip") if r in roles]
+    high = [roles[r] for r in ("l_shoulder", "r_shoulder", "skullbase") if r in roles]
+    if "humanoid_root" not in roles or pair is None or not low or not high:
+        raise ValueError(f"joint angles are of people: expected parts named pelvis, thigh_left, ..., head, found "
+                         f"{', '.join(names)}"[:300])
+    body = _body_axes(joints[roles[pair[1]]] - joints[roles[pair[0]]], joints[high].mean(0) - joints[low].mean(0))
+    parts = {"pelvis": roles["humanoid_root"]}
+    trunk = _carrier(parents, roles)
+    if trunk is not None:
+        parts["trunk"] = trunk
+    if "skullbase" in roles:
+        parts["head"] = roles["skullbase"]
+    frames = dict.fromkeys(parts, body)
+    for side in "rl":
+        _limbs(side, roles, joints, body, parts, frames)
+    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
+
+
+def _body_axes(right: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(3, 3) columns ahead, up, right: up is the axis of the model nearest to a direction, right as level."""
+    up = _nearest_axis(high)
+    right = right - (right @ up) * up
+    if not np.linalg.norm(right) > 1e-6:
+        raise ValueError("joint angles: expected hips or shoulders beside each other at rest")
+    right = right / np.linalg.norm(right)
+    return np.stack([np.cross(up, right), up, right], axis=1)
+
+
+def _carrier(parents: np.ndarray, roles: Mapping[str, int]) -> int | None:
+    """The part that carries the arms; None where it is the pelvis."""
+    chains = [above(parents, roles.get(f"{side}_sternoclavicular", roles[f"{side}_shoulder"]))[1:]
+              for side in "lr" if f"{side}_shoulder" in roles]
+    both = [j for j in chains[0] if all(j in chain for chain in chains)] if chains else []
+    return both[0] if both and both[0] != roles["humanoid_root"] else None
+
+
+def _limbs(side: str, roles: Mapping[str, int], joints: np.ndarray, body: np.ndarray, parts: dict[str, int],
+           frames: dict[str, np.ndarray]) -> None:
+    """Adds the segments of the limbs of one side that have both their ends."""
+    for name, (start, end) in _LIMBS.items():
+        begin, stop = roles.get(f"{side}_{start}"), roles.get(f"{side}_{end}")
+        if begin is None or (end is not None and stop is None):
+            continue
+        if end is None:                                      # no joint beyond: as it is held at rest
+            before = frames.get(f"forearm_{side}")
+            frame = body if name == "foot" else before
+            if frame is None:
+                continue
+        else:
+            assert stop is not None, "both ends"
+            frame = _long_axes(joints[begin] - joints[stop], body, by_front=start in ("shoulder", "elbow"))
+            if name == "forearm":                            # thumbs point ahead at rest: half way to pronation
+                frame = frame @ _turn(1, np.pi / 2 if side == "r" else -np.pi / 2)
+        parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
+
+
+def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray:
+    """(3, 3) columns: y along a bone, towards the trunk, and x as far ahead or z as far right as that leaves."""
+    y = long / np.linalg.norm(long)
+    kept = body[:, 0 if by_front else 2]
+    kept = kept - (kept @ y) * y
+    kept = kept / np.linalg.norm(kept)
+    return np.stack([kept, y, np.cross(kept, y)] if by_front else [np.cross(y, kept), y, kept], axis=1)
+
+
+def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray) -> JointAngles:
+    """The joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
+
+    Raises
+    ------
+    ValueError
+        A body whose parts have not the names of a person's.
+    """
+    skeleton = subject.skeleton
+    found = anatomy(skeleton.names, skeleton.parents, rest_joints(subject))
+    R = skeleton.part_rotations(motion.poses)
+    ground = ground_axes(found.axes, R[:, found.parts["pelvis"]])
+    degrees = angles_of(found, ground, R)
+    pelvis = centres[:, list(found.hips or (found.parts["pelvis"],))].mean(axis=1) @ ground
+    names = tuple(name for joint in found.joints() for name in joint.angles)
+    return JointAngles(names, degrees, pelvis, ground, found.missing())
+
+
+def rest_joints(subject: Subject) -> np.ndarray:
+    """(J, 3) metres: the joints of a person at rest."""
+    rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
+    return subject.joint_regressor @ rest
+
+
+def angles_of(found: Anatomy, ground: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """(T, K) degrees, of part rotations (T, J, 3, 3): those of the joints one after the other, three each."""
+    columns = []
+    for joint in found.joints():
+        relative = _axes_of(found, ground, R, joint.proximal).swapaxes(1, 2) @ _axes_of(found, ground, R, joint.distal)
+        if joint.mirrored:
+            relative = _MIRROR @ relative @ _MIRROR
+        columns.append(np.array(joint.signs) * decompose(relative, joint.sequence))
+    return np.degrees(np.concatenate(columns, axis=1))
+
+
+def _axes_of(found: Anatomy, ground: np.ndarray, R: np.ndarray, segment: str) -> np.ndarray:
+    return np.broadcast_to(ground, R[:, 0].shape) if segment == "ground" else \
+        R[:, found.parts[segment]] @ found.frames[segment]
+
+
+def ground_axes(axes: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """(3, 3) columns x, y, z of OpenSim's ground, each an axis of the motion: y is up, x where the person faces.
+
+    Of a body with `axes` (3, 3) at rest whose root has the rotations R (T, 3, 3); what counts is the mean, and of
+    somebody who turns round the first frame.
+    """
+    mean = R.mean(axis=0)
+    up = axes[:, 1] if (mean @ axes[:, 1]) @ axes[:, 1] > UPRIGHT else _nearest_axis(mean @ axes[:, 1])
+    ways = [way - (way @ up) * up for way in (mean @ axes[:, 0], R[0] @ axes[:, 0], R[0] @ axes[:, 1])]
+    x = _nearest_axis(next((way for way in ways if np.linalg.norm(way) > 0.1), ways[-1]))
+    return np.stack([x, up, np.cross(x, up)], axis=1)
+
+
+def _nearest_axis(direction: np.ndarray) -> np.ndarray:
+    main = int(np.abs(direction).argmax())
+    return np.eye(3)[main] * np.sign(direction[main])
+
+
+def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
+    """(T, 3) radians: angles about the axes of a sequence, "zxy" or "yxy", whose rotations give R (T, 3, 3).
+
+    R = R_1(a) R_2(b) R_3(c). Of "yxy" it is the solution with -b between 0 and half a turn, as ISB has it; of the two
+    of "zxy" that of the smaller angles, unless it would jump. None jumps by a full turn. Where the first and the third
+    axis are one, a stays as it was.
+    """
+    if sequence == "zxy":
+        lost = np.hypot(R[:, 0, 1], R[:, 1, 1])
+        a, b = np.arctan2(-R[:, 0, 1], R[:, 1, 1]), np.arctan2(R[:, 2, 1], lost)
+    else:
+        lost = np.hypot(R[:, 0, 1], R[:, 2, 1])
+        a, b = np.arctan2(-R[:, 0, 1], -R[:, 2, 1]), -np.arctan2(lost, R[:, 1, 1])
+    known = np.maximum.accumulate(np.where(lost > SINGULAR, np.arange(len(R)), -1))
+    a = np.where(known < 0, 0.0, a[known])
+    left = _turn(0, -b) @ _turn(SEQUENCES[sequence][0], -a) @ R
+    angles = np.stack([a, b, np.arctan2(left[:, 0, 2], left[:, 0, 0])], axis=1)
+    return np.unwrap(_smaller(angles) if sequence == "zxy" else angles, axis=0)
+
+
+def _smaller(angles: np.ndarray) -> np.ndarray:
+    """Of each frame's two solutions that of smaller angles (T, 3), radians; the least jumps are worth as much."""
+    both = np.stack([angles, angles * [1, -1, 1] + np.pi])               # (2, T, 3)
+    both -= 2 * np.pi * np.rint(both / (2 * np.pi))
+    size = SIZE * np.abs(both).sum(axis=2)
+    jump = np.abs(np.exp(1j * both[:, None, 1:]) - np.exp(1j * both[None, :, :-1])).sum(axis=3)      # (2, 2, T - 1)
+    cost, came = size[:, 0], np.zeros((len(angles), 2), dtype=int)
+    for t in range(1, len(angles)):
+        ways = cost + jump[:, :, t - 1]
+        came[t] = ways.argmin(axis=1)
+        cost = ways.min(axis=1) + size[:, t]
+    state, out = int(cost.argmin()), np.empty_like(angles)
+    for t in range(len(angles) - 1, -1, -1):
+        out[t], state = both[state, t], came[t, state]
+    return out
+
+
+def compose(angles: np.ndarray, sequence: str) -> np.ndarray:
+    """(3, 3) the rotation of three angles, radians: the inverse of `decompose`."""
+    first, second, third = (_turn(axis, angle) for axis, angle in zip(SEQUENCES[sequence], angles, strict=True))
+    return first @ second @ third
+
+
+def _turn(axis: int, angle: np.ndarray | float) -> np.ndarray:
+    """(..., 3, 3) the rotations by angles (...), radians, about an axis."""
+    return rotations.exp(np.asarray(angle)[..., None] * np.eye(3)[axis])

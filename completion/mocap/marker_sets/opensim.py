@@ -1,0 +1,92 @@
+"""A layout as a marker set of OpenSim: every marker on the body that carries it, to begin with in the scale tool."""
+from __future__ import annotations
+
+import numpy as np
+
+from model.export.names import names_of
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import stance
+from scanprep.skeleton.tree import Skeleton
+
+from .layout import MarkerLayout
+from .symmetry import label_pairs
+
+# Bodies of OpenSim's models begin at the joints, but for these: by the axes x ahead, y up, z right and for hips that
+# are `_HIPS` apart, metres, as in its model gait2392
+_HIPS = 0.167
+_PELVIS = (0.0707, 0.0661, 0.0)      # between the front spines, from the middle of the hips
+_TORSO = (-0.1007, 0.0815, 0.0)      # the lowest lumbar joint, from there
+_HEEL = (-0.0488, -0.0420, 0.0)      # from the ankle
+_LIMBS = {"humerus": "ulna", "ulna": "hand", "femur": "tibia", "tibia": "calcn"}      # y of each points back from these
+_ORDER = ("pelvis", "torso", "femur", "humerus", "tibia", "ulna", "calcn", "hand")
+_WITH = {"head": "torso"}            # bodies that most models do not have
+
+
+def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dict[str, tuple[str, np.ndarray]]:
+    """Name -> path of the body of OpenSim, and the place (3,) in its frame, metres, for `marker_set`.
+
+    The body stands at rest, arms anywhere; the skeleton has its joints. Frames have x ahead, y up, or along the limb to
+    its root, and z right. Hips, knees, ankles, shoulders and elbows are ours; pelvis, torso and heel begin where they
+    do in gait2392. Good enough to begin with: the scale tool moves the markers to those of a recording.
+
+    Raises
+    ------
+    ValueError
+        A skeleton without the parts of a person.
+    """
+    named = names_of(skeleton, "opensim")
+    frames = _frames({name: skeleton.joints[skeleton.names.index(part)] for part, name in named.items()
+                      if name not in _WITH}, *stance(body))
+    parts = skeleton.part_of_vertex(body)[layout.nearest]
+    carriers = [_carrier(skeleton, named, frames, int(part)) for part in parts]
+    found = {}
+    for i, (label, place, other) in enumerate(zip(layout.labels, layout.place(body), label_pairs(layout.labels),
+                                                  strict=True)):
+        kind, _, side = carriers[i].partition("_")
+        partner = carriers[other].partition("_")[0] if other >= 0 else kind
+        kind = min(kind, partner, key=_ORDER.index)          # of a pair at a joint, the one that is nearer the root
+        name = kind if kind in frames else f"{kind}_{side}"
+        origin, axes = frames[name]
+        found[label] = f"/bodyset/{name}", axes.T @ (place - origin)
+    return found
+
+
+def _frames(joints: dict[str, np.ndarray], vertical: np.ndarray, ahead: np.ndarray
+            ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Origin (3,), metres, and axes (3, 3) as columns of every body."""
+    if not {"femur_l", "femur_r", "pelvis"} <= joints.keys():
+        raise ValueError(f"skeleton: expected a pelvis and two thighs, as OpenSim's bodies, got {', '.join(joints)}")
+    upright = np.column_stack([ahead, vertical, np.cross(ahead, vertical)])
+    hips = (joints["femur_l"] + joints["femur_r"]) / 2
+    scale = float(np.linalg.norm(joints["femur_l"] - joints["femur_r"])) / _HIPS
+    pelvis = hips + scale * upright @ _PELVIS
+    found = {"pelvis": (pelvis, upright), "torso": (pelvis + scale * upright @ _TORSO, upright)}
+    for name, joint in joints.items():
+        kind, _, side = name.partition("_")
+        if kind == "calcn":
+            found[name] = joint + scale * upright @ _HEEL, upright
+        elif f"{_LIMBS.get(kind)}_{side}" in joints:
+            found[name] = joint, _along(joint - joints[f"{_LIMBS[kind]}_{side}"], vertical, ahead)
+        elif kind == "hand":
+            found[name] = joint, _along(joints.get(f"ulna_{side}", joint + vertical) - joint, vertical, ahead)
+    return found
+
+
+def _along(y: np.ndarray, vertical: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """(3, 3) axes with this y, and x as near to ahead as it allows."""
+    y = y / np.linalg.norm(y)
+    x = ahead if abs(y @ ahead) < 0.9 else vertical
+    x = x - (x @ y) * y
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, y, np.cross(x, y)])
+
+
+def _carrier(skeleton: Skeleton, named: dict[str, str], frames: dict[str, tuple[np.ndarray, np.ndarray]], part: int
+             ) -> str:
+    """The body of OpenSim that a part belongs to: its own, or that of the first part above it which has one."""
+    while part >= 0:
+        name = named.get(skeleton.names[part], "")
+        if (name := _WITH.get(name, name)) in frames:
+            return name
+        part = int(skeleton.parents[part])
+    return "torso"

@@ -1,0 +1,125 @@
+"""What animation programs expect: root, names, bones along the limbs, soles on the ground, face to the viewer."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sides import side_of
+from scanprep.pictures.camera import stance, upright
+
+from .bvh import part_ends
+from .names import Names, renamed
+from .rig import Rig, carried, rerooted, turn_up
+
+FRAMES = 200                         # of a motion, in which its lowest point is looked for
+_SOME = 20                           # of them at a time
+
+
+def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: str | None = None,
+                 names: Names | None = None, ground: bool = False, front: bool = False
+                 ) -> tuple[Rig, np.ndarray, np.ndarray]:
+    """The same body and motion as animation programs expect them; what GLB, BVH and USD files are written from.
+
+    The surface moves as before, but for `ground` and `front`, which place the whole anew. Bones get axes along the
+    limbs (`aimed`).
+
+    Parameters
+    ----------
+    rig : Rig
+    poses : (T, J, 3) float, radians
+        T is 0 without a motion.
+    trans : (T, 3) float, metres
+    up : int
+        0, 1 or 2: the axis of the body that points up.
+    root : str, optional
+        The part that the skeleton hangs on.
+    names : "mixamo", "vrm", "h-anim" or "opensim", optional
+        Whose names the bones have.
+    ground : bool
+        The lowest point at rest, and the lowest of the motion, at height 0.
+    front : bool
+        The body at rest, and the motion by its mean heading, turned to the viewer: to +z where y is up, to -y where
+        z is up.
+    """
+    rig, poses, trans = placed(rig, poses, trans, up, ground, front)
+    if root is not None:
+        rig, poses, trans = rerooted(rig, poses, trans, root)
+    rig = aimed(rig, up)
+    return (rig if names is None else renamed(rig, names)), poses, trans
+
+
+def aimed(rig: Rig, up: int) -> Rig:
+    """The rig with bones that point along the limbs: y of every bone to the next joint.
+
+    Where bones branch the next joint is that of the largest branch nearest the middle of the body, so that a pelvis
+    points up the spine and a chest to the head; at the end of a limb it is the end of the surface. Roll: z is as near
+    to the front as y allows, or to up where the bone itself points forwards or backwards, within 60 degrees, so that x
+    is the hinge of elbows, knees and ankles, and left and right mirror each other.
+    """
+    vertical, ahead = stance(rig.mesh, vertical=np.eye(3)[up])
+    ends, joints = part_ends(rig.skeleton, rig.mesh), rig.skeleton.joints
+    axes = np.empty_like(rig.axes)
+    for j in range(len(axes)):
+        child = _next(rig, j, np.cross(vertical, ahead))
+        y = (ends[j] if child is None else joints[child]) - joints[j]
+        length = np.linalg.norm(y)
+        y = y / length if length > 1e-9 else vertical
+        z = ahead if abs(y @ ahead) < 0.5 else vertical
+        z = z - (z @ y) * y
+        z /= np.linalg.norm(z)
+        axes[j] = np.column_stack([np.cross(y, z), y, z])
+    return replace(rig, axes=axes)
+
+
+def placed(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool, front: bool
+           ) -> tuple[Rig, np.ndarray, np.ndarray]:
+    """The rig and its motion (T may be 0) on the ground and with the face to the viewer, as `for_programs` says."""
+    Q = W = np.eye(3)
+    if front:
+        Q = to_viewer(*stance(rig.mesh, vertical=np.eye(3)[up]), up)
+        if len(poses):
+            turned = rig.skeleton.part_rotations(poses)[:, 0]
+            W = to_viewer(*stance(rig.mesh, turned, np.eye(3)[up]), up)
+    rig, poses, trans = carried(rig, poses, trans, (Q, np.zeros(3)), (W, np.zeros(3)))
+    if not ground:
+        return rig, poses, trans
+    vertical = np.eye(3)[up]
+    shift = step = -rig.mesh.vertices[:, up].min() * vertical
+    if len(poses):
+        chosen = np.unique(np.linspace(0, len(poses) - 1, min(FRAMES, len(poses))).round().astype(int))
+        step = -min(float(rig.vertices(poses[some], trans[some])[..., up].min())
+                    for some in np.array_split(chosen, -(-len(chosen) // _SOME))) * vertical
+    return carried(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
+
+
+def standing(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool, turned: np.ndarray | None = None
+             ) -> Mesh:
+    """A mesh with its lowest point at height 0, and its face to the viewer: -y where z is up, else +z.
+
+    What is up, without `up` (0, 1 or 2), and front is told by the same body at rest, whose root is `turned` (3, 3).
+    """
+    up = upright(rest)[0] if up is None else up
+    points = body.vertices
+    if front:
+        points = points @ to_viewer(*stance(rest, turned, np.eye(3)[up]), up).T
+    return body.with_vertices(points - ground * points[:, up].min() * np.eye(3)[up])
+
+
+def to_viewer(vertical: np.ndarray, ahead: np.ndarray, up: int) -> np.ndarray:
+    """The rotation (3, 3) that turns up, and ahead, unit vectors (3,), to the axis `up` and to the viewer."""
+    U = turn_up(up)
+    return np.stack([U[1], U[2], U[0]]).T @ np.stack([vertical, ahead, np.cross(vertical, ahead)])
+
+
+def _next(rig: Rig, j: int, across: np.ndarray) -> int | None:
+    """The joint that a bone points to, None at the end of a limb; `across` (3,) is the unit vector to the left."""
+    parents, joints = rig.skeleton.parents, rig.skeleton.joints
+    children = np.flatnonzero(parents == j)
+    if len(children) < 2:
+        return int(children[0]) if len(children) else None
+    size = rig.skeleton.descends[children] @ np.bincount(rig.skeleton.part_of_face, minlength=len(parents))
+    aside = np.abs((joints[children] - joints[j]) @ across)
+    sided = np.array([side_of(rig.skeleton.names[c]) != 0 for c in children])
+    return int(children[np.lexsort((-size, aside > 0.5 * aside.max(), sided))[0]])

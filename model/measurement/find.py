@@ -1,0 +1,301 @@
+"""Tapes found once on a template, from its landmarks and its shape."""
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+
+import numpy as np
+
+from scanprep.geometry.geodesics import SurfaceGraph
+from scanprep.geometry.mesh import Mesh
+
+from .marks import Places, places_of
+from .section import Carried, Curve, direction, mean_of, section, tape
+from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
+
+STATURE = 1.75                       # metres: lengths below are those of somebody so tall
+BAND = 0.10                          # how far from its place on the template a tape may run, along the surface
+LIMB_BAND = 0.07
+CORRIDOR = 0.05                      # how much longer a way may be than the shortest, for what it crosses to count
+BELOW_BUST, BELOW_CROTCH = 0.085, 0.04
+PAST_ARMPIT = (0.5, 0.56, 0.62, 0.68)                  # of the way from the shoulder to the elbow
+APART = 0.12                         # metres from the middle of a section to where its part is sought
+TRIED = 25                           # sections among which the widest or the narrowest is sought
+
+
+class _NotThere(ValueError):
+    """A measurement that a template does not have, and why."""
+
+
+def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
+    """Find every measurement on a template that stands upright, its arms away from the body.
+
+    Waist, bust and ends of limbs are at landmarks; hips and calves are the widest, neck and wrists the narrowest
+    sections between two of them.
+
+    Parameters
+    ----------
+    template : Mesh
+    landmarks : name to vertex
+        Under the names of the synthetic people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
+        head or neck; what begins at another landmark is left out where there is none.
+
+    Raises
+    ------
+    ValueError
+        A landmark that is needed is missing.
+    """
+    finder = _Finder(places_of(template, landmarks))
+    found, missing = dict[str, Found](), dict[str, str]()
+    for name, find in finder.recipes():
+        try:
+            found[name] = find()
+        except KeyError as lacking:
+            missing[name] = f"the template has no landmark '{str(lacking)[1:-1]}'"
+        except _NotThere as problem:
+            missing[name] = str(problem)
+    return Tapes(template, finder.places.axes, found, missing, finder.limbs)
+
+
+class _Finder:
+    """The recipe of each measurement, on one template."""
+
+    def __init__(self, places: Places) -> None:
+        self.places, self.mesh = places, places.mesh
+        self.graph = SurfaceGraph(self.mesh)
+        height = self.mesh.vertices @ places.up
+        self.floor, self.stature = float(height.min()), float(np.ptp(height))
+        self.scale = self.stature / STATURE
+        self.limbs: dict[str, tuple[Carried, Carried]] = {}
+        self.done: dict[str, Girth] = {}
+
+    def recipes(self) -> Iterator[tuple[str, Callable[[], Found]]]:
+        """Names and how each is found, in the order in which they build on each other."""
+        p = self.places
+        yield "stature", lambda: Height(None)
+        yield "neck_height", lambda: Height(self.point("neck back"))
+        yield "shoulder_height", lambda: Height(self.point("left shoulder", "right shoulder"))
+        crown = self.floor + self.stature
+        yield "head_girth", lambda: self.widest("head_girth", lambda t: self.level(
+            p.at("top of head", "left ear", "right ear"), crown - (0.045 + 0.045 * t) * self.stature))
+        yield "neck_girth", self.neck
+        yield "chest_girth", lambda: self.trunk("chest_girth", p.height("left nipple", "right nipple"))
+        yield "under_bust_girth", lambda: self.trunk(
+            "under_bust_girth", p.height("left nipple", "right nipple") - BELOW_BUST * self.scale)
+        yield "waist_girth", self.waist
+        yield "waist_height", lambda: Height(self.girth("waist_girth").centre)
+        yield "hip_girth", self.hips
+        yield "crotch_height", lambda: Height(self.point("crotch"))
+        for side in ("left", "right"):
+            yield from self.leg(side)
+            yield from self.arm(side)
+        yield "shoulder_width", lambda: Straight(self.point("left shoulder"), self.point("right shoulder"))
+        yield "chest_width", lambda: self.span("chest_girth", 1)
+        yield "chest_depth", lambda: self.span("chest_girth", 2)
+        yield "hip_width", lambda: self.span("hip_girth", 1)
+        yield "back_length", lambda: self.way("neck back", self.at_back(self.girth("waist_girth")))
+        yield "shoulder_length_back", lambda: self.way("left shoulder", "neck back", "right shoulder")
+
+    def leg(self, side: str) -> Iterator[tuple[str, Callable[[], Found]]]:
+        """Of one leg, from above."""
+        p, knee, heel = self.places, (f"{side} knee", f"{side} knee inside"), f"{side} heel"
+        yield f"thigh_girth_{side}", lambda: self.keep(f"thigh_girth_{side}", self.level(
+            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - BELOW_CROTCH * self.scale), None, BAND)
+        yield f"knee_girth_{side}", lambda: self.across(f"knee_girth_{side}", self.shin(side), 0.0)
+        yield f"calf_girth_{side}", lambda: self.widest(f"calf_girth_{side}", lambda t: self.along(
+            p.at(*knee), p.at(heel), 0.12 + 0.4 * t), self.shin(side))
+        yield f"foot_length_{side}", lambda: self.foot(side)
+
+    def arm(self, side: str) -> Iterator[tuple[str, Callable[[], Found]]]:
+        """Of one arm, from above."""
+        p, elbow = self.places, (f"{side} elbow outside", f"{side} elbow inside")
+        shoulder, tip = f"{side} shoulder", f"{side} middle finger"
+        yield f"upper_arm_girth_{side}", lambda: self.across(f"upper_arm_girth_{side}", self.upper_arm(side), 0.0)
+        yield f"wrist_girth_{side}", lambda: self.narrowest(f"wrist_girth_{side}", lambda t: self.along(
+            p.at(*elbow), p.at(tip), 0.42 + 0.26 * t), self.limb(
+                f"{side} forearm", p.at(*elbow), p.at(tip), 0.12, 0.45))
+        yield f"arm_length_{side}", lambda: self.way(shoulder, elbow[0], self.nearest(
+            self.girth(f"wrist_girth_{side}"), elbow[0]))
+        yield f"hand_length_{side}", lambda: Straight(self.girth(f"wrist_girth_{side}").centre, self.point(tip))
+
+    def point(self, *names: str) -> Carried:
+        """The mean of landmarks, all of which must be there."""
+        for name in names:
+            self.places.at(name)
+        return mean_of(*(self.places.of[name] for name in names))
+
+    def loop(self, origin: np.ndarray, normal: np.ndarray) -> Curve:
+        """The closed section by a plane that is nearest to a point (3,) of it."""
+        curves = section(self.mesh.vertices, self.mesh.faces, origin, normal)
+        far = [np.linalg.norm(curve.at(self.mesh.vertices).mean(axis=0) - origin) for curve in curves]
+        if not curves or min(far) > APART * self.scale:
+            raise _NotThere("the template has no section there")
+        best = curves[int(np.argmin(far))]
+        if not best.closed:
+            raise _NotThere("a hole of the template crosses it")
+        return best
+
+    def level(self, near: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+        """The level plane at a height, metres, through the point above or below `near` (3,)."""
+        up = self.places.up
+        return near + (height - near @ up) * up, up
+
+    def along(self, start: np.ndarray, end: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """The plane across the line between two points (3,)."""
+        return start + share * (end - start), (end - start) / np.linalg.norm(end - start)
+
+    def length(self, curve: Curve, normal: np.ndarray) -> float:
+        """Of the tape, metres."""
+        points = curve.at(self.mesh.vertices)
+        hull = points[tape(points, normal)]
+        return float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
+
+    def keep(self, name: str, plane: tuple[np.ndarray, np.ndarray], axis: tuple[Carried, Carried] | None,
+             band: float = LIMB_BAND, under_arms: bool = False) -> Girth:
+        """The girth in a plane (a point of it, its normal), carried by its centroid."""
+        ring = self.loop(*plane)
+        centre = ring.centroid(self.mesh.vertices)
+        normal = self.places.up if axis is None else direction(axis, self.mesh.vertices)
+        if axis is not None:
+            ring = self.loop(centre.at(self.mesh.vertices), normal)
+            centre = ring.centroid(self.mesh.vertices)
+        far, _ = self.graph.nearest(np.unique(ring.edges))
+        near = (far <= band * self.scale)[self.mesh.faces].any(axis=1)
+        if under_arms:
+            near &= ~self.arms[self.mesh.faces].any(axis=1)
+        aside = 1 if "upper_arm" in name else -1 if "thigh" in name else 0
+        self.done[name] = Girth(centre, axis, self.mesh.faces[near], ring, under_arms, aside)
+        return self.done[name]
+
+    @cached_property
+    def arms(self) -> np.ndarray:
+        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is."""
+        found = np.zeros(len(self.mesh.vertices), dtype=bool)
+        for side in ("left", "right"):
+            elbow, armpit = (self.places.of.get(f"{side} {name}") for name in ("elbow inside", "armpit"))
+            if elbow is not None and armpit is not None:
+                far = self.graph.distances(elbow)
+                found |= far < far[armpit]
+        return found
+
+    def girth(self, name: str) -> Girth:
+        """One that was found before."""
+        if name not in self.done:
+            raise _NotThere(f"the template has no {name.replace('_', ' ')}")
+        return self.done[name]
+
+    def best(self, plane: Callable[[float], tuple[np.ndarray, np.ndarray]], sign: int
+             ) -> tuple[np.ndarray, np.ndarray]:
+        """The plane of the longest (1) or shortest (-1) tape, over t from 0 to 1."""
+        lengths = []
+        for t in np.linspace(0, 1, TRIED):
+            origin, normal = plane(float(t))
+            lengths.append(sign * self.length(self.loop(origin, normal), normal))
+        return plane(float(np.linspace(0, 1, TRIED)[int(np.argmax(lengths))]))
+
+    def widest(self, name: str, plane: Callable[[float], tuple[np.ndarray, np.ndarray]],
+               axis: tuple[Carried, Carried] | None = None) -> Girth:
+        return self.keep(name, self.best(plane, 1), axis)
+
+    def narrowest(self, name: str, plane: Callable[[float], tuple[np.ndarray, np.ndarray]],
+                  axis: tuple[Carried, Carried] | None = None) -> Girth:
+        return self.keep(name, self.best(plane, -1), axis)
+
+    def trunk(self, name: str, height: float) -> Girth:
+        """A level girth of the trunk."""
+        return self.keep(name, self.level(self.middle(), height), None, BAND, name != "waist_girth")
+
+    def middle(self) -> np.ndarray:
+        """A point (3,) on the axis of the trunk."""
+        p = self.places
+        if "back" in p.of:
+            return p.at("navel", "back")
+        return p.at("left hip", "right hip", "left shoulder", "right shoulder")
+
+    def waist(self) -> Girth:
+        """At the landmarks, else the narrowest of the trunk."""
+        p = self.places
+        if {"left waist", "right waist"} <= set(p.of):
+            return self.trunk("waist_girth", p.height("left waist", "right waist"))
+        low, high = p.height("crotch"), p.height("left nipple", "right nipple")
+        plane = self.best(lambda t: self.level(self.middle(), low + (0.35 + 0.5 * t) * (high - low)), -1)
+        return self.keep("waist_girth", plane, None, BAND)
+
+    def hips(self) -> Girth:
+        """The widest from the crotch up to two thirds of the way to the waist."""
+        p = self.places
+        low = p.height("crotch")
+        high = p.height("left waist", "right waist", "navel")
+        plane = self.best(lambda t: self.level(self.middle(), low + (0.12 + 0.55 * t) * (high - low)), 1)
+        return self.keep("hip_girth", plane, None, BAND)
+
+    def neck(self) -> Girth:
+        """The narrowest across the neck."""
+        p = self.places
+        foot, head = p.at("neck front", "neck back"), p.at("left ear", "right ear")
+        axis = (self.point("neck front", "neck back"), self.point("left ear", "right ear"))
+        return self.narrowest("neck_girth", lambda t: self.along(foot, head, 0.1 + 0.6 * t), axis)
+
+    def limb(self, name: str, start: np.ndarray, end: np.ndarray, first: float, second: float
+             ) -> tuple[Carried, Carried]:
+        """The axis of a limb: centroids of two sections between its ends."""
+        rings = [self.loop(*self.along(start, end, share)) for share in (first, second)]
+        self.limbs[name] = (rings[0].centroid(self.mesh.vertices), rings[1].centroid(self.mesh.vertices))
+        return self.limbs[name]
+
+    def upper_arm(self, side: str) -> tuple[Carried, Carried]:
+        """From its middle, or as soon as the armpit is passed, to the elbow."""
+        p = self.places
+        for share in PAST_ARMPIT:
+            with contextlib.suppress(_NotThere):
+                return self.limb(f"{side} upper arm", p.at(f"{side} shoulder"),
+                                 p.at(f"{side} elbow outside", f"{side} elbow inside"), share, 0.95)
+        raise _NotThere("the upper arm lies against the trunk on the template")
+
+    def shin(self, side: str) -> tuple[Carried, Carried]:
+        p = self.places
+        return self.limb(f"{side} shin", p.at(f"{side} knee", f"{side} knee inside"), p.at(f"{side} heel"), 0.0, 0.7)
+
+    def across(self, name: str, axis: tuple[Carried, Carried], share: float) -> Girth:
+        """The girth at a share of the way along an axis."""
+        start, end = (point.at(self.mesh.vertices) for point in axis)
+        return self.keep(name, self.along(start, end, share), axis)
+
+    def span(self, girth: str, axis: int) -> Span:
+        self.girth(girth)
+        return Span(girth, axis)
+
+    def nearest(self, girth: Girth, name: str) -> int:
+        """The vertex of a girth's section that is nearest to a landmark, along the surface."""
+        ring = np.unique(girth.ring.edges)
+        return int(ring[self.graph.distances(self.point(name).vertices[0])[ring].argmin()])
+
+    def at_back(self, girth: Girth) -> int:
+        """The vertex of a girth's section in the middle of the back."""
+        ring = np.unique(girth.ring.edges)
+        apart = self.mesh.vertices[ring] - girth.centre.at(self.mesh.vertices)
+        behind = apart @ self.places.axes[2] < 0
+        return int(ring[behind][np.abs(apart[behind] @ self.places.axes[1]).argmin()])
+
+    def way(self, *stations: str | int) -> Way:
+        """Along the surface, over landmarks or vertices."""
+        vertices = [int(self.point(s).vertices[0]) if isinstance(s, str) else s for s in stations]
+        faces = []
+        for start, end in itertools.pairwise(vertices):
+            over = self.graph.distances(np.array([start, end])).sum(axis=0)        # of ways over each vertex
+            if not np.isfinite(over[start]):
+                raise _NotThere("no way along the surface joins its ends")
+            faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + CORRIDOR * self.scale).all(axis=1)])
+        return Way(tuple(vertices), tuple(faces))
+
+    def foot(self, side: str) -> Extent:
+        """From heel to toes, of what is low and on that side."""
+        p = self.places
+        heel, toe = self.point(f"{side} heel"), self.point(f"{side} toe")
+        middle = 0.5 * (p.at(f"{side} heel") + p.at(f"{side} toe"))
+        low = self.mesh.vertices @ p.up - self.floor < 0.05 * self.scale
+        near = np.linalg.norm(self.mesh.vertices - middle, axis=1) < 0.2 * self.scale
+        own = (self.mesh.vertices - 0.5 * (p.at("left heel") + p.at("right heel"))) @ p.axes[1]
+        return Extent(np.flatnonzero(low & near & ((own > 0) == (side == "left"))), heel, toe)

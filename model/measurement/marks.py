@@ -1,0 +1,92 @@
+"""Names of the landmarks that measurements begin from, in the vocabularies that template files use."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+
+# our names, which are those of the synthetic people -> the SCAPE and SPRING meshes' -> CAESAR's
+MIDDLE = {
+    "top of head": ("top of head", "vertex", "crown"), "navel": ("navel", "cornea"),
+    "back": ("back", "cornea (on the back, similar position)"), "crotch": ("crotch", "between two legs"),
+    "neck front": ("neck front", "neck (front)", "suprasternale"),
+    "neck back": ("neck back", "neck (back)", "cervicale")}
+PAIRED = {
+    "toe": ("{} toe", "toe in {} leg", "{} digit ii"),
+    "heel": ("{} heel", "heel in {} leg", "{} calcaneous, post."),
+    "knee": ("{} knee", "knee in {} leg", "{} femoral lateral epicn."),
+    "knee inside": ("{} knee inside", "knee (inside) in {} leg", "{} femoral medial epicn."),
+    "waist": ("{} waist", "waist {} side", "{} 10th rib"), "hip": ("{} hip", "hip, {}", "{} trochanterion"),
+    "middle finger": ("{} middle finger", "middle finger {} hand", "{} dactylion"),
+    "elbow outside": ("{} elbow outside", "elbow (outside) {} arm", "{} olecranon"),
+    "elbow inside": ("{} elbow inside", "elbow (inside) {} arm", "{} humeral medial epicn."),
+    "shoulder": ("{} shoulder", "shoulder (upper) {} side", "{} acromion"),
+    "armpit": ("{} armpit", "shoulder (bottom) {} side", "{} axilla, ant."),
+    "nipple": ("{} nipple", "tit, {}", "{} thelion/bustpoint"), "ear": ("{} ear", "ear, {}", "{} tragion")}
+SIDES = {"left": ("left", "lt."), "right": ("right", "rt.")}
+FEET = tuple(f"{side} {name}" for side in SIDES for name in ("toe", "heel"))
+ABOVE = ("top of head", "neck front", "neck back", "left ear", "right ear")
+
+
+def known_landmarks(landmarks: Mapping[str, int]) -> dict[str, int]:
+    """The landmarks that measurements use, by our names: `left knee` for `knee in left leg` or `Lt. Femoral ...`."""
+    given = {" ".join(name.lower().split()): int(vertex) for name, vertex in landmarks.items()}
+    wanted = dict(MIDDLE)
+    for side, words in SIDES.items():
+        wanted |= {f"{side} {name}": tuple(form.format(word) for form in forms for word in words)
+                   for name, forms in PAIRED.items()}
+    return {name: given[form] for name, forms in wanted.items() for form in forms[::-1] if form in given}
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Named vertices of a template, and which way is up, left and ahead: the rows of `axes` (3, 3)."""
+
+    mesh: Mesh
+    of: Mapping[str, int]
+    axes: np.ndarray
+
+    @property
+    def up(self) -> np.ndarray:
+        return self.axes[0]
+
+    def at(self, *names: str) -> np.ndarray:
+        """The mean (3,), metres, of some landmarks; KeyError where none of them is known."""
+        known = [self.of[name] for name in names if name in self.of]
+        if not known:
+            raise KeyError(" and ".join(names))
+        return self.mesh.vertices[known].mean(axis=0)
+
+    def height(self, *names: str) -> float:
+        """Of the mean of some landmarks along `up`, metres."""
+        return float(self.at(*names) @ self.up)
+
+
+def places_of(mesh: Mesh, landmarks: Mapping[str, int]) -> Places:
+    """The landmarks of a template, by our names, and its axes.
+
+    Up is the axis of coordinates along which head or neck are above the feet, where the body stands along one.
+
+    Raises
+    ------
+    ValueError
+        No toes and heels, or nothing above: then nothing tells which way is up, and where the front is.
+    """
+    known = known_landmarks(landmarks)
+    lacking = [name for name in FEET if name not in known]
+    if lacking or not set(ABOVE) & set(known):
+        raise ValueError(f"landmarks: expected at least {', '.join(FEET)}, and one of {', '.join(ABOVE)}; there is no "
+                         f"{', '.join(lacking) or 'landmark of head or neck'}")
+    at = {name: mesh.vertices[known[name]] for name in (*FEET, *ABOVE) if name in known}
+    feet, head = (np.mean([at[name] for name in names if name in at], axis=0) for names in (FEET, ABOVE))
+    up = (head - feet) / np.linalg.norm(head - feet)
+    axis = int(np.abs(up).argmax())
+    if np.abs(up[axis]) > 0.97:
+        up = np.sign(up[axis]) * np.eye(3)[axis]
+    ahead = at["left toe"] - at["left heel"] + at["right toe"] - at["right heel"]
+    ahead -= (ahead @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    return Places(mesh, known, np.stack([up, np.cross(up, ahead), ahead]))

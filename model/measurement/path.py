@@ -1,0 +1,91 @@
+"""Shortest ways along the surface, and where they run."""
+from __future__ import annotations
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+
+from .section import Curve
+
+GRID = np.linspace(0, 1, 17)          # places tried on an edge
+
+
+def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> tuple[float, Curve]:
+    """Exact length, metres, of the shortest way along triangles from one vertex to another, and the way itself.
+
+    Parameters
+    ----------
+    body : (N, 3) float, metres
+    faces : (F, 3) int
+        The triangles that the way may cross.
+
+    Raises
+    ------
+    ValueError
+        No way leads there.
+    """
+    import igl
+
+    used, few = np.unique(faces, return_inverse=True)
+    few, vertices = few.reshape(-1, 3), np.ascontiguousarray(body[used])
+    places = np.searchsorted(used, [start, end])
+    if not np.array_equal(used[np.minimum(places, len(used) - 1)], [start, end]) or start == end:
+        raise ValueError(f"vertices {start} and {end}: expected two that the triangles join")
+    none = np.zeros(0, dtype=np.int64)
+    far = igl.exact_geodesic(vertices, few, places[:1], none, np.arange(len(used)), none)
+    if not 0 < far[places[1]] < 1e6:                                       # 0, or a huge number, where no way leads
+        raise ValueError(f"vertices {start} and {end}: no way along the surface joins them, there is a gap")
+    edges, share = _straightened(vertices, *_descent(Mesh(vertices, few), far, int(places[0]), int(places[1])))
+    return float(far[places[1]]), Curve(used[edges], share, False)
+
+
+def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """Edges (m, 2) and places (m,) on them that lead from `end` down the distances `far` (N,) from `start`."""
+    of_vertex: dict[int, list[int]] = {}
+    for face, corners in enumerate(mesh.faces.tolist()):
+        for corner in corners:
+            of_vertex.setdefault(corner, []).append(face)
+    edges, share = [(end, end)], [0.0]
+    for _ in range(len(far)):
+        (a, b), s = edges[-1], share[-1]
+        around = set(of_vertex[a]) & set(of_vertex[b])
+        corners = [mesh.faces[face].tolist() for face in around]
+        if any(start in three for three in corners):
+            break
+        here = (1 - s) * mesh.vertices[a] + s * mesh.vertices[b]
+        below = (1 - s) * far[a] + s * far[b]
+        best = (np.inf, a, b, s)
+        for three in corners:
+            for c, d in ((three[0], three[1]), (three[1], three[2]), (three[2], three[0])):
+                if {c, d} == {a, b} or (a == b and a in (c, d)):
+                    continue
+                ahead = np.outer(1 - GRID, mesh.vertices[c]) + np.outer(GRID, mesh.vertices[d])
+                level = (1 - GRID) * far[c] + GRID * far[d]
+                cost = np.where(level < below - 1e-12, level + np.linalg.norm(ahead - here, axis=1), np.inf)
+                k = int(cost.argmin())
+                best = min(best, (float(cost[k]), c, d, float(GRID[k])))
+        if not np.isfinite(best[0]):
+            break
+        _, c, d, s = best
+        c, d = (c, c) if s == 0 else (d, d) if s == 1 else (c, d)
+        edges.append((c, d))
+        share.append(s if c != d else 0.0)
+    return np.array([*edges, (start, start)]), np.array([*share, 0.0])
+
+
+def _straightened(vertices: np.ndarray, edges: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The shortest way across the same edges: a convex problem in the places on them."""
+    from scipy.optimize import minimize
+
+    first, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
+
+    def length(s: np.ndarray) -> tuple[float, np.ndarray]:
+        steps = np.diff(first + s[:, None] * along, axis=0)
+        far = np.linalg.norm(steps, axis=1)
+        ways = steps / np.maximum(far, 1e-12)[:, None]
+        force = np.concatenate([np.zeros((1, 3)), ways]) - np.concatenate([ways, np.zeros((1, 3))])
+        return float(far.sum()), np.einsum("md,md->m", force, along)
+
+    found = minimize(length, share, jac=True, method="L-BFGS-B", bounds=[(0, 1)] * len(share),
+                     options={"maxiter": 200, "ftol": 1e-14})
+    return edges, np.asarray(found.x)

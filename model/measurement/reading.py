@@ -1,0 +1,213 @@
+"""One measurement of one body, with its derivative by every vertex."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import singledispatch
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+
+from .path import shortest_path
+from .section import Carried, Curve, around, bulge, direction, section, tape
+from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
+
+ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
+STATURE, STEP, STEPS = 1.75, 0.004, 12    # metres: of somebody so tall, steps in which a plane moves on if it must
+
+
+class NotMeasured(ValueError):
+    """A measurement that cannot be taken of a body, and why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """A body in the triangles of a template, and the unit vectors up, left and ahead, the rows of `axes` (3, 3)."""
+
+    mesh: Mesh
+    axes: np.ndarray
+
+    @property
+    def vertices(self) -> np.ndarray:
+        return self.mesh.vertices
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One measurement of a body.
+
+    `value`, metres; `curve` (m, 3), metres, where the tape runs, its points one after the other; `vertices` (k,) and
+    `force` (k, 3) its derivative by them, of which one may come several times; `slope`, metres per metre, what sliding
+    its plane along the part, or its landmarks along the skin, changes.
+    """
+
+    value: float
+    curve: np.ndarray
+    vertices: np.ndarray
+    force: np.ndarray
+    slope: float = 0.0
+
+    def along(self, moves: np.ndarray) -> np.ndarray:
+        """Change (...,) of the value by moves (N, 3, ...) of all vertices."""
+        return np.einsum("kd,kd...->...", self.force, moves[self.vertices])
+
+
+@singledispatch
+def read(found: Found, body: Standing, tapes: Tapes) -> Reading:
+    """One measurement of a body.
+
+    Raises
+    ------
+    NotMeasured
+        A hole where the tape runs.
+    """
+    raise TypeError(f"expected a measurement, got {type(found).__name__}")
+
+
+@read.register
+def _girth(found: Girth, body: Standing, tapes: Tapes) -> Reading:
+    cut = _taped(found, body, tapes)
+    points = cut.points[cut.hull]
+    apart = np.abs(cut.hull - np.roll(cut.hull, 1))
+    value, pull = around(points, (apart == 1) | (apart == len(cut.points) - 1))       # next to each other on the skin
+    return Reading(value, np.concatenate([points, points[:1]]), *_moved(found, cut, cut.hull, pull, body))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """The section of a girth, its plane, its points (m, 3), and which of them the tape touches, in order."""
+
+    curve: Curve
+    origin: np.ndarray
+    normal: np.ndarray
+    points: np.ndarray
+    hull: np.ndarray
+
+
+def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
+    """The section of a girth, cut anew by its carried plane; NotMeasured where it is not closed.
+
+    A thigh or an upper arm is measured as near to the trunk as it is on its own.
+    """
+    vertices, normal = body.vertices, body.axes[0]
+    origin = found.centre.at(vertices)
+    if found.axis is not None:
+        normal = direction(found.axis, vertices)
+    step = STEP * (np.ptp(vertices @ body.axes[0]) / STATURE) * found.aside * normal
+    for tried in range(STEPS if found.aside else 1):
+        curve = _curve(found, body, origin + tried * step, normal)
+        if curve.closed:
+            points = curve.at(vertices) + bulge(vertices, body.mesh.vertex_normals, curve)
+            return _Cut(curve, origin + tried * step, normal, points, tape(points, normal))
+    raise NotMeasured("its plane runs out of the part it goes around")
+
+
+def _curve(found: Girth, body: Standing, origin: np.ndarray, normal: np.ndarray) -> Curve:
+    """The section of a girth by a plane: where arms are left out its pieces together; NotMeasured at a hole."""
+    curves = section(body.vertices, found.faces, origin, normal)
+    if not curves:
+        raise NotMeasured("its plane meets nothing there")
+    ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
+    if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
+        raise NotMeasured("a hole of the mesh crosses it")
+    if found.under_arms and not any(curve.closed for curve in curves):
+        return Curve(np.concatenate([c.edges for c in curves]), np.concatenate([c.share for c in curves]), True)
+    return min(curves, key=lambda c: float(np.linalg.norm(c.at(body.vertices).mean(axis=0) - origin)))
+
+
+def _moved(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: Standing
+           ) -> tuple[np.ndarray, np.ndarray, float]:
+    """What vertices add where they pull at points of a section, the plane moving with them.
+
+    `chosen` (m,) points of the section, `pull` (m, 3) the derivative by them; vertices (k,), their force (k, 3), and
+    the derivative by moving the plane along its normal. What the bulge between vertices changes is left out.
+    """
+    vertices, edges, share = body.vertices, cut.curve.edges[chosen], cut.curve.share[chosen]
+    along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    out = np.einsum("md,md->m", pull, along) / (along @ cut.normal)
+    on_edge = pull - out[:, None] * cut.normal
+    ids = [edges[:, 0], edges[:, 1], found.centre.vertices]
+    force = [(1 - share)[:, None] * on_edge, share[:, None] * on_edge,
+             found.centre.weights[:, None] * (out.sum() * cut.normal)]
+    if found.axis is not None:                                            # the plane turns with the limb
+        length = np.linalg.norm(found.axis[1].at(vertices) - found.axis[0].at(vertices))
+        by_normal = -(out @ (cut.points[chosen] - cut.origin))
+        by_end = (by_normal - (by_normal @ cut.normal) * cut.normal) / length
+        for point, sign in zip(found.axis, (-1, 1), strict=True):
+            ids.append(point.vertices)
+            force.append(sign * point.weights[:, None] * by_end)
+    return np.concatenate(ids), np.concatenate(force), float(out.sum())
+
+
+@read.register
+def _span(found: Span, body: Standing, tapes: Tapes) -> Reading:
+    girth = tapes.found[found.girth]
+    assert isinstance(girth, Girth)
+    cut, way = _taped(girth, body, tapes), body.axes[found.axis]
+    along = cut.points[cut.hull] @ way
+    ends = cut.hull[[along.argmin(), along.argmax()]]
+    drawn = _through(cut.points[ends].mean(axis=0), cut.points[ends], way)
+    return Reading(float(np.ptp(along)), drawn, *_moved(girth, cut, ends, np.stack([-way, way]), body))
+
+
+def _through(middle: np.ndarray, points: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Points (n, 3) moved onto the line through the middle (3,) along a unit vector (3,)."""
+    return middle + np.outer((points - middle) @ way, way)
+
+
+@read.register
+def _height(found: Height, body: Standing, tapes: Tapes) -> Reading:
+    up, height = body.axes[0], body.vertices @ body.axes[0]
+    floor = int(height.argmin())
+    top = Carried(np.array([height.argmax()]), np.ones(1)) if found.top is None else found.top
+    place = top.at(body.vertices)
+    value = float(place @ up - height[floor])
+    force = np.concatenate([top.weights[:, None] * up, -up[None]])
+    return Reading(value, np.stack([place - value * up, place]), np.append(top.vertices, floor), force,
+                   0.0 if found.top is None else float(np.linalg.norm(top.weights)))
+
+
+@read.register
+def _straight(found: Straight, body: Standing, tapes: Tapes) -> Reading:
+    ends = np.stack([found.first.at(body.vertices), found.second.at(body.vertices)])
+    way = ends[1] - ends[0]
+    value = float(np.linalg.norm(way))
+    ids = np.concatenate([found.first.vertices, found.second.vertices])
+    weights = np.concatenate([-found.first.weights, found.second.weights])
+    return Reading(value, ends, ids, weights[:, None] * (way / value), ENDS)
+
+
+@read.register
+def _extent(found: Extent, body: Standing, tapes: Tapes) -> Reading:
+    vertices, up = body.vertices, body.axes[0]
+    way = found.second.at(vertices) - found.first.at(vertices)
+    way = way - (way @ up) * up
+    length = np.linalg.norm(way)
+    way = way / length
+    along = vertices[found.vertices] @ way
+    ends = found.vertices[[along.argmin(), along.argmax()]]
+    apart = vertices[ends[1]] - vertices[ends[0]]
+    turned = apart - (apart @ way) * way - (apart @ up) * up              # the direction is carried too
+    ids = np.concatenate([ends, found.first.vertices, found.second.vertices])
+    weights = np.concatenate([-found.first.weights, found.second.weights])
+    return Reading(float(np.ptp(along)), _through(vertices[ends].mean(axis=0), vertices[ends], way), ids,
+                   np.concatenate([-way[None], way[None], weights[:, None] * turned / length]))
+
+
+@read.register
+def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
+    total, drawn, ids, force = 0.0, list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    for start, end, faces in zip(found.vertices, found.vertices[1:], found.faces, strict=False):
+        try:
+            length, curve = shortest_path(body.vertices, faces, start, end)
+        except ValueError as problem:
+            raise NotMeasured(str(problem)) from None
+        points = curve.at(body.vertices)
+        steps = np.diff(points, axis=0)
+        ways = steps / np.maximum(np.linalg.norm(steps, axis=1), 1e-12)[:, None]
+        pull = np.concatenate([np.zeros((1, 3)), ways]) - np.concatenate([ways, np.zeros((1, 3))])
+        total += length
+        drawn.append(points[::-1])                                        # the way is found from its end
+        ids += [curve.edges[:, 0], curve.edges[:, 1]]
+        force += [(1 - curve.share)[:, None] * pull, curve.share[:, None] * pull]
+    return Reading(total, np.concatenate(drawn), np.concatenate(ids), np.concatenate(force), ENDS)

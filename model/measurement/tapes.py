@@ -1,0 +1,82 @@
+"""Where tapes run on a template, carried by its vertices."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+
+from .section import Carried, Curve
+
+
+@dataclass(frozen=True, eq=False)
+class Girth:
+    """A tape around some part: the plane through `centre`, along `up` where there is no axis, else across the axis.
+
+    `faces` (F', 3) are the triangles around its place on the template: arms and other legs are none of them.
+    `under_arms`: where they end at the arms the tape runs straight on, under the armpit. `aside`: where the plane meets
+    the trunk or the other leg it moves on, along its normal (1) or against it (-1); 0 if it stays.
+    """
+
+    centre: Carried
+    axis: tuple[Carried, Carried] | None
+    faces: np.ndarray
+    ring: Curve                          # on the template
+    under_arms: bool = False
+    aside: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """A breadth of the section of a girth along one of the body's `axes` (0 up, 1 left, 2 ahead)."""
+
+    girth: str
+    axis: int
+
+
+@dataclass(frozen=True, eq=False)
+class Height:
+    """Height of the highest vertex of some, or of a carried point, above the floor."""
+
+    top: Carried | None
+
+
+@dataclass(frozen=True, eq=False)
+class Straight:
+    """The straight way between two carried points."""
+
+    first: Carried
+    second: Carried
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """How long some vertices (k,) are along the level direction from one carried point to another."""
+
+    vertices: np.ndarray
+    first: Carried
+    second: Carried
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """Shortest ways along the surface from vertex to vertex, one after the other, and the triangles for each."""
+
+    vertices: tuple[int, ...]
+    faces: tuple[np.ndarray, ...]
+
+
+Found = Girth | Span | Height | Straight | Extent | Way
+
+
+@dataclass(frozen=True, eq=False)
+class Tapes:
+    """All measurements of a template: `found` by name, `missing` with the reason; `axes` (3, 3) up, left, ahead."""
+
+    template: Mesh
+    axes: np.ndarray
+    found: Mapping[str, Found]
+    missing: Mapping[str, str] = field(default_factory=dict)
+    limbs: Mapping[str, tuple[Carried, Carried]] = field(default_factory=dict)     # directions that tell the pose

@@ -1,0 +1,1 @@
+"""Motions of files, ours and those of others, and how they come onto other skeletons."""

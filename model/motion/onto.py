@@ -1,0 +1,123 @@
+"""A motion of any file on a model: its own as it is, those of other skeletons brought onto it."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.cli import MM
+from scanprep.console import Metric
+from scanprep.geometry.storage import StorageError
+
+from ..body import BodyModel
+from ..linear import Subject
+from .amass import BODY, UNCERTAIN, moving_body, with_joints
+from .bvh import read_bvh
+from .error import Followed, followed
+from .files import StoredMotion, betas_for, check_ours, read_motion_file
+from .moving import MovingSkeleton
+from .retarget import Pairing, Retargeted, retargeted
+from .same import copied
+from .standing import standing_rest
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """A motion of a model's body."""
+
+    poses: np.ndarray                # (T, J, 3) radians
+    trans: np.ndarray                # (T, 3) metres
+    betas: np.ndarray | None         # (K,) of the body, None for the template's own
+    rate: float                      # frames a second
+    gender: str = "neutral"
+    how: str = "as it is"            # how it came onto the body
+    rest: str = ""                   # what is not certain about the rest of its own skeleton
+    brought: Retargeted | None = None    # what followed what, and how well, of a motion of another skeleton
+    fit: Followed | None = None
+
+    @property
+    def told(self) -> list[Metric]:
+        """For a table: how a motion of another skeleton came onto the body, and how far it is off."""
+        if self.brought is None:
+            return []
+        off = self.fit and f", joint centres {MM * self.fit.distance:.0f} mm, segments {self.fit.angle:.1f}° off"
+        return [Metric("motion copied", f"{self.how}{off or ''}"),
+                *([Metric("rest of its skeleton", self.rest)] if self.rest else [])]
+
+
+def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None
+                ) -> BodyMotion:
+    """A motion file for a model: its own (`.npz`), AMASS (`.npz`) or BVH.
+
+    A motion of the model's parts is taken as it is; one of its skeleton, or of a model of its family, is copied; of
+    another skeleton the segments point where they pointed (see `retarget`).
+
+    Parameters
+    ----------
+    path : str or Path
+    model : BodyModel
+    subject : Subject, optional
+        The body that moves; else that of the file's betas, and for motions of other skeletons the mean person.
+    unit : str, optional
+        Of the lengths in a BVH file, else centimetres. Travel is as long as the legs are, so it matters little.
+
+    Raises
+    ------
+    StorageError
+        Missing, damaged, or of a skeleton that cannot be brought onto this one.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".bvh":
+        return _onto(path, read_bvh(path, unit or "cm"), subject or _mean_person(model), "")
+    J = len(model.skeleton.parents)
+    stored = read_motion_file(path, parts=J)
+    family = bool(model.info.get("family"))
+    if stored.of_family and (stored.made_for or stored.poses.shape[1] != J or family):
+        if family:
+            return _of_family(path, stored, model, subject)
+        if stored.poses.shape[1] < BODY:
+            raise StorageError(f"{path}: expected at least the {BODY} joints of the body, "
+                               f"found {stored.poses.shape[1]}")
+        return _onto(path, moving_body(stored)[0], subject or _mean_person(model), UNCERTAIN, stored.gender)
+    check_ours(path, stored)
+    if stored.poses.shape[1] != J:
+        raise StorageError(f"{path}: expected frames of the model's {J} parts, found {stored.poses.shape[1]} parts; "
+                           "a motion of another skeleton comes as BVH")
+    betas = betas_for(path, stored.betas, model) if subject is None else subject.betas
+    return BodyMotion(stored.poses, stored.trans, betas, stored.rate, stored.gender)
+
+
+def _mean_person(model: BodyModel) -> Subject:
+    return model.subject(np.zeros(1) if model.n_betas else None)
+
+
+def _of_family(path: Path, stored: StoredMotion, model: BodyModel, subject: Subject | None) -> BodyMotion:
+    """A motion of the family on a model that was imported from it."""
+    betas = betas_for(path, stored.betas, model) if subject is None else subject.betas
+    return BodyMotion(with_joints(stored.poses, len(model.skeleton.parents)), stored.trans, betas, stored.rate,
+                      stored.gender, "pose by pose, of the same family")
+
+
+def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, gender: str = "neutral"
+          ) -> BodyMotion:
+    """A motion of another skeleton on a body."""
+    regressor = subject.joint_regressor
+    rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
+    skeleton = replace(subject.skeleton, joints=regressor @ rest)
+    same = copied(skeleton, subject.template, subject.vertices, moving)
+    if same is not None:
+        return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,
+                          "part by part, of the same skeleton", brought=same)
+    moving, frame = standing_rest(moving)
+    if frame is not None:
+        uncertain = f"that of frame {frame}, in which it stands: the file has none of a person who does"
+    try:
+        pair = Pairing(skeleton, subject.vertices, moving)
+        found = retargeted(pair)
+    except ValueError as problem:
+        raise StorageError(f"{path}: {problem}") from None
+    centres = subject.operator.joints(regressor).astype(np.float64).evaluate(found.poses, found.trans)
+    fit = followed(pair, found.poses, centres)
+    return BodyMotion(found.poses, found.trans, subject.betas, found.rate, gender, "by the directions of the segments",
+                      uncertain, found, fit)

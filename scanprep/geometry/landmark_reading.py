@@ -1,0 +1,237 @@
+"""Landmarks in the files of other programs, each format as it stands; `landmark_writing` is the counterpart."""
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from . import storage
+from .format_common import FARTHEST, UNITS, Lines, MeshFileError, quote
+from .mesh import Mesh
+
+Entry = np.ndarray | int | dict[str, Any]        # point, vertex, or face with barycentric coordinates
+_Points = list[tuple[str, np.ndarray]]
+
+
+class Found(NamedTuple):
+    """What a file says, in its order."""
+
+    pairs: list[tuple[str, Entry]]
+    unit: str | None = None                      # of the points, where the format or the file tells
+
+
+def entries_of(path: Path, data: bytes, unit: str | None, mesh: Mesh | None) -> Found:
+    """The landmarks of a file by its ending; `unit` is that which was told, `mesh` tells the axes of 3D Slicer.
+
+    MeshFileError with the line or the element that is wrong.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".json", ".pp", ".xml") and b"\0" in data:
+        raise MeshFileError(f"{path}: expected landmarks as text, found a binary file")
+    with storage.taking_apart(path, "landmarks", MeshFileError):
+        if suffix == ".json":
+            return _json(path, data, unit, mesh)
+        if suffix == ".fcsv":
+            return _as_meshed(_fiducials(path, data), unit, mesh)
+        if suffix == ".pp":
+            return Found([*_picked_points(path, data)])
+        if suffix == ".xml":
+            return Found([*_marker_set(path, data)], "m")
+        if suffix == ".csv":
+            return Found([*_table(Lines(path, data, comment=b"#"))])
+        if suffix == ".lnd":
+            # number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`
+            expected = "a line of a CAESAR .lnd file, seven numbers and a name"
+            return Found(_named_rows(Lines(path, data), 7, expected, "latin-1", b"="), "mm")
+        return Found(_named_rows(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8"))
+
+
+def _json(path: Path, data: bytes, unit: str | None, mesh: Mesh | None) -> Found:
+    """Ours, scalismo's, or a markups file of 3D Slicer."""
+    tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused later, by name
+    if isinstance(tree, list) and tree and all(isinstance(one, dict) and "id" in one for one in tree):
+        return Found([(str(one["id"]), _point(path, str(one["id"]), one.get("coordinates"))) for one in tree])
+    if not isinstance(tree, dict):
+        raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, found a {type(tree).__name__}")
+    if isinstance(tree.get("markups"), list):
+        return _as_meshed(_slicer(path, tree["markups"], unit), unit, mesh)
+    return Found([(name, _json_entry(path, name, value)) for name, value in tree.items()])
+
+
+def _json_entry(path: Path, name: str, value: Any) -> Entry:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if isinstance(value, dict) and isinstance(value.get("face"), int):
+        bary = _numbers(value.get("bary"))
+        if bary is not None and abs(bary.sum() - 1) < 1e-3:
+            return {"face": value["face"], "bary": bary / bary.sum()}
+    return _point(path, name, value)
+
+
+def _point(path: Path, name: str, value: Any) -> np.ndarray:
+    point = _numbers(value)
+    if point is None:
+        raise MeshFileError(f"{path}: landmark '{name}': expected [x, y, z], a vertex or "
+                            f'{{"face": f, "bary": [a, b, c]}}, found {quote(json.dumps(value))}')
+    return point
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    try:
+        point = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return point if point.shape == (3,) else None
+
+
+def _slicer(path: Path, markups: list[Any], unit: str | None) -> Found:
+    """The points of a markups file, in LPS."""
+    pairs: list[tuple[str, Entry]] = []
+    own_unit: Any = "mm"
+    with storage.taking_apart(path, "a markups file of 3D Slicer", MeshFileError):
+        for markup in markups:
+            units = markup.get("coordinateUnits", "mm")
+            own_unit = units[0] if isinstance(units, list) else units
+            signs = {"LPS": (1, 1, 1), "RAS": (-1, -1, 1)}[markup.get("coordinateSystem", "LPS")]
+            for i, point in enumerate(markup["controlPoints"]):
+                if point.get("positionStatus", "defined") == "defined":
+                    name = point.get("label", i)
+                    if not isinstance(name, str | int):
+                        raise ValueError(f"point {i} has a label that is no text")
+                    position = _numbers(point["position"])
+                    if position is None:
+                        raise ValueError(f"point {i} has a position that is no [x, y, z]")
+                    pairs.append((str(name), position * signs))
+    if str(own_unit) not in UNITS and unit is None:
+        raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
+    return Found(pairs, own_unit)
+
+
+_FIDUCIALS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID".split(",")
+_FIDUCIALS_OLD = "label,x,y,z,sel,vis".split(",")            # of 3D Slicer 3
+_DEFINED = "2"                       # what 3D Slicer 5 writes behind these columns of a point that was placed
+
+
+def _fiducials(path: Path, data: bytes) -> Found:
+    """The points of an .fcsv file of 3D Slicer, in LPS: without a word of the axes they are RAS."""
+    heading = [line.lstrip(b"# ").strip() for line in data.splitlines() if line.startswith(b"#")]
+    told = [line.split(b"=")[1].strip() for line in heading if re.match(rb"(?i)coordinatesystem *=", line)]
+    signs = {b"0": (-1, -1, 1), b"RAS": (-1, -1, 1), b"1": (1, 1, 1), b"LPS": (1, 1, 1)}.get(*told or [b"RAS"])
+    if signs is None:
+        raise MeshFileError(f"{path}: expected CoordinateSystem = LPS or RAS (1 or 0), found {quote(told[0])}")
+    named = [line.split(b"=")[-1].strip().decode().split(",") for line in heading if b",x,y,z," in line + b","]
+    pairs: _Points = []
+    lines = Lines(path, b"\n".join(b"" if line.startswith(b"#") else line for line in data.splitlines()))
+    for row in range(len(lines)):
+        words = _cells(lines, row, ",")
+        columns = named[0] if named else _FIDUCIALS if len(words) > len(_FIDUCIALS_OLD) else _FIDUCIALS_OLD
+        if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != _DEFINED:
+            continue
+        pairs.append(_named_point(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
+    return Found([(name, point * signs) for name, point in pairs], "mm")
+
+
+def _as_meshed(found: Found, unit: str | None, mesh: Mesh | None) -> Found:
+    """Points of 3D Slicer, in LPS as it writes meshes; in RAS, where the mesh at hand shows that they were meant so."""
+    if mesh is None or not all((np.abs(np.asarray(p)) <= FARTHEST).all() for _, p in found.pairs) or not found.pairs:
+        return found
+    points = UNITS[unit or found.unit or "mm"] * np.array([p for _, p in found.pairs])
+    tree, flip = cKDTree(mesh.vertices), np.array([-1, -1, 1])
+    if tree.query(points * flip)[0].sum() >= tree.query(points)[0].sum():
+        return found
+    return Found([(name, np.asarray(p) * flip) for name, p in found.pairs], found.unit)
+
+
+def _picked_points(path: Path, data: bytes) -> _Points:
+    """Points of MeshLab's PickPoints; those of a template that were not picked are inactive and left out."""
+    pairs = []
+    with storage.taking_apart(path, "picked points of MeshLab with x, y, z and name", MeshFileError):
+        for i, point in enumerate(ElementTree.fromstring(data).iter("point"), 1):
+            if point.attrib.get("active", "1") == "0":
+                continue
+            lacking = [name for name in ("x", "y", "z", "name") if name not in point.attrib]
+            if lacking:
+                raise ValueError(f"point {i} has no {lacking[0]}")
+            place = _numbers([point.attrib[axis] for axis in "xyz"])
+            if place is None:
+                raise ValueError(f"point {i}, {quote(point.attrib['name'])}, lies at no numbers")
+            pairs.append((point.attrib["name"], place))
+    return pairs
+
+
+def _marker_set(path: Path, data: bytes) -> _Points:
+    """The markers of OpenSim, which must be in one frame: what others are on is known with its model only."""
+    markers = read_marker_set(path, data)
+    frames = {frame: name for name, (frame, _) in reversed(markers.items())}
+    if len(frames) > 1:
+        (one, a), (other, b), *_ = sorted(frames.items())
+        raise MeshFileError(f"{path}: expected markers in one frame, found '{a}' on {one} and '{b}' on {other}: where "
+                            "these are OpenSim's model tells; write the markers of a pose from there, as TRC")
+    return [(name, place) for name, (_, place) in markers.items()]
+
+
+def read_marker_set(path: Path, data: bytes) -> dict[str, tuple[str, np.ndarray]]:
+    """Name -> the body or frame, and the place (3,) in it, metres, of every marker of OpenSim's; MeshFileError."""
+    found: dict[str, tuple[str, np.ndarray]] = {}
+    with storage.taking_apart(path, "a MarkerSet of OpenSim", MeshFileError):
+        for i, marker in enumerate(ElementTree.fromstring(data).iter("Marker"), 1):
+            name = marker.get("name", "")
+            frame = marker.findtext("socket_parent_frame") or marker.findtext("body")       # of version 4, and before
+            place = _numbers((marker.findtext("location") or "").split())
+            if not name or frame is None or place is None:
+                lacking = "name" if not name else "socket_parent_frame or body" if frame is None else "location x y z"
+                raise ValueError(f"marker {i} {quote(name)} has no {lacking}")
+            if name in found:
+                raise MeshFileError(f"{path}: landmark '{name}' comes twice")
+            found[name] = frame.strip().rpartition("/")[2], place
+    return found
+
+
+def _table(lines: Lines) -> _Points:
+    """Rows below a heading that has name (or label, landmark, id), x, y and z among its columns."""
+    if not len(lines):
+        return []
+    mark = max(",;\t", key=lambda sign: lines.text[0].count(sign.encode()))
+    columns = [word.lower() for word in _cells(lines, 0, mark)]
+    name = next((word for word in ("name", "label", "landmark", "id") if word in columns), None)
+    if name is None or not {"x", "y", "z"} <= {*columns}:
+        raise lines.fail(0, "a heading with name, x, y, z")
+    return [_named_point(lines, row, dict(zip(columns, _cells(lines, row, mark), strict=False)), name,
+                         mark.join(columns)) for row in range(1, len(lines))]
+
+
+def _cells(lines: Lines, row: int, mark: str) -> list[str]:
+    try:
+        text = lines.text[row].decode("utf-8-sig")
+        return [word.strip() for word in next(csv.reader([text], delimiter=mark, strict=True))]
+    except (csv.Error, UnicodeDecodeError, StopIteration):
+        raise lines.fail(row, f"text in columns, parted by {mark!r}") from None
+
+
+def _named_point(lines: Lines, row: int, cells: dict[str, str], name: str, expected: str) -> tuple[str, np.ndarray]:
+    point = _numbers([cells.get(axis) for axis in "xyz"])
+    if point is None or not cells.get(name) or not np.isfinite(point).all():
+        raise lines.fail(row, expected)
+    return cells[name], point
+
+
+def _named_rows(lines: Lines, count: int, expected: str, encoding: str, heading: bytes | None = None
+                ) -> list[tuple[str, Entry]]:
+    """Lines of so many numbers, the last three of them x, y, z, and a name; those with `heading` in them left out."""
+    pairs: list[tuple[str, Entry]] = []
+    for row, line in enumerate(lines.text):
+        if heading is not None and heading in line:
+            continue
+        words = line.split(None, count)
+        try:
+            numbers = [float(word) for word in words[:count]]
+            pairs.append((b" ".join(words[count].split()).decode(encoding), np.array(numbers[-3:])))
+        except (ValueError, IndexError):
+            raise lines.fail(row, expected) from None
+    return pairs

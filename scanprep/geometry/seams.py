@@ -1,0 +1,48 @@
+"""Seams: where a file repeats vertices, for flat shading or a chart of textures, and so cuts its surface apart."""
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """Which vertex (N,) int, of those that are left, each vertex is where the seams of a mesh are closed.
+
+    A seam is where two borders run through the very same places; nothing else is merged, so meshes without seams keep
+    their vertices, also those that touch, and the vertices that are left keep their order. None without any seam.
+    """
+    ends = _border(faces, len(vertices))
+    if not len(ends):
+        return None
+    place = np.full(len(vertices), -1)
+    used = np.unique(ends)
+    rows = np.ascontiguousarray(vertices[used] + 0.0, dtype=np.float64)           # + 0.0: minus zero is zero
+    place[used] = np.unique(rows.view(np.dtype((np.void, 24))).ravel(), return_inverse=True)[1]
+    ends = np.where((place[ends[:, 0]] > place[ends[:, 1]])[:, None], ends[:, ::-1], ends)
+    ends = ends[place[ends[:, 0]] < place[ends[:, 1]]]
+    key = place[ends[:, 0]] * len(vertices) + place[ends[:, 1]]
+    order = np.argsort(key, kind="stable")
+    again = np.flatnonzero(np.diff(key[order]) == 0)
+    if not len(again):
+        return None
+    a, b = ends[order[again]].ravel(), ends[order[again + 1]].ravel()
+    _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(vertices),) * 2), directed=False)
+    first = np.unique(label, return_index=True)[1]
+    return np.argsort(np.argsort(first))[label]
+
+
+def _border(faces: np.ndarray, count: int) -> np.ndarray:
+    """(B, 2) the edges of one triangle only."""
+    half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    key = half.min(axis=1) * count + half.max(axis=1)
+    order = np.argsort(key)
+    new = np.r_[True, np.diff(key[order]) != 0, True]
+    return half[order[new[1:] & new[:-1]]]
+
+
+def merged_mean(values: np.ndarray, vertex_of: np.ndarray) -> np.ndarray:
+    """(n, k) the mean over the vertices that became one; `values` (N, k), `vertex_of` (N,) as of `seams_closed`."""
+    total = np.zeros((vertex_of.max() + 1, values.shape[1]))
+    np.add.at(total, vertex_of, values)
+    return total / np.bincount(vertex_of)[:, None]

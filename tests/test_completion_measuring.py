@@ -1,0 +1,160 @@
+"""`scape measure`: sets, completions, betas and meshes in, a table and a page out; the body of some measurements."""
+import csv
+import json
+
+import numpy as np
+import pytest
+from people_bodies import kept, small_people
+
+from completion.__main__ import main
+from completion.partial.completion import Completion, save_completion
+from model import find_tapes, measure
+from model.measurement.catalogue import CATALOGUE
+from scanprep import RegisteredSet, write_mesh
+from scanprep.judgement import Judgement
+from scanprep.synthetic.people import BodyShape, Person
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A model, its template's own body at rest, somebody in a pose, and betas."""
+    folder, model = tmp_path_factory.mktemp("measure"), small_people()
+    model.save(folder / "model.npz")
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    bent = rest.copy()
+    bent[4, 1], bent[7, 1], bent[11, 0] = 1.1, -1.1, 0.9
+    for name, vertices in (("rest", model.vertices(rest)), ("bent", model.vertices(bent))):
+        write_mesh(folder / "bodies" / f"{name}.ply", model.template.with_vertices(vertices))
+    (folder / "somebody.json").write_text(json.dumps({"betas": [0.8, -0.5]}))
+    (folder / "people" / "anna").mkdir(parents=True)                       # as scape mosh writes them
+    (folder / "people" / "anna" / "subject.json").write_text(json.dumps({"betas": [0.8, -0.5], "layout": "cmu41"}))
+    (folder / "marks.json").write_text(json.dumps(model.info["landmarks"]))
+    return folder
+
+
+def scape(*words):
+    return main(["measure", *map(str, words)])
+
+
+def table(path):
+    """Rows of a table by the name of the body."""
+    with path.open(encoding="utf-8") as lines:
+        return {row["body"]: row for row in csv.DictReader(lines)}
+
+
+def test_a_folder_and_betas_with_their_model(folder, tmp_path, capsys):
+    """A bent body is measured as it stands upright; the page and the report are there, the values those of Python."""
+    assert scape(folder / "bodies", folder / "somebody.json", folder / "people", "-m", folder / "model.npz", "-o",
+                 tmp_path / "all.csv") == 0
+    rows, model = table(tmp_path / "all.csv"), small_people()
+    assert list(rows) == ["bent", "rest", "somebody", "anna"]
+    assert list(rows["anna"].values())[1:] == list(rows["somebody"].values())[1:]
+    assert list(rows["rest"])[:3] == ["body", "stature", "neck_height"] and len(rows["rest"]) == 2 + 2 * len(CATALOGUE)
+    tapes = find_tapes(model.template, model.info["landmarks"])
+    true = measure(model.vertices(np.zeros((16, 3))), tapes, tapes.axes).values
+    for name in ("stature", "waist_girth", "upper_arm_girth_left", "knee_girth_left"):
+        assert float(rows["rest"][name]) == pytest.approx(true[name], abs=0.003), name
+        assert float(rows["bent"][name]) == pytest.approx(true[name], abs=0.006), name
+    assert rows["rest"]["waist_girth_error"] == ""
+    page = (tmp_path / "all.html").read_text(encoding="utf-8")
+    assert "4 bodies, measured" in page and "back waist length, ISO 8559-1" in page
+    report = (tmp_path / "all.csv.report.json").read_text(encoding="utf-8")
+    assert "NaN" not in report and json.loads(report)["judgement"]["verdict"] == "good"
+
+
+def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys):
+    rest, bent = (folder / "bodies" / f"{name}.ply" for name in ("rest", "bent"))
+    assert scape(rest, bent, "--landmarks", folder / "marks.json", "-o", tmp_path / "m.csv") == 0
+    said = capsys.readouterr().err
+    assert "LOOK AT THE RESULT: bent: the left shin is turned by 50 degrees" in said, said
+    assert "name the model with -m" in said
+    assert table(tmp_path / "m.csv")["bent"]["note"].startswith("the left shin is turned by")
+
+
+def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
+    person = Person(BodyShape(weight=1.0))
+    bodies = RegisteredSet.create(tmp_path / "set", person.mesh)
+    bodies.add("one", person.mesh, subject="a")
+    assert scape(tmp_path / "set", "-o", tmp_path / "set.csv") == 0
+    row = table(tmp_path / "set.csv")["one"]
+    assert float(row["stature"]) == pytest.approx(person.shape.stature, abs=0.005) and row["note"] == ""
+
+
+def test_a_completion_states_errors(folder, tmp_path):
+    """Those that expected errors of its vertices imply; its report names the model."""
+    model, person = small_people(), Person(BodyShape(sex=0.3))
+    body = model.template.with_vertices(person.mesh.vertices[kept()])
+    n = len(body.vertices)
+    done = Completion(body, body, np.zeros((16, 3)), np.zeros(4), np.zeros(3), np.ones(n, bool), 0.001, 1.0, 0.001,
+                      True, 3, expected_error=np.full(n, 0.004), judgement=Judgement())
+    save_completion(tmp_path / "whole", done)
+    (tmp_path / "whole" / "report.json").write_text(json.dumps({"settings": {"model": str(folder / "model.npz")}}))
+    assert scape(tmp_path / "whole", "-o", tmp_path / "m.csv") == 0
+    row = table(tmp_path / "m.csv")["whole"]
+    assert 0.0005 < float(row["waist_girth_error"]) < 0.02
+    assert abs(float(row["stature"]) - person.shape.stature) < 0.01
+
+
+def test_the_body_of_some_measurements(folder, tmp_path, capsys):
+    """It has them, and its betas are a subject of other commands."""
+    assert scape("-m", folder / "model.npz", "--to", "stature=1.72", "waist=0.82", "-o", tmp_path / "body.ply") == 0
+    assert scape(tmp_path / "body.ply", tmp_path / "body.betas.json", "-m", folder / "model.npz", "-o",
+                 tmp_path / "m.csv") == 0
+    with (tmp_path / "m.csv").open() as lines:
+        for row in csv.DictReader(lines):
+            assert float(row["stature"]) == pytest.approx(1.72, abs=0.003)
+            assert float(row["waist_girth"]) == pytest.approx(0.82, abs=0.003)
+    assert (tmp_path / "body.html").exists()
+
+
+@pytest.mark.parametrize(("words", "told"), [
+    (["-m", "model.npz", "--to", "stature=4", "-o", "b.ply"], "stature=4: expected 1.2 to 2.4 m, which people measure"),
+    (["-m", "model.npz", "--to", "waist=0.01", "-o", "b.ply"], "waist=0.01: expected 0.4 to 2.2 m"),
+    (["-m", "model.npz", "--to", "waist", "-o", "b.ply"], "--to: expected name=metres, such as waist=0.85, got waist"),
+    (["-m", "model.npz", "--to", "shoe=1", "-o", "b.ply"], "no measurement 'shoe'; there are: stature"),
+    (["bodies", "-m", "model.npz", "--to", "waist=0.8", "-o", "b.ply"], "--to makes a body from measurements"),
+    (["-o", "m.csv"], "BODY: expected at least one body to measure"),
+    (["nowhere", "-o", "m.csv"], "nowhere: there is no such file or folder"),
+    (["bodies", "-o", "m.xlsx"], "expected the name of a table, such as measures.csv"),
+    (["bodies", "-o", "m.csv"], "measuring begins at landmarks of the template, and there are none"),
+    (["bodies", "--landmarks", "marks.json", "-o", "m.csv"], "bodies/bent.ply: it is the template of all bodies, as no "
+     "model is named, and does not stand upright: the left shin is "),
+    (["somebody.json", "-o", "m.csv"], "somebody.json: betas need their model; name it with -m")])
+def test_one_line_for_what_is_wrong(folder, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(folder)
+    before = sorted(p.name for p in folder.iterdir())
+    assert scape(*words) == 1
+    said = capsys.readouterr().err.strip().splitlines()
+    assert told in said[-1] and len(said) == 1
+    assert sorted(p.name for p in folder.iterdir()) == before
+
+
+def test_other_triangles_are_refused(folder, tmp_path, capsys):
+    write_mesh(tmp_path / "other.ply", Person().mesh)
+    assert scape(folder / "bodies" / "rest.ply", tmp_path / "other.ply", "--landmarks", folder / "marks.json", "-o",
+                 tmp_path / "m.csv") == 1
+    assert "expected the triangles of" in capsys.readouterr().err
+
+
+def test_a_wrong_unit_is_told(folder, tmp_path, capsys):
+    """A body of 17 m means nothing."""
+    model = small_people()
+    write_mesh(tmp_path / "giant.ply", model.template.with_vertices(10 * model.vertices(np.zeros((16, 3)))))
+    assert scape(tmp_path / "giant.ply", "--landmarks", folder / "marks.json", "-o", tmp_path / "m.csv") == 1
+    assert "giant: no person measures so, stature" in capsys.readouterr().err
+
+
+def test_a_hole_leaves_a_cell_empty(folder, tmp_path, capsys):
+    """The row says why, and no NaN is anywhere."""
+    model = small_people()
+    body = model.template.with_vertices(model.vertices(np.zeros((16, 3))))
+    tapes = find_tapes(model.template, model.info["landmarks"])
+    calf = np.unique(tapes.found["calf_girth_left"].ring.edges[:2])
+    opened = type(body)(body.vertices, body.faces[~np.isin(body.faces, calf).any(axis=1)])
+    write_mesh(tmp_path / "open.ply", opened)
+    assert scape(tmp_path / "open.ply", "--landmarks", folder / "marks.json", "-o", tmp_path / "m.csv") == 0
+    row = table(tmp_path / "m.csv")["open"]
+    assert row["calf_girth_left"] == "" and "calf_girth_left: a hole of the template crosses it" in row["note"]
+    assert row["waist_girth"] != "" and "nan" not in (tmp_path / "m.csv").read_text().lower()
+    said = capsys.readouterr().err
+    assert "LOOK AT THE RESULT: open: no knee girth left, a hole" in said, said

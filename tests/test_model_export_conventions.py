@@ -1,0 +1,271 @@
+"""Rigs as animation programs expect them: root, names, bones along the limbs, on the ground, to the viewer."""
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bvh_reader import Bvh
+from glb_reader import Glb
+from model_bodies import random_poses, worm_model
+
+from model.export.bvh import write_bvh
+from model.export.cli import export
+from model.export.conventions import aimed, for_programs
+from model.export.correctives import motion_correctives
+from model.export.glb import skinned_glb, write_skinned_glb
+from model.export.names import names_of
+from model.export.rig import carried, joint_places, make_rig, rerooted
+from model.motion.roles import find_roles
+from model.posing.cli import mesh
+from model.statue.control.files import humanoid, read_control
+from scanprep.command_line import run
+from scanprep.geometry import rotations
+from scanprep.geometry.files import read_mesh
+from scanprep.geometry.format_glb import turn_up
+from scanprep.pictures.camera import stance
+from scanprep.skeleton.tree import Skeleton
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_model()
+
+
+@pytest.fixture(scope="module")
+def rig(model):
+    return make_rig(model, np.array([0.5, -1.0]), 3)
+
+
+@pytest.fixture(scope="module")
+def motion(model):
+    rng = np.random.default_rng(0)
+    return random_poses(model, 5, rng, 0.8), rng.normal(size=(5, 3))
+
+
+@pytest.fixture(scope="module")
+def person():
+    return humanoid().rig
+
+
+def swaying(rig, frames=6):
+    rng = np.random.default_rng(1)
+    return 0.3 * rng.normal(size=(frames, len(rig.skeleton.parents), 3)), rng.normal(size=(frames, 3))
+
+
+@pytest.mark.parametrize("root", ["part0", "part1", "part2", "part3"])
+def test_another_root_moves_the_same_surface(rig, motion, root):
+    poses, trans = motion
+    other, turned, moved = rerooted(rig, poses, trans, root)
+    assert other.skeleton.names[0] == root and set(other.skeleton.names) == set(rig.skeleton.names)
+    assert np.abs(other.vertices(turned, moved) - rig.vertices(poses, trans)).max() < 1e-12
+
+    def links(one):
+        return {frozenset((name, one.skeleton.names[p])): tuple(np.round(one.skeleton.joints[j], 12))
+                for j, (name, p) in enumerate(zip(one.skeleton.names, one.skeleton.parents, strict=True)) if j}
+
+    assert links(other) == links(rig), "the joints between parts stay where they are"
+    inside = other.skeleton.part_of_vertex(rig.mesh) == 0
+    assert np.allclose(other.skeleton.joints[0], rig.mesh.vertices[inside].mean(axis=0), atol=1e-12)
+    back, again, places = rerooted(other, turned, moved, "part0")
+    assert np.abs(rotations.exp(again[:, [back.skeleton.names.index(n) for n in rig.skeleton.names]])
+                  - rotations.exp(poses)).max() < 1e-9
+    assert np.abs(places + back.skeleton.joints[0] - trans - rig.skeleton.joints[0]).max() < 1e-2     # the centroid
+    still = rerooted(rig, poses[:0], trans[:0], root)
+    assert still[1].shape == (0, 4, 3) and still[2].shape == (0, 3)
+
+
+def test_body_at_rest_and_motion_are_carried_apart(rig, motion):
+    Q, W = rotations.exp(np.array([[0.2, 1, 0], [0.3, -2, 1]]))
+    shift, step = np.array([1.0, 2, 3]), np.array([-1.0, 0, 5])
+    moved, poses, trans = carried(rig, *motion, (Q, shift), (W, step))
+    assert np.abs(moved.vertices(poses, trans) - (rig.vertices(*motion) @ W.T + step)).max() < 1e-12
+    assert np.abs(moved.mesh.vertices - (rig.mesh.vertices @ Q.T + shift)).max() < 1e-12
+
+
+def test_bones_of_any_axes_show_the_same(rig, motion):
+    axes = rotations.exp(np.random.default_rng(5).normal(size=(4, 3)))
+    subject = worm_model().subject(np.array([0.5, -1.0]))
+    rig = replace(rig, correctives=motion_correctives(rig, subject, motion[0]))
+    other, plain = Glb(skinned_glb(replace(rig, axes=axes), *motion, 4.0)), Glb(skinned_glb(rig, *motion, 4.0))
+    assert np.abs(other.skinned() - plain.skinned()).max() < 1e-6
+    U = turn_up(2)
+    for t in range(5):
+        assert np.abs(other.skinned(t) - plain.skinned(t)).max() < 1e-5
+    world = other.matrices()
+    for j in range(4):
+        assert np.abs(world[j + 1][:3, :3] - U @ axes[j]).max() < 1e-6
+        assert np.abs(world[j + 1][:3, 3] - U @ rig.skeleton.joints[j]).max() < 1e-6
+
+
+def test_bones_point_along_the_limbs(person):
+    rig = aimed(person, 2)
+    names, joints = rig.skeleton.names, rig.skeleton.joints
+    assert np.allclose(np.linalg.det(rig.axes), 1)
+    for part, child in (("humanoid_root", "vl5"), ("vl5", "skullbase"), ("l_shoulder", "l_elbow"),
+                        ("l_elbow", "l_wrist"), ("r_hip", "r_knee"), ("r_knee", "r_ankle")):
+        way = joints[names.index(child)] - joints[names.index(part)]
+        assert np.allclose(rig.axes[names.index(part)][:, 1], way / np.linalg.norm(way)), part
+    vertical, ahead = stance(person.mesh, vertical=np.eye(3)[2])
+    aside = np.cross(vertical, ahead)
+    for part in ("l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle"):
+        assert rig.axes[names.index(part)][:, 0] @ aside < -0.9, "the hinge of a leg points to the right"
+    for name in (n for n in names if n.startswith("l_")):
+        left, right = rig.axes[names.index(name)], rig.axes[names.index("r" + name[1:])]
+        mirror = np.eye(3) - 2 * np.outer(aside, aside)
+        assert np.allclose(mirror @ left[:, 1:], right[:, 1:], atol=0.05), "of both sides mirror each other"
+    assert rig.axes[names.index("skullbase")][:, 1] @ vertical > 0.9, "a leaf points to the end of its surface"
+
+
+def chain(*names, places=()):
+    """A skeleton of parts in a row along x, at some places or 1 m apart, metres."""
+    n = len(names)
+    x = np.array(places) if places else np.arange(n)
+    return Skeleton(np.arange(n), np.arange(-1, n - 1), np.c_[x, 0 * x, 0 * x], names)
+
+
+def test_names_of_other_programs():
+    parts = chain("pelvis", "abdomen", "chest", "head", "upper_arm_left", "hand_right", "thigh_right", "shin_left",
+                  "tail")
+    assert names_of(parts, "mixamo") == {
+        "pelvis": "mixamorig:Hips", "abdomen": "mixamorig:Spine", "chest": "mixamorig:Spine1",
+        "head": "mixamorig:Head", "upper_arm_left": "mixamorig:LeftArm", "hand_right": "mixamorig:RightHand",
+        "thigh_right": "mixamorig:RightUpLeg", "shin_left": "mixamorig:LeftLeg"}
+    assert names_of(parts, "opensim") == {
+        "pelvis": "pelvis", "chest": "torso", "head": "head", "upper_arm_left": "humerus_l", "hand_right": "hand_r",
+        "thigh_right": "femur_r", "shin_left": "tibia_l"}
+    four = chain("pelvis", *(f"{limb}{k}_left" for limb in ("arm", "leg") for k in (1, 2, 3, 4)),
+                 places=(0, 0.1, 0.2, 0.5, 0.8, 1.0, 1.2, 1.45, 1.9))                # a clavicle, a thigh in two pieces
+    assert names_of(four, "vrm") == dict(zip((n for n in four.names if n != "leg2_left"), [
+        "hips", "leftShoulder", "leftUpperArm", "leftLowerArm", "leftHand", "leftUpperLeg", "leftLowerLeg",
+        "leftFoot"], strict=True))
+    with pytest.raises(ValueError, match=r"names: expected a person's parts .* found part0, part1"):
+        names_of(chain("part0", "part1"), "vrm")
+
+
+@pytest.mark.parametrize("kind", ["mixamo", "vrm", "h-anim", "opensim"])
+def test_names_are_read_as_the_same_joints(kind):
+    """What we read other programs' skeletons by finds the same joints under the new names."""
+    limbs = [f"{part}_{side}" for side in ("left", "right")
+             for part in ("shoulder", "upper_arm", "forearm", "hand", "thigh", "shin", "foot")]
+    parts = chain("pelvis", "abdomen", "chest", "neck", "head", *limbs)
+    named = names_of(parts, kind)
+    assert len(set(named.values())) == len(named)
+    before, after = find_roles(parts.names), find_roles([named.get(name, name) for name in parts.names])
+    assert {role: j for role, j in after.items() if role != "vl5"} == {
+        role: j for role, j in before.items() if role != "vl5"}
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.1, -2.5])
+def test_soles_on_the_ground_and_face_to_the_viewer(person, turn):
+    """However it stood before: z up and -y to the viewer, which is y up and +z in GLB."""
+    R = rotations.exp(np.array([0, 0, turn]))
+    poses, trans = swaying(person)
+    poses[:, 0] *= 0.1
+    before = person.moved(R, np.array([3.0, 4, 5]))
+    turns = poses @ R.T
+    turns[:, 0] = rotations.log(rotations.exp(turns[:, 0]) @ rotations.exp(np.array([0, 0, 2.0])))
+    rig, new, places = for_programs(before, turns, trans, 2, "vl5", None, ground=True, front=True)
+    assert rig.mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-12)
+    assert np.allclose(stance(rig.mesh, vertical=np.eye(3)[2])[1], [0, -1, 0], atol=1e-6)
+    shown = rig.vertices(new, places)
+    assert shown[..., 2].min() == pytest.approx(0, abs=1e-12)
+    ahead = rig.skeleton.part_rotations(new)[:, rig.skeleton.names.index("humanoid_root")].mean(axis=0) @ [0, -1, 0]
+    assert ahead[1] < 0 and abs(ahead[0]) < 1e-3 * abs(ahead[1])
+    old = before.vertices(turns, trans)
+    apart = np.linalg.norm(old[:, :, None, :][:, ::200] - old[:, None, ::200], axis=-1)
+    assert np.allclose(np.linalg.norm(shown[:, ::200, None] - shown[:, None, ::200], axis=-1), apart, atol=1e-9)
+    glb = Glb(skinned_glb(rig, new, places))
+    assert glb.skinned()[:, 1].min() == pytest.approx(0, abs=1e-6)
+
+
+def test_a_control_mesh_is_read_from_bones_along_the_limbs(person, tmp_path):
+    write_skinned_glb(tmp_path / "plain.glb", person)
+    write_skinned_glb(tmp_path / "aimed.glb", aimed(person, 2))
+    plain, other = read_control(tmp_path / "plain.glb"), read_control(tmp_path / "aimed.glb")
+    assert np.abs(plain.mesh.vertices - other.mesh.vertices).max() < 1e-6
+    assert np.abs(plain.skeleton.joints - other.skeleton.joints).max() < 1e-6
+    pose = 0.3 * np.random.default_rng(3).normal(size=(17, 3))
+    assert np.abs(plain.rig.vertices(pose) - other.rig.vertices(pose)).max() < 1e-5
+
+
+@pytest.fixture(scope="module")
+def files(model, motion, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export")
+    named = replace(model, skeleton=replace(model.skeleton, names=("chest", "pelvis", "head", "tail")))
+    named.save(folder / "named.npz")
+    model.save(folder / "model.npz")
+    np.savez(folder / "motion.npz", poses=motion[0].reshape(5, -1), trans=motion[1], betas=np.array([0.5, -1.0]),
+             mocap_frame_rate=np.array(4.0), surface_model_type=np.array("scape"))
+    return folder
+
+
+def test_the_command_has_root_names_ground_and_front(files, model, rig, motion):
+    told = []
+    for name in ("a.glb", "b.bvh"):
+        assert run(export, "scape model export", [
+            str(files / "named.npz"), "-o", str(files / name), "--motion", str(files / "motion.npz"), "--root",
+            "pelvis", "--names", "mixamo", "--ground", "--up", "1"]) == 0
+        told.append({m["metric"]: m["value"] for path in files.glob(f"{name[0]}*.json")
+                     for m in json.loads(path.read_text())["metrics"]})
+        assert told[-1]["root"] == "mixamorig:Hips" and told[-1]["parts without a name of mixamo"] == "tail"
+    glb, bvh = Glb((files / "a.glb").read_bytes()), Bvh((files / "b.bvh").read_text())
+    assert glb.json["nodes"][1]["name"] == "mixamorig:Hips" == bvh.names[0]
+    exact = model.subject(np.array([0.5, -1.0])).vertices(*motion)
+    exact = exact - [0, rig.vertices(*motion)[..., 1].min(), 0]
+    off = [1000 * np.linalg.norm(glb.skinned(t) - exact[t], axis=1) for t in range(5)]
+    assert np.mean(off) == pytest.approx(told[0]["distance from exact body, mean"], rel=1e-2) and np.mean(off) < 1
+    for t in range(5):
+        world, places = glb.matrices(t), bvh.positions(t)
+        for j, node in enumerate(glb.json["nodes"][1:], 1):
+            assert np.abs(world[j][:3, 3] - 0.01 * places[node["name"]]).max() < 1e-5
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--root", "nose"], "root: expected a part of the body (part0, part1, part2, part3), got 'nose'"),
+    (["--names", "vrm"], "names: expected a person's parts (pelvis, thigh_left, ...)")])
+def test_the_command_refuses_in_one_line(files, arguments, words, capsys):
+    assert run(export, "scape model export", [str(files / "model.npz"), "-o", str(files / "c.glb"), *arguments]) == 1
+    error = capsys.readouterr().err
+    assert words in error and not (files / "c.glb").exists()
+
+
+@pytest.mark.parametrize("name", ["d.ply", "d.glb"])
+def test_a_mesh_stands_on_the_ground_and_looks_at_the_viewer(files, model, name):
+    arguments = [str(files / "model.npz"), "-o", str(files / name), "--own-body"]
+    assert run(mesh, "scape model mesh", [*arguments, "--ground", "--front"]) == 0
+    body = read_mesh(files / name, "m")
+    up = int(np.ptp(model.template.vertices, axis=0).argmax())
+    assert body.vertices[:, up].min() == pytest.approx(0, abs=1e-7)
+    ahead = stance(body, vertical=np.eye(3)[up])[1]                      # a worm has no face: either end of the line
+    assert np.abs(ahead @ turn_up(up).T @ [0, 0, 1]) == pytest.approx(1, abs=1e-9)
+
+
+def test_joints_of_a_rerooted_motion_stand_where_they_stood(rig, motion):
+    other, poses, trans = rerooted(rig, *motion, "part3")
+    now, before = joint_places(other.skeleton, poses, trans), joint_places(rig.skeleton, *motion)
+    for j in range(1, 4):
+        assert np.abs(now[:, 1:] - before[:, [j]]).max(axis=(0, 2)).min() < 1e-12
+
+
+def test_blender_shows_the_same(tmp_path):
+    """The whole motion of surface and joints, with correctives, other root, other names."""
+    pytest.importorskip("bpy", reason="Blender as a module (pip install bpy)")
+    from blender_reader import evaluated
+
+    poses, trans = swaying(worm_rig := make_rig(worm_model(), np.array([0.5, -1.0]), 2))
+    subject = worm_model().subject(np.array([0.5, -1.0]))
+    made = replace(worm_rig, correctives=motion_correctives(worm_rig, subject, poses))
+    made, turns, places = for_programs(made, poses, trans, 2, "part2")
+    write_skinned_glb(tmp_path / "a.glb", made, turns, places, 4.0)
+    write_bvh(tmp_path / "a.bvh", made.skeleton, turns, places, 4.0, body=made.mesh)
+    times, U = np.arange(6) / 4, turn_up(2).T
+    off = np.linalg.norm(evaluated(tmp_path / "a.glb", times) - subject.vertices(poses, trans) @ U, axis=2)
+    assert off.mean() < 1e-3 and np.linalg.norm(rig_off(worm_rig, subject, poses), axis=2).mean() > 3 * off.mean()
+    shown = evaluated(tmp_path / "a.glb", times, made.skeleton.names)
+    joints = joint_places(made.skeleton, turns, places) @ U
+    assert np.abs(shown - joints).max() < 1e-5
+    assert np.abs(evaluated(tmp_path / "a.bvh", times, made.skeleton.names) - joints).max() < 1e-4
+
+
+def rig_off(rig, subject, poses):
+    return rig.vertices(poses) - subject.vertices(poses)

@@ -1,0 +1,283 @@
+"""Measurements: known sections and ways, two derivations of a girth, derivatives, what is carried, what is missing."""
+import dataclasses
+
+import numpy as np
+import pytest
+from people_bodies import kept, small_people
+from scipy.spatial import ConvexHull
+
+from model import body_with_measurements, find_tapes, measure
+from model.measurement import reading
+from model.measurement.catalogue import CATALOGUE, named
+from model.measurement.marks import MIDDLE, PAIRED, known_landmarks
+from model.measurement.path import shortest_path
+from model.measurement.reading import Standing
+from model.measurement.section import around, bulge, direction, mean_of, section, tape
+from model.measurement.tapes import Girth, Span, Way
+from model.measurement.uncertainty import measured_error
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.rotations import exp
+from scanprep.synthetic.body_parts import body_surface
+from scanprep.synthetic.landmarks import landmarks
+from scanprep.synthetic.people import BodyShape, Person
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def person():
+    return Person(BodyShape(sex=-0.6, weight=0.8, chest=0.7))
+
+
+@pytest.fixture(scope="module")
+def tapes():
+    return find_tapes(Person().mesh, landmarks())
+
+
+@pytest.fixture(scope="module")
+def small_tapes():
+    return find_tapes(small_people().template, small_people().info["landmarks"])
+
+
+def tube(radius=0.05, height=0.4, around=40, rings=31, profile=None):
+    """A tube without ends about z; `profile` (angle) -> radius."""
+    angle = 2 * np.pi * np.arange(around) / around
+    far = np.full(around, radius) if profile is None else profile(angle)
+    ring = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=1)
+    vertices = np.array([[*xy, z] for z in np.linspace(0, height, rings) for xy in ring])
+    a = np.arange(around * (rings - 1)).reshape(rings - 1, around)
+    b = np.roll(a, -1, axis=1)
+    return Mesh(vertices, np.stack([a, b, a + around, b, b + around, a + around], axis=-1).reshape(-1, 3))
+
+
+def taped(mesh, height, normal=UP):
+    """Length of the tape around a mesh at a height, and of the plain polygon."""
+    curve, = section(mesh.vertices, mesh.faces, height * UP, normal)
+    assert curve.closed
+    points = curve.at(mesh.vertices) + bulge(mesh.vertices, mesh.vertex_normals, curve)
+    hull = tape(points, normal)
+    apart = np.abs(hull - np.roll(hull, 1))
+    return around(points[hull], (apart == 1) | (apart == len(points) - 1))[0], around(curve.at(mesh.vertices))[0]
+
+
+def test_a_tape_around_a_coarse_tube_is_as_long_as_its_circle():
+    """With 14 corners a polygon loses three percent."""
+    smooth, plain = taped(tube(around=14), 0.2037)
+    assert smooth == pytest.approx(2 * np.pi * 0.05, rel=2e-3)
+    assert 0.006 < 1 - plain / (2 * np.pi * 0.05) < 0.03
+
+
+def test_a_tape_across_a_tube_at_a_slant_is_an_ellipse():
+    from scipy.special import ellipe
+
+    tilt = np.radians(30)
+    found, _ = taped(tube(around=160, rings=121), 0.2037, np.array([0, -np.sin(tilt), np.cos(tilt)]))
+    assert found == pytest.approx(4 * 0.05 / np.cos(tilt) * ellipe(np.sin(tilt)**2), rel=1e-3)
+
+
+def test_a_tape_spans_hollows():
+    def profile(angle):
+        return 0.05 * (1 + 0.7 * np.cos(2 * angle))
+
+    mesh = tube(around=400, profile=profile)
+    found, plain = taped(mesh, 0.2037)
+    assert found == pytest.approx(ConvexHull(mesh.vertices[:400, :2]).area, rel=1e-3) and found < 0.95 * plain
+
+
+def test_a_section_that_a_hole_crosses_is_open():
+    mesh = tube()
+    curves = section(mesh.vertices, np.delete(mesh.faces, np.arange(1210, 1230), axis=0), 0.2037 * UP, UP)
+    assert len(curves) == 1 and not curves[0].closed
+    assert section(mesh.vertices, mesh.faces, 2 * UP, UP) == []
+
+
+def test_ways_are_exact():
+    """On a tube as on the plane it unrolls to, up to what the polygon cuts off."""
+    mesh = tube(around=60, rings=81)
+    start, end = 10 * 60 + 3, 70 * 60 + 23
+    length, curve = shortest_path(mesh.vertices, mesh.faces, start, end)
+    edge = 2 * 0.05 * np.sin(np.pi / 60)
+    assert length == pytest.approx(np.hypot(20 * edge, 0.3), rel=1e-9)
+    drawn = np.diff(curve.at(mesh.vertices), axis=0)
+    assert np.linalg.norm(drawn, axis=1).sum() == pytest.approx(length, rel=1e-6)
+    with pytest.raises(ValueError, match="no way along the surface"):
+        two = Mesh(np.concatenate([mesh.vertices, mesh.vertices + 1]), np.concatenate([mesh.faces, mesh.faces + 4860]))
+        shortest_path(two.vertices, two.faces, start, end + 4860)
+
+
+def test_all_is_measured_of_a_person(person, tapes):
+    found = measure(person.mesh, tapes)
+    assert not found.missing and not found.turned and set(found.values) == set(CATALOGUE)
+    for name, value in found.values.items():
+        assert CATALOGUE[name].low < value < CATALOGUE[name].high, name
+    assert found.values["stature"] == pytest.approx(person.shape.stature, abs=0.005)
+    for name in found.values:
+        if name.endswith("_left"):
+            assert found.values[name] == pytest.approx(found.values[name.replace("left", "right")], rel=0.01), name
+
+
+def test_girths_are_those_of_the_surface_itself(person, tapes):
+    """The people's implicit surface, cut without any triangles; plain polygons are 1.6 mm too short."""
+    field, found, corners = body_surface(person.anatomy), measure(person.mesh, tapes, tapes.axes), []
+    for name in ("waist_girth", "hip_girth", "thigh_girth_left", "calf_girth_right", "neck_girth", "wrist_girth_left"):
+        girth = tapes.found[name]
+        origin = girth.centre.at(person.mesh.vertices)
+        normal = UP if girth.axis is None else direction(girth.axis, person.mesh.vertices)
+        true = around_field(field, origin, normal)
+        assert found.values[name] == pytest.approx(true, abs=0.001), name
+        cuts = [c.at(person.mesh.vertices) for c in section(person.mesh.vertices, girth.faces, origin, normal)]
+        mine = min(cuts, key=lambda points: np.linalg.norm(points.mean(axis=0) - origin))
+        corners.append(true - ConvexHull(mine @ np.linalg.svd(normal[None])[2][1:].T).area)
+    assert np.mean(corners) > 0.001
+
+
+def around_field(field, origin, normal):
+    """Tape (metres) around a part of an implicit surface, which is seen from a point inside in all directions."""
+    across, angle = np.linalg.svd(normal[None])[2][1:], 2 * np.pi * np.arange(240) / 240
+    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across
+    inside = np.sign(field(origin[None]))
+    steps = np.arange(0.005, 0.3, 0.005)
+    out = np.sign(field((origin + steps[:, None, None] * ways).reshape(-1, 3))).reshape(len(steps), -1) != inside
+    low = steps[out.argmax(axis=0)] - 0.005
+    high = low + 0.005
+    for _ in range(12):
+        middle = 0.5 * (low + high)
+        within = np.sign(field(origin + middle[:, None] * ways)) == inside
+        low, high = np.where(within, middle, low), np.where(within, high, middle)
+    return ConvexHull(low[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)).area
+
+
+def test_fewer_triangles_measure_the_same(person):
+    """1,000 vertices of the 9,000: the smooth tape makes up for most of what triangles cut off corners."""
+    numbers = {int(v): k for k, v in enumerate(kept())}
+    coarse = Mesh(person.mesh.vertices[kept()], small_people().template.faces)
+    one = measure(person.mesh, find_tapes(person.mesh, landmarks())).values
+    two = measure(coarse, find_tapes(coarse, {name: numbers[v] for name, v in landmarks().items()})).values
+    for name in ("stature", "waist_girth", "hip_girth", "chest_girth", "thigh_girth_left", "calf_girth_left"):
+        assert two[name] == pytest.approx(one[name], rel=0.015), name
+
+
+def test_place_turn_and_size_change_nothing_else(person, tapes):
+    still = measure(person.mesh, tapes).values
+    turned = measure(person.mesh.vertices @ exp(np.array([0.3, -0.5, 2.0])).T + [3, -2, 5], tapes).values
+    larger = measure(1.1 * person.mesh.vertices, tapes).values
+    for name, value in still.items():
+        assert turned[name] == pytest.approx(value, abs=2e-5), name
+        assert larger[name] == pytest.approx(1.1 * value, rel=2e-3), name
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_derivatives_are_finite_differences(person, tapes, smooth, monkeypatch):
+    """Exact on plain triangles, but for ways that change theirs; of the smooth tape its bulge is left out."""
+    if not smooth:
+        monkeypatch.setattr(reading, "bulge", lambda body, normals, curve: 0.0)
+        monkeypatch.setattr(reading, "around", lambda points, near: around(points))
+    rng, axes = np.random.default_rng(0), tapes.axes
+    body = person.mesh.vertices + 1e-4 * rng.normal(size=person.mesh.vertices.shape)       # no two soles alike
+    moves = np.sin(body @ rng.normal(size=(3, 3)) * 3 + rng.normal(size=3))
+    for name, found in tapes.found.items():
+        here, ahead, back = (reading.read(found, Standing(person.mesh.with_vertices(body + step * moves), axes), tapes)
+                             for step in (0, 1e-6, -1e-6))
+        limit = 0.15 if smooth and isinstance(found, Girth | Span) else 0.05 if isinstance(found, Way) else 1e-5
+        assert here.along(moves) == pytest.approx((ahead.value - back.value) / 2e-6, abs=limit), name
+
+
+def test_moved_limbs_are_told(person, tapes):
+    pose = np.zeros((16, 3))
+    pose[4, 1] = 1.2
+    assert [line.split(" is ")[0] for line in measure(person.posed(pose), tapes).turned] == [
+        "the left upper arm", "the left forearm"]
+
+
+def test_names_of_other_templates():
+    """SCAPE's and CAESAR's names are the same places."""
+    every = [*MIDDLE.items(), *PAIRED.items()]
+    for number, sides in ((1, ("left", "right")), (2, ("Lt.", "Rt."))):
+        given = {forms[min(number, len(forms) - 1)].format(side): k for k, (_, forms) in enumerate(every)
+                 for side in (sides if "{}" in forms[0] else ("",))}
+        found = known_landmarks(given)
+        wanted = {full: k for k, (name, forms) in enumerate(every)
+                  for full in ((f"left {name}", f"right {name}") if "{}" in forms[0] else (name,))}
+        assert found == wanted
+
+
+def test_what_a_template_lacks_is_told(person):
+    few = {name: v for name, v in landmarks().items() if "nipple" not in name}
+    found = find_tapes(person.mesh, few)
+    assert found.missing["chest_girth"] == "the template has no landmark 'left nipple and right nipple'"
+    assert "waist_girth" in found.found and "chest_width" in found.missing
+    with pytest.raises(ValueError, match=r"expected at least left toe, .*; there is no left toe"):
+        find_tapes(person.mesh, {name: v for name, v in landmarks().items() if name != "left toe"})
+
+
+def test_holes_leave_out_what_crosses_them(person, tapes):
+    waist = tapes.found["waist_girth"]
+    height = person.mesh.vertices @ UP
+    cut = np.abs(person.mesh.corners[..., 2].mean(axis=1) - waist.centre.at(person.mesh.vertices) @ UP) < 0.02
+    front = person.mesh.corners[..., 1].mean(axis=1) < waist.centre.at(person.mesh.vertices)[1]
+    opened = Mesh(person.mesh.vertices, person.mesh.faces[~(cut & front)])
+    found = find_tapes(opened, landmarks())
+    assert found.missing["waist_girth"] == "a hole of the template crosses it" and "hip_girth" in found.found
+    # a body whose waist lies elsewhere than on the template
+    above = mean_of(*np.flatnonzero(np.abs(height - waist.centre.at(person.mesh.vertices) @ UP) < 0.01))
+    moved = {**tapes.found, "waist_girth": dataclasses.replace(waist, centre=above,
+                                                               faces=waist.faces[~(cut & front)[_rows(tapes, waist)]])}
+    told = measure(opened, dataclasses.replace(tapes, template=opened, found=moved))
+    assert told.missing["waist_girth"] == "a hole of the mesh crosses it" and "waist_girth" not in told.values
+
+
+def _rows(tapes, girth):
+    """Which triangles of the template those of a girth are."""
+    every = {tuple(face): k for k, face in enumerate(tapes.template.faces.tolist())}
+    return np.array([every[tuple(face)] for face in girth.faces.tolist()])
+
+
+def test_bodies_of_other_triangles_are_refused(tapes):
+    for wrong in (np.zeros((5, 3)), np.full(tapes.template.vertices.shape, np.nan)):
+        with pytest.raises(ValueError, match="body: expected finite numbers of shape"):
+            measure(wrong, tapes)
+
+
+def test_stated_errors(person, tapes):
+    """None of the vertices leaves the sliding; small ones add up as squares; what moves as a whole cancels."""
+    error = np.full(len(person.mesh.vertices), 0.001)
+    plain, one, two = (measure(person.mesh, tapes, expected_error=k * error) for k in (0, 1, 2))
+    for name, taken in plain.readings.items():
+        slide = plain.errors[name]
+        assert slide == pytest.approx(0.003 * abs(taken.slope), abs=1e-9), name
+        assert two.errors[name]**2 - slide**2 == pytest.approx(4 * (one.errors[name]**2 - slide**2), rel=1e-6), name
+    waist = plain.readings["waist_girth"]
+    assert np.abs(waist.along(np.ones_like(person.mesh.vertices)[:, None, :].transpose(0, 2, 1))).max() < 1e-9
+    near = measured_error(waist, 1e-6 * person.mesh.vertices, error)       # all errors the same
+    assert near == pytest.approx(plain.errors["waist_girth"], abs=1e-7)
+
+
+def test_the_body_with_some_measurements(small_tapes):
+    model, tapes = small_people(), small_tapes
+    betas = np.array([1.0, -0.8, 0.5, 0.3])
+    pose = np.zeros((len(model.skeleton.parents), 3))
+    there = measure(model.vertices(pose, betas), tapes, tapes.axes).values
+    made = body_with_measurements(model, tapes, {"stature": there["stature"], "waist": there["waist_girth"]})
+    assert not made.missed and made.deviations <= np.linalg.norm(betas) + 1e-6
+    again = measure(model.vertices(pose, made.betas), tapes, tapes.axes).values
+    assert again["stature"] == pytest.approx(there["stature"], abs=2e-4)
+    assert again["waist_girth"] == pytest.approx(there["waist_girth"], abs=2e-4)
+    mean = measure(model.vertices(pose, np.zeros(4)), tapes, tapes.axes).values
+    usual = body_with_measurements(model, tapes, {"stature": mean["stature"]})
+    assert usual.deviations < 1e-3 and usual.rarer > 0.999
+    apart = body_with_measurements(model, tapes, {"waist": 1.6, "hip": 0.7})
+    assert set(apart.missed) == {"waist_girth", "hip_girth"} and np.isfinite(apart.betas).all()
+
+
+@pytest.mark.parametrize(("given", "told"), [
+    ({"stature": 4}, r"stature=4: expected 1.2 to 2.4 m"), ({"waist": 0.01}, r"waist=0.01: expected 0.4 to 2.2 m"),
+    ({"shoe": 1}, "no measurement 'shoe'; there are: stature, "), ({}, "expected at least one measurement")])
+def test_measures_that_no_person_has(given, told, small_tapes):
+    with pytest.raises(ValueError, match=told):
+        body_with_measurements(small_people(), small_tapes, given)
+
+
+def test_names_as_users_say_them():
+    assert list(named("Waist")) == ["waist_girth"] and list(named("back length")) == ["back_length"]
+    assert list(named("thigh")) == ["thigh_girth_left", "thigh_girth_right"]
+    assert list(named("calf_left")) == ["calf_girth_left"]
