@@ -42,6 +42,7 @@ FINGERS = {side: tuple(f"{finger}{i}_{side}" for finger in ("index", "middle", "
                        for i in (1, 2, 3)) for side in ("left", "right")}
 NAMES = {24: (*BODY, "fingers_left", "fingers_right"), 52: (*BODY, *FINGERS["left"], *FINGERS["right"]),
          55: (*BODY, "jaw", "eye_left", "eye_right", *FINGERS["left"], *FINGERS["right"])}
+FAMILY = {24: "smpl", 52: "smplh", 55: "smplx"}
 
 CONVERT = ("convert it once where the library it came with is installed: python -c \"import pickle, numpy as np; "
            "m = pickle.load(open('{0}', 'rb'), encoding='latin1'); np.savez('{1}', **{{k: np.array(m[k].todense() if "
@@ -80,7 +81,11 @@ def import_model(path: str | Path) -> SkinningModel:
     Loper et al., SMPL, 2015.
     """
     found = read_published(path)
-    return as_skinning(found, {"imported": Path(path).name, "notes": "; ".join(found.notes)})
+    model = as_skinning(found, {"imported": Path(path).name, "notes": "; ".join(found.notes)})
+    family = "star" if model.features.lift.kind == QuaternionLift.kind else FAMILY.get(len(found.parents), "")
+    if model.skeleton.names == NAMES.get(len(found.parents)):
+        model.info["family"] = family                                         # whose motions are taken pose by pose
+    return model
 
 
 def import_file(model: ModelArg, output: Output) -> Outcome:

@@ -28,8 +28,8 @@ def imported_models(report: dict) -> str:
                      half.get("seconds", ""), *(one[what][figure] for what in ("markers, shape known", "MoSh")
                                                 for figure in ("mean_mm", "seconds")),
                      one["256 bodies of one person"]["seconds"] * 1000))
-    return table(("model", "whole body (mm)", "half view, seen (mm)", "unseen (mm)", "s", "47 markers, shape known (mm)",
-                  "s", "MoSh (mm)", "s", "256 bodies (ms)"), rows)
+    return table(("model", "whole body (mm)", "half view, seen (mm)", "unseen (mm)", "s",
+                  "47 markers, shape known (mm)", "s", "MoSh (mm)", "s", "256 bodies (ms)"), rows)
 
 
 def half_people(report: dict) -> str:
