@@ -18,7 +18,7 @@ from scanprep.geometry.storage import StorageError
 from scanprep.pictures import scene
 
 WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "report.html",
-           "report.json"}
+           "report.json", "motion.trc", "motion.mot"}
 
 
 @pytest.fixture(scope="module", autouse=True)
