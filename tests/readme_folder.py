@@ -11,7 +11,7 @@ import numpy as np
 
 from completion import Motion
 from completion.__main__ import main
-from model import load_model
+from model import load_model, write_body_npz
 from scanprep import write_mesh
 from scanprep.synthetic.data_set import read_views
 from scanprep.viewer import server
@@ -88,6 +88,7 @@ def with_demo_model(folder):
     model = load_model(demo / "model.npz")
     standing = np.zeros((len(model.skeleton.parents), 3))
     write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(standing, np.array([1.5]))))
+    write_body_npz(folder / "SMPL_NEUTRAL.npz", model, draws=40)
     (folder / "walk").mkdir(exist_ok=True)
     shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
     return folder

@@ -100,12 +100,12 @@ def test_the_table_has_partners_and_parts(person):
     assert "RBAK" in rows["RBAC"][1]
 
 
-def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, monkeypatch):
+def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, monkeypatch, capsys):
     """With a registration that is known: the command passes landmarks on by name and says how it went."""
     seen = {}
 
     def perfect(source, target, landmarks, *rest):
-        seen["landmarks"] = landmarks
+        seen.update(landmarks=landmarks, source=source, target=target)
         nothing = np.zeros(len(source.vertices))
         return Registration(source, nothing, nothing == 0, 0.001, 0.002, True, 1, {}, 0, nothing + 1, 0.06)
 
@@ -127,6 +127,13 @@ def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, mon
     told = json.loads((tmp_path / "b.layout.json.report.json").read_text())
     figures = {m["metric"]: m["value"] for m in told["metrics"]}
     assert figures["target not covered"] == pytest.approx(6) and figures["landmarks"] == 3
+    small_people().save(tmp_path / "m.npz")                       # from the average person to the template of a model
+    onto = ["--target", str(tmp_path / "m.npz"), "-o"]
+    assert main(["layout", "transfer", "cmu41", *onto, str(tmp_path / "m.json")]) == 0
+    np.testing.assert_array_equal(seen["source"].vertices, body.vertices)
+    np.testing.assert_array_equal(seen["target"].vertices, at_rest(small_people()).vertices)
+    assert main(["layout", "transfer", str(out), *onto, str(tmp_path / "n.json")]) == 1
+    assert "expected the mesh that it is for, --source" in capsys.readouterr().err
 
 
 BAD = {

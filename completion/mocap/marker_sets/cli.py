@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from model.files import load_model
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome, bar, say
@@ -17,12 +18,14 @@ from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmark_writing import marker_set
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.registration.person import average_person
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.landmarks import landmarks as synthetic_landmarks
 
 from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model
 from .layout import MarkerLayout
-from .named import layout_summaries, read_layout
+from .named import layout_names, layout_summaries, read_layout
 from .opensim import opensim_markers
 from .symmetry import label_pairs
 
@@ -91,11 +94,12 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     return Outcome(output, [Metric("body", name), *figures], {"layout": layout})
 
 
-def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, landmarks: Path | None = None,
-             source_landmarks: Path | None = None, unit: Unit | None = None) -> Outcome:
+def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | None = None,
+                landmarks: Path | None = None, source_landmarks: Path | None = None, unit: Unit | None = None
+                ) -> Outcome:
     """A layout on another triangulation: the source body is registered to the target and takes its markers along.
 
-    Example: scape layout transfer vicon47 --source template.ply --target mine.ply -o mine.layout.json
+    Example: scape layout transfer vicon47 --target mine.ply -o mine.layout.json
 
     Without landmarks, places that look alike are sought; they cannot tell how far a smooth limb is rotated about
     itself, so look at the picture beside the output, and name landmarks where it is wrong: ends of the limbs, inner
@@ -103,9 +107,9 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
 
     Args:
         layout: One of `scape layout list`, or a file.
-        source: Mesh that the layout is for.
-        target: Mesh to bring it to, in any pose.
+        target: Mesh to bring it to, in any pose, or a model file (.npz), whose template it is.
         output: Layout file to write; pictures and the registered source are written beside it.
+        source: Mesh that the layout is for; else the average of the synthetic people, for the sets that come along.
         landmarks: Landmarks of the target.
         source_landmarks: Landmarks of the source, of the same names; else the file of its name beside it.
         unit: Unit of the target and its landmarks.
@@ -115,11 +119,16 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
     from .pictures import picture_layout
     from .transfer import UNCERTAIN, transfer_layout
 
-    ours, theirs = read_mesh(source), read_mesh(target, unit)
+    ours = average_person().mesh if source is None else read_mesh(source)
+    theirs = at_rest(load_model(target)) if target.suffix.lower() == ".npz" else read_mesh(target, unit)
+    if source is None and layout not in layout_names():
+        raise ValueError(f"{layout}: expected the mesh that it is for, --source; without one, one of "
+                         f"{', '.join(layout_names())}")
     found = read_layout(layout, ours, None)
     pairs = None
     if landmarks is not None:
-        marks = read_template_landmarks(source, ours, source_landmarks, "--source-landmarks")
+        marks = synthetic_landmarks() if source is None and source_landmarks is None else read_template_landmarks(
+            source or Path("average person"), ours, source_landmarks, "--source-landmarks")
         try:
             pairs = match_landmarks(marks, read_landmarks(landmarks, theirs, unit))[1:]
         except ValueError as error:
