@@ -72,6 +72,7 @@ def user_folder(demo, folder):
         cameras[f"view{k}"] = view.camera.tolist()
     (folder / "views" / "cameras.json").write_text(json.dumps(cameras))
     model, motion = load_model(demo / "model.npz"), Motion.load(demo / "animation" / "motion.npz")
+    write_body_npz(folder / "SMPL_NEUTRAL.npz", model, draws=40)
     for t, vertices in enumerate(motion.vertices(model.subject(None), slice(0, 8, 2))):
         write_mesh(folder / "frames" / f"{t:04d}.ply", model.template.with_vertices(vertices))
     for part, names in (("poses", mine), ("people", others + mine[:1])):
@@ -88,7 +89,6 @@ def with_demo_model(folder):
     model = load_model(demo / "model.npz")
     standing = np.zeros((len(model.skeleton.parents), 3))
     write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(standing, np.array([1.5]))))
-    write_body_npz(folder / "SMPL_NEUTRAL.npz", model, draws=40)
     (folder / "walk").mkdir(exist_ok=True)
     shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
     return folder

@@ -45,8 +45,8 @@ def test_set_up_is_what_ci_does():
 
 
 def test_commands(place):
-    for written in ("out/report.html", "completed/report.html", "walk/animation.glb", "person/report.html", "body.glb",
-                    "walk_of_two/motion.npz", "tracked/motion.npz"):
+    for written in ("out/report.html", "completed/report.html", "walk/animation.glb", "person/report.html", "walk.glb",
+                    "measures.csv", "smpl.npz", "brought/motion.npz", "walk_of_two/motion.npz", "tracked/motion.npz"):
         assert (place / written).exists(), written
 
 
