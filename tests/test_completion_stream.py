@@ -10,7 +10,8 @@ from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate, low_pass
 from completion.mocap.pose.foot_contact import Floor, FootContact
-from completion.mocap.pose.marked_body import MarkedBody, PartShapes, supports
+from completion.mocap.pose.marked_body import MarkedBody, supports
+from completion.mocap.pose.part_shapes import PartShapes
 from completion.mocap.pose.robust import LabelWatch, marker_weights
 from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.motion import Motion

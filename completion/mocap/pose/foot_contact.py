@@ -9,7 +9,8 @@ from scipy.ndimage import uniform_filter1d
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import Dense
 
-from .marked_body import MarkedBody, PartShapes, part_shapes, point_system
+from .marked_body import MarkedBody, point_system
+from .part_shapes import PartShapes, part_shapes
 from .robust import runs
 
 TOUCH = 0.025                        # metres above the floor below which a point may stand
