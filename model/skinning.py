@@ -147,8 +147,10 @@ class SkinningModel(BodyModel):
             posed[j] = posed[parent] + R[parent] @ (joints[j] - joints[parent])
         x = x + self.corrections(pose)
         y = sum(self.weights[:, p, None] * ((x - joints[p]) @ R[p].T + posed[p]) for p in range(len(joints)))
+        if self.regressor is not None:
+            return np.asarray(y - self.skeleton.joints[0])
         ids, share = self._root
-        return np.asarray(y - (share @ y[ids] if self.regressor is None else self.skeleton.joints[0]))
+        return np.asarray(y - share @ y[ids])
 
     def blended(self, pose: np.ndarray) -> np.ndarray:
         """(N, 3, 3) the weighted mean of the rotations that carry each vertex, at a pose (J, 3)."""
