@@ -1,18 +1,16 @@
 """Some surface points of a body whose shape is free."""
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import sparray
 
-from scanprep.skeleton.tree import Skeleton
-
-from .linear import PointOperator
+from .linear import PointOperator, Points
 
 
-class ShapedPoints(ABC):
+class ShapedPoints(Points):
     """Surface points as a function of pose, betas and place, with derivatives; affine in betas.
 
     Made by `BodyModel.points`.
@@ -20,23 +18,8 @@ class ShapedPoints(ABC):
 
     @property
     @abstractmethod
-    def skeleton(self) -> Skeleton:
-        """What the pose turns."""
-
-    @property
-    @abstractmethod
-    def count(self) -> int:
-        """L, the number of points."""
-
-    @property
-    @abstractmethod
     def n_betas(self) -> int:
         """K, the number of betas."""
-
-    @property
-    @abstractmethod
-    def load(self) -> int:
-        """Numbers that derivatives of one coordinate of a point hold in between."""
 
     @abstractmethod
     def operator(self, betas: np.ndarray | None = None) -> PointOperator:

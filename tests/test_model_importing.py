@@ -10,12 +10,13 @@ from conformance_bodies import skinned_worm
 from published_bodies import as_smplx, as_star, published_vertices, synthetic_smpl
 from scipy.sparse import csc_array, csr_array
 
+from model.cli import import_file
 from model.export.correctives import write_body_npz
 from model.export.rig import joint_places, make_rig
 from model.features import QuaternionLift, RotationLift, lifted, lifted_slopes
 from model.files import load_model
 from model.fitting import fit_shape
-from model.importing import NAMES, import_file, import_model
+from model.importing import NAMES, import_model
 from model.linear import check_pose
 from model.makehuman import part_of, regressor_of
 from model.products import Products, Terms
