@@ -1,6 +1,6 @@
 """Merging four virtual views and filling six holes, ours beside other tools; with --held on the held-out bodies.
 
-    python tests/benchmarks/cleaning.py --out cleaning.json [--held] [--merge N] [--holes N]
+    python tests/benchmarks/cleaning.py -o cleaning.json [--held] [--merge N] [--holes N]
 
 Peers are measured where they can be imported: open3d, pymeshlab, pymeshfix, trimesh. Times are of the processor.
 """
@@ -247,7 +247,7 @@ def summary(rows: list[dict[str, object]], by: str, keys: tuple[str, ...]) -> di
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", default="cleaning.json")
+    parser.add_argument("-o", "--output", default="cleaning.json")
     parser.add_argument("--held", action="store_true")
     parser.add_argument("--merge", type=int, default=2, help="poses and as many men to merge")
     parser.add_argument("--holes", type=int, default=3, help="poses, men and procedural people each to fill")

@@ -1,7 +1,7 @@
 """Co-registration of virtual four-view scans of one man: errors before, and after each round.
 
     SCAPEKIT_DATA=... python tests/benchmarks/coregistration.py [--landmarks 4|7|10] [--again 0|4|7|10] [--rounds 2]
-        [--faces 5000] [--held] [--beside 10] [--clickless 0] [--out coregistration.json]
+        [--faces 5000] [--held] [--beside 10] [--clickless 0] [-o coregistration.json]
 
 1. The template is registered to every scan without a model, with few landmarks.
 2. Skeleton and model are learned from those whose scan they explain; the truth is not asked.
@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--beside", type=int, default=10, help="how many further poses are scanned and learned from")
     parser.add_argument("--clickless", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--out", default="coregistration.json")
+    parser.add_argument("-o", "--output", default="coregistration.json")
     args = parser.parse_args()
     whole = load_real()
     shown = HELD_POSES if args.held else TUNING_POSES
@@ -139,8 +139,8 @@ def main() -> None:
         person = done.model.subject()
         story.tell("no start, no landmark", {i: register_with_model(person, story.scans[i].scan, config=free
                                                                     ).mesh.vertices for i in range(args.clickless)})
-    settings = {name: value for name, value in vars(args).items() if name != "out"}
-    write_report(Path(args.out), {"protocol": __doc__, "machine": machine(), "settings": settings, "poses": poses,
+    settings = {name: value for name, value in vars(args).items() if name != "output"}
+    write_report(Path(args.output), {"protocol": __doc__, "machine": machine(), "settings": settings, "poses": poses,
                                   "shown": shown, "parts": len(skeleton.parents), "rows": story.rows,
                                   "converged": done.converged})
 

@@ -1,7 +1,7 @@
 """Correspondences from a few seeds, or none, on the scans that registration is measured on.
 
     SCAPEKIT_DATA=... python tests/benchmarks/correspondences.py --set tuning --seeds 7
-    SCAPEKIT_DATA=... python tests/benchmarks/correspondences.py --set held --seeds 0 --json results/cc.json
+    SCAPEKIT_DATA=... python tests/benchmarks/correspondences.py --set held --seeds 0 -o correspondences.json
 
 `median` and `beyond` are of the distance along the true body between the true place of the template's vertex and
 the point of the scan given for it. A correspondence is flipped when it lies more than 100 mm off and at most half
@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--seeds", choices=("10", "7", "4", "0"), default="7")
     parser.add_argument("--front", action="store_true", help="one view from the front in place of four")
     parser.add_argument("--first", type=int, default=None, help="only so many poses and men")
-    parser.add_argument("--json", help="write the figures here")
+    parser.add_argument("-o", "--output", help="write the figures here")
     options = parser.parse_args()
     data = load_real()
     other = other_side(data)
@@ -86,9 +86,9 @@ def main() -> None:
     mean["worst_median_mm"] = max(row["median_mm"] for row in done)
     mean["failed"] = len(rows) - len(done)
     print("mean of scans: " + ", ".join(f"{name} {value:.3g}" for name, value in mean.items()))
-    if options.json:
+    if options.output:
         settings = {name: value for name, value in vars(options).items() if name != "json"}
-        write_report(options.json, {"settings": settings, "machine": machine(), "scans": rows, "mean": mean})
+        write_report(options.output, {"settings": settings, "machine": machine(), "scans": rows, "mean": mean})
 
 
 if __name__ == "__main__":

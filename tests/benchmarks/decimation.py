@@ -1,6 +1,6 @@
 """Decimation beside other libraries: a closed body, the same body cut open, and a whole registered set.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/decimation.py [--faces 50000] [--only closed,open,set] [--out FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/decimation.py [--faces 50000] [--only closed,open,set] [-o FILE]
 
 The body of about 400,000 triangles is mesh000, subdivided twice by Loop's rule, with relief of up to 1.4 mm. Libraries
 that are not installed are left out by name. Times are of the process, not of the wall. What we lose at:
@@ -161,7 +161,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--faces", type=int, default=50_000)
     parser.add_argument("--only", default="closed,open,set")
-    parser.add_argument("--out", default="decimation.json")
+    parser.add_argument("-o", "--output", default="decimation.json")
     args = parser.parse_args()
     data = load_real()
     body = large_body(data)
@@ -181,7 +181,7 @@ def main() -> None:
                 data, faces, DecimateSetConfig(meshes, placement))            # type: ignore[arg-type]
                for placement in ("vertices", "solved") for meshes in (1, 8, 16)},
             "fast-simplification, replayed": replayed(data, faces)} for faces in (12_000, 3_000)}
-    write_report(args.out, report)
+    write_report(args.output, report)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Where pictures take the front of a body to be (`upright`), against its hips, shoulders and waist.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/fronts.py [--json FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/fronts.py [-o FILE]
 
 All SCAPE poses and SPRING men, as surfaces and as points without triangles. True is the level direction that is square
 to the lines from right to left between landmarks.
@@ -45,15 +45,15 @@ def measure(data: RealData, bodies: np.ndarray, name: str, points: bool) -> dict
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json")
+    parser.add_argument("-o", "--output")
     args = parser.parse_args()
     data = load_real()
     rows = [measure(data, bodies, name, points) for points in (False, True)
             for name, bodies in (("SCAPE poses", data.poses), ("SPRING men", data.shapes))]
     for row in rows:
         print(row)
-    if args.json:
-        write_report(args.json, {"machine": machine(), "rows": rows})
+    if args.output:
+        write_report(args.output, {"machine": machine(), "rows": rows})
 
 
 if __name__ == "__main__":

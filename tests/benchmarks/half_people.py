@@ -1,8 +1,7 @@
 """Half views of men of unknown shape, ours against the nearest training body and against plain hole filling.
 
     SCAPEKIT_DATA=... python tests/benchmarks/half_people.py -m MODEL.npz -o half_people.json [--inner] [--only K ...]
-        [--nearest] [--points DIR] [--pictures DIR] [--set NAME=VALUE ...]
-    python tests/benchmarks/half_people.py --poisson DIR -o poisson.json       (needs open3d; reads DIR/*.npz)
+        [--peers] [--pictures DIR] [--set NAME=VALUE ...]
 
 `--inner` takes every fifth of the 182 training men, for tuning, with a model learned from the others; else the 45
 held-out men. Each row of the table: *seen* is the mean distance of the seen vertices to the true surface, *unseen*
@@ -88,36 +87,16 @@ def bent(model: Any, vertices: np.ndarray, view: HalfView) -> Any:
     return complete(own.subject(None), view.points, view.landmarks).predicted
 
 
-def poisson(folder: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Screened Poisson of every file of points: a row of errors for each, and the settings."""
+def poisson(cloud: Any) -> Any:
+    """Screened Poisson of a scan's points and normals; everything that it invents is kept."""
     import open3d
 
-    rows = []
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as kept:
-            cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(kept["points"]))
-            cloud.normals = open3d.utility.Vector3dVector(kept["normals"])
-            truth, seen, faces = kept["truth"], kept["seen"], kept["faces"]
-        start = time.process_time()
-        mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=8)
-        spent = time.process_time() - start
-        away = {}
-        for name, surface, points in (("seen", (truth, faces), np.asarray(mesh.vertices)),
-                                      ("mesh", (np.asarray(mesh.vertices), np.asarray(mesh.triangles)), truth)):
-            scene = open3d.t.geometry.RaycastingScene()
-            scene.add_triangles(surface[0].astype(np.float32), surface[1].astype(np.uint32))
-            away[name] = 1e3 * scene.compute_distance(points.astype(np.float32)).numpy()
-        off = away["mesh"]
-        rows.append({"k": int(path.stem), "seen_mm": off[seen].mean(), "closest_mm": off[~seen].mean(),
-                     "invented_mm": away["seen"].mean(), "cpu_seconds": spent})
-        print(rows[-1], flush=True)
-    return rows, {"depth": 8, "open3d": open3d.__version__}
+    from scanprep.geometry.mesh import Mesh
 
-
-def keep_points(path: Path, view: HalfView, cloud: Any, body: Any) -> None:
-    """What `--poisson` reads."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, points=cloud.points, normals=cloud.normals, truth=body.vertices, seen=view.seen, faces=body.faces)
+    points = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.points))
+    points.normals = open3d.utility.Vector3dVector(cloud.normals)
+    mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(points, depth=8)
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
 
 
 def tried(args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -129,15 +108,13 @@ def tried(args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any
     from completion.partial.settings import CompletionConfig
     from model.files import load_model
     from model.scape import ScapeModel
-    from scanprep.geometry.surface import OrientedPoints
+    from scanprep.geometry.surface import OrientedPoints, Surface
 
     data, model, config = load_real(), load_model(args.model), CompletionConfig(**dict(args.set or []))
     assert isinstance(model, ScapeModel)
     train, bodies = men(len(data.shapes), args.inner)
-    others = []
-    if args.nearest:
-        meshes = [data.template.with_vertices(data.shapes[i]) for i in train]
-        others = [OrientedPoints(mesh.vertices, mesh.vertex_normals) for mesh in meshes]
+    meshes = [data.template.with_vertices(data.shapes[i]) for i in train] if args.peers else []
+    others = [OrientedPoints(mesh.vertices, mesh.vertex_normals) for mesh in meshes]
     rows = []
     for k in args.only if args.only is not None else range(len(bodies)):
         body = data.template.with_vertices(data.shapes[bodies[k]])
@@ -148,13 +125,13 @@ def tried(args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any
                                "cpu_seconds": time.process_time() - cpu, "rounds": result.iterations,
                                "converged": result.converged, "betas": np.linalg.norm(np.asarray(result.betas))}
         found = {"completed": result.completed, "predicted": result.predicted}
-        if args.nearest or args.points:
+        if args.peers:
             cloud = prepare_scan(view.points)
-        if args.nearest:
             rigid, row["nearest"] = nearest(others, cloud, view.landmarks)
             found |= {"nearest_rigid": data.template.with_vertices(rigid), "nearest_posed": bent(model, rigid, view)}
-        if args.points:
-            keep_points(args.points / f"{k:02d}.npz", view, cloud, body)
+            surface = Surface(poisson(cloud))
+            for part, shown in (("seen", view.seen), ("closest", ~view.seen)):
+                row[f"poisson_{part}_mm"] = 1e3 * surface.closest(body.vertices[shown]).distances.mean()
         apart = np.linalg.norm(result.completed.vertices - body.vertices, axis=1)[~view.seen]
         assert result.expected_error is not None and result.confidence is not None
         row |= {"expected_mm": 1e3 * np.sqrt((result.expected_error[~view.seen]**2).mean()),
@@ -183,13 +160,11 @@ def main() -> None:
     parser.add_argument("-m", "--model", help="learned from the training part alone")
     parser.add_argument("--inner", action="store_true", help="the tuning men instead of the held-out ones")
     parser.add_argument("--only", type=int, nargs="*", help="indices in the list of men")
-    parser.add_argument("--nearest", action="store_true", help="also the nearest training body")
-    parser.add_argument("--points", type=Path, help="folder to keep what --poisson reads")
-    parser.add_argument("--poisson", type=Path, help="only screened Poisson, on the files of such a folder")
+    parser.add_argument("--peers", action="store_true", help="also the nearest training body, and screened Poisson")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each")
     parser.add_argument("--set", type=setting, nargs="*", help="name=value of CompletionConfig")
     args = parser.parse_args()
-    rows, facts = poisson(args.poisson) if args.poisson else tried(args)
+    rows, facts = tried(args)
     mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0] if name != "k"}
     for name, value in mean.items():
         print(f"{name:28s} {value:8.2f}")

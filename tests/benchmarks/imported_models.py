@@ -102,7 +102,7 @@ def main() -> None:
     from model.fitting import fit_shape
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-o", type=Path, required=True)
+    parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--bodies", type=int, default=4)
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--faces", type=int, default=10000)
@@ -122,7 +122,7 @@ def main() -> None:
             rows["half views"] = half_views(model, own, people)
         report[name] = rows
         print(name, rows, flush=True)
-        write_report(args.o, report)
+        write_report(args.output, report)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measurements against cuts of the true surface, repeated, and against the errors that they state.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/measures.py -o FOLDER [--people 20] [--men 6] [--json FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/measures.py --bodies FOLDER [--people 20] [--men 6] [-o FILE]
 
 Bodies are those of `measured_bodies.py`, made in FOLDER where they are missing. The truth of a girth is the convex hull
 of a section of the true triangles by trimesh, in the plane that the true vertices carry. Registered people are measured
@@ -174,21 +174,21 @@ def honesty(rows: list[dict], odd: bool) -> list[dict[str, object]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--bodies", type=Path, required=True)
     parser.add_argument("--people", type=int, default=20)
     parser.add_argument("--men", type=int, default=6)
-    parser.add_argument("--json")
+    parser.add_argument("-o", "--output")
     args = parser.parse_args()
-    args.output.mkdir(parents=True, exist_ok=True)
+    args.bodies.mkdir(parents=True, exist_ok=True)
     model = synthetic_model()
     tapes = find_tapes(model.template, model.info["landmarks"])
     rows = list[dict]()
     for k in range(args.people):
-        of_person(model, args.output, k)
-        rows += of_somebody(model, tapes, args.output, k)
+        of_person(model, args.bodies, k)
+        rows += of_somebody(model, tapes, args.bodies, k)
     for man in HELD_MEN[:args.men]:
-        of_man(args.output, man)
-    men = of_men(args.output, list(HELD_MEN[:args.men]))
+        of_man(args.bodies, man)
+    men = of_men(args.bodies, list(HELD_MEN[:args.men]))
     report = {"machine": machine(), "means": summed(rows, ("how", "girth"), "off_mm"),
               "by_name": summed(rows, ("how", "name"), "off_mm"),
               "stated": [*honesty(rows, False), *honesty(rows, True)],
@@ -198,8 +198,8 @@ def main() -> None:
         for row in report[part]:
             print("  ".join(f"{name} {value:.2f}" if isinstance(value, float) else f"{name} {value}"
                             for name, value in row.items()))
-    if args.json:
-        write_report(args.json, report)
+    if args.output:
+        write_report(args.output, report)
 
 
 if __name__ == "__main__":

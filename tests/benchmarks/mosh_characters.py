@@ -1,7 +1,7 @@
 """Pose and soft tissue on characters: cartoon figures of the project, registered and moved by people.
 
-    python tests/benchmarks/mosh_characters.py --walk -o OUT
-    SCAPEKIT_DATA=... python tests/benchmarks/mosh_characters.py -m PEOPLE.npz --c3d FILE.c3d -o OUT
+    python tests/benchmarks/mosh_characters.py --folder OUT [-o FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/mosh_characters.py -m PEOPLE.npz --c3d FILE.c3d --folder OUT [-o FILE]
 
 The template is registered to each figure once and kept in OUT. Whose motion it is comes from `mosh`: an embedded man
 who walks, or a file. Counted are triangles that have turned over against the rotations of the parts around them
@@ -122,7 +122,7 @@ def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float,
 def main() -> None:
     """Run and print a row for each figure and factor."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("-m", "--model", type=Path, help="of the file's person; else the embedded one")
     parser.add_argument("--c3d", type=Path, help="whose motion it is; else an embedded man walks")
     parser.add_argument("--frames", type=int, default=60, help="that are measured and shown")
@@ -130,7 +130,7 @@ def main() -> None:
     args = parser.parse_args()
     from model.files import load_model
 
-    args.output.mkdir(parents=True, exist_ok=True)
+    args.folder.mkdir(parents=True, exist_ok=True)
     model = load_model(args.model) if args.model else synthetic_model()
     markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
         (read_markers(args.c3d), named_layout("cmu41", model.template))
@@ -139,7 +139,7 @@ def main() -> None:
     rows = []
     for name in CARTOONS:
         figure = cartoon(name)
-        found, seconds = on_figure(model, figure, args.output / f"{name}.{len(model.template.faces)}.npy")
+        found, seconds = on_figure(model, figure, args.folder / f"{name}.{len(model.template.faces)}.npy")
         off = joints_off(model, figure, found)
         about = {"figure": name, "joints_inside": f"{found.inside.sum()} of {len(found.inside)}",
                  "limb_joints_off_mm": MM * float(np.mean(off)), "worst_joint_mm": MM * max(off), "register_s": seconds}
@@ -147,9 +147,9 @@ def main() -> None:
             rows.append({**about, **measure(model, found, soft, factor, frames)})
             print(rows[-1], flush=True)
         moved = retarget_soft_tissue(soft, model, found.model, max(args.factors))
-        save_png(args.output / f"{name}.png", picture_transfer(model, soft, found.model, moved, 8))
-        write_character(args.output / f"{name}.glb", found.model, moved)
-    write_report(args.output / "report.json", {"motion": str(args.c3d or "embedded walk"), "machine": machine(),
+        save_png(args.folder / f"{name}.png", picture_transfer(model, soft, found.model, moved, 8))
+        write_character(args.folder / f"{name}.glb", found.model, moved)
+    write_report(args.output, {"motion": str(args.c3d or "embedded walk"), "machine": machine(),
                                                "rows": rows})
 
 

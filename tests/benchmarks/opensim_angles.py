@@ -1,6 +1,6 @@
 """OpenSim's inverse kinematics on the TRC of a recording, beside the motion that our own solver found.
 
-    python tests/benchmarks/opensim_angles.py RECORDING.c3d -o FOLDER
+    python tests/benchmarks/opensim_angles.py RECORDING.c3d --folder FOLDER [-o FILE]
 
 Needs `opensim`. `scape mosh` finds person and motion in the recording. An OpenSim model is built of the person: a body
 for every part, joints of three rotations at our joint centres with the sequences of the README, the markers of the
@@ -165,21 +165,21 @@ def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--folder", type=Path, required=True)
     args = parser.parse_args()
     opensim.Logger.removeFileSink()                          # opensim.log, in the folder where one stands
-    if scape(["mosh", str(args.recording), "-o", str(args.output / "mosh")]):
+    if scape(["mosh", str(args.recording), "-o", str(args.folder / "mosh")]):
         raise SystemExit("no motion was found")
-    trc = next((args.output / "mosh").glob("*/*/motion.trc"))
+    trc = next((args.folder / "mosh").glob("*/*/motion.trc"))
     motion, (model, name) = Motion.load(trc.with_name("motion.npz")), read_model(None)
     subject, layout = model.subject(motion.betas), MarkerLayout.load(trc.parent.parent / "layout.json")
     ours = columns(trc.with_name("motion.mot"))
     labels = list(opensim.TimeSeriesTableVec3(str(trc)).getColumnLabels())
     person = build(subject, layout, labels, {k: float(v[0]) for k, v in ours.items() if k.startswith("pelvis_t")
                                              and k != "pelvis_tilt"})
-    theirs = solve(person, trc, args.output)
+    theirs = solve(person, trc, args.folder)
     told_angles = anatomical_angles(motion, subject, joint_centres(motion, subject))
-    draw(args.output / "angles.png", ours, theirs, motion.rate)
+    draw(args.folder / "angles.png", ours, theirs, motion.rate)
     told = motion.told()
     used = [i for i, label in enumerate(motion.labels) if label in layout.labels]
     off = {key: ours[key] - theirs[key] for side in "rl" for key in (f"{each}_{side}" for each in COMPARED)}
@@ -194,7 +194,7 @@ def main() -> None:
               "range_degrees": {key: float(np.ptp(ours[key])) for key in off}, "machine": machine()}
     for key, value in report.items():
         print(key, value)
-    write_report(args.output / "opensim_angles.json", report)
+    write_report(args.output, report)
 
 
 if __name__ == "__main__":

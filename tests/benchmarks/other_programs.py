@@ -1,13 +1,13 @@
 """What other programs make of our files: their vertices or joints against our exact bodies, in millimetres.
 
-    python tests/benchmarks/other_programs.py MODEL.npz MOTION.npz -o DIR --bpy /path/of/python/with/bpy \
-        --npm /folder/with/node_modules
+    python tests/benchmarks/other_programs.py --folder DIR [-m MODEL.npz --motion MOTION.npz] [-o FILE]
+        [--bpy /path/of/python/with/bpy] [--npm /folder/with/node_modules]
 
-The motion is exported as GLB, BVH, USD (skinned, and as points) and, by the command of model/README.md, FBX, a body at
-rest as static GLB. Every file is opened in Blender (`bpy`, in a Python of its own), USD in usd-core too, GLB in
-three.js (`npm install three`, in headless Chromium, skinned on the processor); the Khronos validator (`npm install
-gltf-validator`) checks GLB. Programs that are not there are left out. `results.json` holds a row for each file and
-program; a new file is a new entry of `cases`, a new program a new entry of `PROGRAMS`.
+The motion, else a walk of a synthetic person, is exported as GLB, BVH, USD (skinned, and as points) and, by the command
+of model/README.md, FBX, a body at rest as static GLB. Every file is opened in Blender (`bpy`, in a Python of its own),
+USD in usd-core too, GLB in three.js (`npm install three`, in headless Chromium, skinned on the processor); the Khronos
+validator (`npm install gltf-validator`) checks GLB. Programs that are not there are left out. The result holds a row
+for each file and program; a new file is a new entry of `cases`, a new program a new entry of `PROGRAMS`.
 """
 from __future__ import annotations
 
@@ -21,8 +21,21 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from protocols import machine, write_report
 
 FRAMES = 10
+
+
+def synthetic_walk(path):
+    """The files of the model of synthetic people, and of a walk of two seconds of one of them."""
+    from completion.motion import Motion
+    from completion.synthetic_people import synthetic_model, synthetic_path
+    from scanprep.synthetic.people import walk
+
+    betas = np.random.default_rng(0).normal(0, 0.7, synthetic_model().n_betas)
+    poses, trans = walk(120, 60.0)
+    Motion(poses, trans, betas, 60.0, np.zeros((len(poses), 0)), ()).save(path)
+    return synthetic_path(), path
 
 
 def cases(model_file, motion_file, folder):
@@ -190,34 +203,40 @@ def usd_core(asked, cases, folder):
             if path.suffix == ".usdc"}
 
 
-PROGRAMS = {"usd-core": (usd_core, "output"), "Blender": (blender, "bpy"), "three.js": (three, "npm")}
+PROGRAMS = {"usd-core": (usd_core, "folder"), "Blender": (blender, "bpy"), "three.js": (three, "npm")}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path)
-    parser.add_argument("motion", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("-m", "--model", type=Path, help="the one of synthetic people when not given")
+    parser.add_argument("--motion", type=Path, help="of that model; a walk when not given")
+    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--bpy", help="a Python that has bpy")
     parser.add_argument("--npm", type=Path, help="a folder with node_modules of three and gltf-validator")
     asked = parser.parse_args()
-    asked.output.mkdir(parents=True, exist_ok=True)
-    made = cases(asked.model, asked.motion, asked.output)
+    asked.folder.mkdir(parents=True, exist_ok=True)
+    if asked.motion is None:
+        asked.model, asked.motion = synthetic_walk(asked.folder / "walk.npz")
+    made = cases(asked.model, asked.motion, asked.folder)
     asked.rate = float(np.load(asked.motion)["mocap_frame_rate"])
     if asked.bpy is not None:
-        made = with_fbx(asked, made, asked.output)
+        made = with_fbx(asked, made, asked.folder)
     rows = {name: {"size_MB": path.stat().st_size / 1e6} for name, (path, *_) in made.items()}
     for program, (evaluate, needs) in PROGRAMS.items():
         if getattr(asked, needs) is None:
             continue
-        for name, points in evaluate(asked, made, asked.output).items():
+        for name, points in evaluate(asked, made, asked.folder).items():
             off = 1000 * np.linalg.norm(points - made[name][1], axis=-1)
             rows[name][program] = {"mean_mm": off.mean(), "largest_mm": off.max()}
     for name, (path, *_) in made.items():
         if asked.npm is not None and path.suffix == ".glb":
             rows[name]["Khronos validator"] = validated(asked, path.resolve())
-    (asked.output / "results.json").write_text(json.dumps(rows, indent=1) + "\n")
-    print(json.dumps(rows, indent=1))
+    programs = [name for name, (_, needs) in PROGRAMS.items() if getattr(asked, needs)]
+    report = {"machine": machine(), "programs": programs, "files": rows}
+    print(json.dumps(report, indent=1, default=float))
+    if asked.output:
+        write_report(asked.output, report)
 
 
 if __name__ == "__main__":

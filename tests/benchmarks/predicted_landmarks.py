@@ -1,6 +1,6 @@
 """After a few clicks the other landmarks are predicted, as in `scape pick`: how far from where they belong.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/predicted_landmarks.py [--poses 2,7] [--marks 4] [--full] [--json FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/predicted_landmarks.py [--poses 2,7] [--marks 4] [--full] [-o FILE]
 
 The template is mesh000 with all its landmarks; of every virtual scan (four views all around) hands and feet are
 clicked, without error, and the other landmarks are compared with the true ones. `scape pick` predicts after four, by a
@@ -54,15 +54,15 @@ def main() -> None:
     parser.add_argument("--men", default=",".join(map(str, HELD_MEN[:5])))
     parser.add_argument("--marks", choices=("4", "7", "10"), default="4")
     parser.add_argument("--full", action="store_true", help="also by a registration with all its steps")
-    parser.add_argument("--json")
+    parser.add_argument("-o", "--output")
     args = parser.parse_args()
     data, rows = load_real(), []
     for kind, given in (("pose", args.poses), ("man", args.men)):
         for index in map(int, filter(None, given.split(","))):
             rows.append(measure(data, kind, index, args.marks, args.full))
             print({name: value for name, value in rows[-1].items() if not name.endswith("apart_mm")}, flush=True)
-    if args.json:
-        write_report(args.json, {"machine": machine(), "marks": args.marks, "rows": rows})
+    if args.output:
+        write_report(args.output, {"machine": machine(), "marks": args.marks, "rows": rows})
 
 
 if __name__ == "__main__":

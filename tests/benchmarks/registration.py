@@ -1,7 +1,7 @@
 """Registration of mesh000 to the virtual scans of `scans.py`: accuracy beside time.
 
     SCAPEKIT_DATA=... python tests/benchmarks/registration.py [--marks 10|7|4|0] [--front] [--set tuning|held]
-        [--poses 3,8] [--men 3] [--published] [--kept FOLDER] [--json FILE]
+        [--poses 3,8] [--men 3] [--published] [--kept FOLDER] [-o FILE]
 
 With `--marks 0` the template is led by `register_unmarked`, with no click. What we lose at: the surface is right
 long before the correspondence is; skin slides over muscles, and nothing in the shape says by how much.
@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--men", help="numbers of SPRING men instead of those of the set")
     parser.add_argument("--published", action="store_true", help="the registration of [SCAPE] instead of ours [Hahnel]")
     parser.add_argument("--kept", type=Path, help="folder for the registered vertices")
-    parser.add_argument("--json", help="write all figures here")
+    parser.add_argument("-o", "--output", help="write all figures here")
     args = parser.parse_args()
     data = load_real()
     poses, men = (tuple(int(k) for k in text.split(",") if k) if text is not None else default
@@ -137,8 +137,8 @@ def main() -> None:
         if row["verdict"] != "good":
             print(f"{row['scan']}: {row['verdict']}")
     print("flags:", told)
-    if args.json:
-        write_report(args.json, {"marks": args.marks, "front": args.front, "published": args.published,
+    if args.output:
+        write_report(args.output, {"marks": args.marks, "front": args.front, "published": args.published,
                                  "machine": machine(), "summary": summary, "flags": told, "rows": rows})
 
 

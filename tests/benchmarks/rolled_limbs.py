@@ -1,6 +1,6 @@
 """Limbs rolled about their own axis on true bodies: from which angle on a registration is doubted.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/rolled_limbs.py [--set tuning|held] [--json FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/rolled_limbs.py [--set tuning|held] [-o FILE]
     SCAPEKIT_DATA=... python tests/benchmarks/rolled_limbs.py --repair 3,8 [--degrees 180]
 
 Registrations that roll a limb are rare, so they are made: every limb of every pose is rolled about its bone, the roll
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("--set", choices=("tuning", "held"), default="tuning", dest="chosen")
     parser.add_argument("--repair", help="numbers of poses whose limbs are rolled and repaired, instead")
     parser.add_argument("--degrees", type=int, default=180, help="by which they are rolled")
-    parser.add_argument("--json", help="write all figures here")
+    parser.add_argument("-o", "--output", help="write all figures here")
     args = parser.parse_args()
     data = load_real()
     parts = person_parts(data.template)
@@ -98,8 +98,8 @@ def main() -> None:
             rows.append({"limb": limb, "degrees": angle, "bodies": len(told), "told": sum(told),
                          "limb_off_mm": float(np.mean(off))})
             print(rows[-1], flush=True)
-    if args.json:
-        write_report(args.json, {"set": args.chosen, "machine": machine(), "rows": rows})
+    if args.output:
+        write_report(args.output, {"set": args.chosen, "machine": machine(), "rows": rows})
 
 
 if __name__ == "__main__":

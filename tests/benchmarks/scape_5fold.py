@@ -1,6 +1,6 @@
 """SCAPE-5fold: error on held-out poses of the real man, for every kind of model and regressor, beside the time.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/scape_5fold.py -o scape_5fold.json
+    SCAPEKIT_DATA=... python tests/benchmarks/scape_5fold.py -o scape_5fold.json [--keep FOLD_0.npz]
 
 Skeleton and model of every fold come from its training poses alone; all kinds share the fold's skeleton, which is
 the one that `scape learn` finds (`--skeleton chosen`) or that of the search for rigid parts alone (`rigid`). Done folds
@@ -69,11 +69,14 @@ KINDS: dict[str, Learn] = {
 }
 
 
-def run(learn: Learn, template: Mesh, training: np.ndarray, held: np.ndarray, skeleton: Skeleton) -> dict:
+def run(learn: Learn, template: Mesh, training: np.ndarray, held: np.ndarray, skeleton: Skeleton,
+        keep: Path | None) -> dict:
     """Error of every held-out body in millimetres after fitting pose and place, and what it took."""
     start = time.perf_counter()
     model = learn(template, training, skeleton)
     learned = time.perf_counter()
+    if keep:
+        model.save(keep)
     fitter = PoseFitter(model.subject())
     errors = [1e3 * fitter.fit(body).mean for body in held]
     return {"error_mm": np.round(errors, 2).tolist(), "features": model.n_features,
@@ -88,6 +91,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("scape_5fold.json"))
     parser.add_argument("--folds", type=int, nargs="*", default=range(5))
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
+    parser.add_argument("--keep", type=Path, help="where to keep the model of fold 0 that is SCAPE, linear")
     parser.add_argument("--skeleton", choices=["chosen", "rigid"], default="chosen")
     args = parser.parse_args()
     data = load_real()
@@ -109,7 +113,9 @@ def main() -> None:
         done["parts"] = len(skeleton.parents)
         for kind in args.kinds:
             if kind not in done["kinds"]:
-                done["kinds"][kind] = run(KINDS[kind], data.template, data.poses[train], data.poses[held], skeleton)
+                keep = args.keep if (fold, kind) == (0, "SCAPE, linear") else None
+                done["kinds"][kind] = run(KINDS[kind], data.template, data.poses[train], data.poses[held], skeleton,
+                                          keep)
                 report.update(protocol="SCAPE-5fold", machine=machine())
                 write_report(args.output, report)
             result = done["kinds"][kind]

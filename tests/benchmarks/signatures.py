@@ -1,6 +1,6 @@
 """Whether bumps and hollows of the template come to lie on those of the scan: where we put them, and in the reference.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/signatures.py [--poses 3,24,48] [--json FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/signatures.py [--poses 3,24,48] [-o FILE]
 
 Mean curvature of the template at rest, smoothed over 6 to 35 mm, against that of the true posed surface at the place of
 every vertex: by the published registration of that scan, by the same slid 4 mm at random, by ours from ten landmarks.
@@ -44,7 +44,7 @@ def correlation(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> list[float
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--poses", default=",".join(map(str, TUNING_POSES)))
-    parser.add_argument("--json")
+    parser.add_argument("-o", "--output")
     args = parser.parse_args()
     data = load_real()
     rest, weights = signature(data.template), data.template.vertex_areas
@@ -61,8 +61,8 @@ def main() -> None:
         print(rows[-1], flush=True)
     means = {name: np.mean([row[name] for row in rows], axis=0).tolist() for name in ("reference", "slid", "ours")}
     print(means)
-    if args.json:
-        write_report(args.json, {"machine": machine(), "scales_mm": [1e3 * s for s in SCALES], "rows": rows,
+    if args.output:
+        write_report(args.output, {"machine": machine(), "scales_mm": [1e3 * s for s in SCALES], "rows": rows,
                                  "means": means})
 
 

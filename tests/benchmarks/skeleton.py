@@ -1,6 +1,6 @@
 """Parts, tree and joints: on the real poses with every fifth held out, and on a synthetic person.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/skeleton.py [OUT.json] [--only real folds embedded animals]
+    SCAPEKIT_DATA=... python tests/benchmarks/skeleton.py [-o FILE] [--only real folds embedded animals]
 
 Real poses have no truth: reported are the number of parts, the agreement over seeds and with the skeletons of
 four fifths of the poses (adjusted Rand index), how far poses are from moving rigidly, and how unlike left and right
@@ -188,7 +188,7 @@ def dem_bones(mesh: Mesh, poses: np.ndarray, bones: int, truth: Skeleton | None 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("output", nargs="?", type=Path)
+    parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--only", nargs="*", default=["real", "folds", "embedded", "animals"])
     asked = parser.parse_args()

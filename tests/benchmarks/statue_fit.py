@@ -1,6 +1,6 @@
 """The fit of the control mesh to a scan: which way gives the better control mesh, and the paper's Fig. 6 and 7.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/statue_fit.py [--men 12,...] [--poses 29,...] [--json FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/statue_fit.py [--men 12,...] [--poses 29,...] [-o FILE]
         [--picture FILE]
 
 Every scan is a real body subdivided once (50,000 vertices), the start a registration that has not followed the details
@@ -180,7 +180,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--men", default="12", help="numbers of SPRING men")
     parser.add_argument("--poses", default="29", help="numbers of SCAPE poses")
-    parser.add_argument("--json", help="write all figures here")
+    parser.add_argument("-o", "--output", help="write all figures here")
     parser.add_argument("--picture", help="write the picture of Fig. 7 here")
     args = parser.parse_args()
     sixth, seventh = figure_6(), figure_7(args.picture)
@@ -203,8 +203,8 @@ def main() -> None:
              for way in ways}
     for way, figures in means.items():
         print("mean:", _line({"way": way, **figures}))
-    if args.json:
-        write_report(Path(args.json), {"machine": machine(), "figure_6": sixth, "figure_7": seventh, "means": means,
+    if args.output:
+        write_report(Path(args.output), {"machine": machine(), "figure_6": sixth, "figure_7": seventh, "means": means,
                                        "rows": rows})
 
 

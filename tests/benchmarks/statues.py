@@ -1,6 +1,6 @@
 """Statues: the tables of the paper, mean and RMS from the reconstruction to the scan at every level, for any scans.
 
-    python tests/benchmarks/statues.py SCAN... [--size 2048] [--json FILE]
+    python tests/benchmarks/statues.py SCAN... [--size 2048] [-o FILE]
 
 Scans stand upright, in metres; each is fitted without clicks, with and without vector displacement. Distances leave
 holes of the scan out. `e` is the error left by the map where it is one-to-one. Relief on smooth scans, 1 to 3 mm with
@@ -72,7 +72,7 @@ def main() -> None:
     read.add_argument("scans", nargs="+", type=Path)
     read.add_argument("--size", type=int, default=2048)
     read.add_argument("--emboss", action="store_true")
-    read.add_argument("--json", type=Path)
+    read.add_argument("-o", "--output", type=Path)
     given = read.parse_args()
     rows = []
     for path in given.scans:
@@ -81,8 +81,8 @@ def main() -> None:
         for vectors in (False, True):
             rows.append(row(path.stem, scan, given.size, vectors))
             print(rows[-1], flush=True)
-    if given.json:
-        write_report(given.json, {"machine": machine(), "size": given.size, "rows": rows})
+    if given.output:
+        write_report(given.output, {"machine": machine(), "size": given.size, "rows": rows})
 
 
 if __name__ == "__main__":

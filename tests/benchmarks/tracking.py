@@ -1,6 +1,6 @@
 """Marker-less capture: a procedural walk seen by virtual depth cameras, and real poses where they are at hand.
 
-Run:  python tests/benchmarks/tracking.py OUT.json [--quick] [--only NAME ...] [--real MODEL.npz FOLD]
+Run:  python tests/benchmarks/tracking.py -o FILE [--quick] [--only NAME ...] [--real MODEL.npz FOLD]
 
 The walking person is not among those that the model of the synthetic people was learned from. The scanner's cameras
 go along with the person, 2.5 m away. Real motion leads through held-out poses: the model's poses in between, and what
@@ -154,7 +154,7 @@ def real(path: Path, fold: int, step: int) -> dict[str, object]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("output")
+    parser.add_argument("-o", "--output", default="tracking.json")
     parser.add_argument("--quick", action="store_true", help="40 frames")
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--real", nargs=2, metavar=("MODEL", "FOLD"))

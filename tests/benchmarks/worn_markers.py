@@ -1,7 +1,7 @@
 """Markers clicked on a scan of the person who wears them: how far from where they belong they come back on the model.
 
     SCAPEKIT_DATA=... python tests/benchmarks/worn_markers.py [-m MODEL.npz] [--poses 2,17] [--men 2] [--people 4]
-        [--register] [--json FILE]
+        [--register] [-o FILE]
 
 The 41 markers of `cmu41` are at vertices of a body, are clicked without error on a virtual scan of it (four views all
 around, or one half view), and carried to the model by completing the scan from seven landmarks. Only markers in sight
@@ -155,7 +155,7 @@ def main() -> None:
     parser.add_argument("--men", default=",".join(map(str, HELD_MEN[:3])))
     parser.add_argument("--people", type=int, default=5)
     parser.add_argument("--register", action="store_true", help="by registration too: five times as long")
-    parser.add_argument("--json")
+    parser.add_argument("-o", "--output")
     args = parser.parse_args()
     data = load_real()
     model = load_model(args.model) if args.model else learned(data)
@@ -169,8 +169,8 @@ def main() -> None:
                 way: f"{np.mean(mm):.1f}, worst {max(mm):.1f}" for way, mm in rows[-1]["off_mm"].items()}, flush=True)
     for row in summed(rows):
         print(row)
-    if args.json:
-        write_report(args.json, {"machine": machine(), "means": summed(rows), "rows": rows})
+    if args.output:
+        write_report(args.output, {"machine": machine(), "means": summed(rows), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Landmarks at wrong places, as in `scape complete --interactive`: does the completion say so, and which ones are told.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/wrong_landmarks.py -m FOLD_0 [--only 0 1 2] [--json FILE]
+    SCAPEKIT_DATA=... python tests/benchmarks/wrong_landmarks.py -m FOLD_0 [--only 0 1 2] [-o FILE]
 
 Half views of held-out poses, seven landmarks: as they are, with left and right exchanged, and one of them (drawn at
 random) at the place of another. `doubts` compares them with the body that is found without any.
@@ -26,7 +26,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-m", "--model", type=Path)
     parser.add_argument("--only", type=int, nargs="*")
-    parser.add_argument("--json")
+    parser.add_argument("-o", "--output")
     args = parser.parse_args()
     data = load_real()
     subject = (load_model(args.model) if args.model else learned(data, False, 0)).subject(None)
@@ -51,8 +51,8 @@ def main() -> None:
             rows.append({"k": k, "case": case, "verdict": done.judgement.verdict, "without": found.judgement.verdict,
                          "told": sorted(told), "right": told == wrong, "cpu_s": cpu})
             print(rows[-1], flush=True)
-    if args.json:
-        write_report(args.json, {"machine": machine(), "rows": rows})
+    if args.output:
+        write_report(args.output, {"machine": machine(), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -1,10 +1,8 @@
 """Tables of BENCHMARKS.md on markers alone: people, recordings, speed, faults, sex, characters, marker sets."""
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from summary_scans import Rows, table
+from tables_scans import Rows, table
 
 
 def people(report: dict) -> str:
@@ -124,78 +122,15 @@ def opensim_angles(report: dict) -> str:
         ("angle", "apart, RMS (°)", "without the mean (°)", "range of ours (°)"), rows)
 
 
-MOCAP: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
-    "mosh_people": (
-        "People from simulated markers alone",
-        "python tests/benchmarks/mosh_people.py -m MODEL --every 3", people,
-        "45 held-out men with their own full shape, posed by a model of 182 men with 80 components; markers 5 "
-        "mm beside "
-        "their place (tangential Gaussian), 9.5 mm radius, 12 frames. Weights were chosen on two to four of "
-        "the training "
-        "men with a model without them; two held-out men had been seen in an earlier run. The patent: 13.1 mm with 42 "
-        "markers and 11.4 with 73, on scanned people. Where we lose: at rest, what betas say of posture "
-        "differs between "
-        "two sequences."),
-    "mosh_c3d": (
-        "Real recordings by MoSh, six markers held out",
-        "python tests/benchmarks/mosh_c3d.py FOLDER -m MODEL --soft", recordings,
-        "35 of 41 markers. The weights of the poses were chosen on these files, as were the places of loose "
-        "markers in the "
-        "layout; see the head of the script for what of the held-out six had been seen. The patent: 7.9 and "
-        "6.2 mm, held "
-        "out 34 mm, on its data. Where we lose: the held-out markers, because technicians put them elsewhere; the best "
-        "single places, chosen with these very markers, leave 36.6 mm."),
-    "mosh_c3d_published": (
-        "The same with the weights of the patent",
-        "python tests/benchmarks/mosh_c3d.py FOLDER -m MODEL --preset published", recordings,
-        "Random frames, no marker is an outlier, nothing is repaired; its prior of poses is that of 71 scans here."),
-    "mosh_speed": (
-        "How long MoSh takes",
-        "python tests/benchmarks/mosh_speed.py FOLDER -m MODEL", speed,
-        "One thread, 41 markers, a person of 80 betas and soft tissue of 80. Three other processes were at work on the "
-        "two cores, so the times of the clock are upper bounds."),
-    "mosh_faults": (
-        "Faults put into markers",
-        "python tests/benchmarks/mosh_artefacts.py FOLDER -m MODEL --men 3 --held-out --no-real "
-        "--files basketball 85_02",
-        faults,
-        "Held-out men moved as in two recordings; a tenth of the markers exchanged at any time, each for 0.2 to 2 s, a "
-        "twentieth out of sight; everything, person included, from the faulty markers. Close pairs are nearer "
-        "than 20 cm. "
-        "Thresholds were chosen on the recordings with faults put in."),
-    "opensim_angles": (
-        "OpenSim's inverse kinematics on our TRC",
-        "python tests/benchmarks/opensim_angles.py basketball.c3d -o FOLDER", opensim_angles,
-        "A walk with a ball of 494 frames, 41 markers, the model of synthetic people. OpenSim 4.6 follows the markers "
-        "with a model of our joint centres and sequences, ball joints everywhere, markers fixed to bones where they "
-        "are on the person at rest; ours has markers on the skin, outliers, smoothness and a prior. In the angles of "
-        "motion.mot its feet are turned as ours to 1e-6 degrees."),
-    "mosh_worn_elsewhere": (
-        "Markers worn elsewhere, and names exchanged throughout",
-        "python tests/benchmarks/mosh_worn_elsewhere.py FOLDER -m MODEL --first 20 --seeds 1", worn_elsewhere,
-        "The four recordings, every fourth frame. Moved markers are simulated from the fitted body and what the marker "
-        "was off it; those taken over are real tracks of other markers. Limits were chosen with other draws of "
-        "these recordings: what was touched differs, the people do not. Pairs nearer than 10 cm are not drawn. Of the "
-        "four moved markers that were not found, two are loose ones, which the usual search had put within 9 mm, and "
-        "two were told to be nowhere and left out. That they are left out, and that the limb of an exchanged pair is "
-        "tried again with all its markers, was mended when two cases of 85_02 in this draw showed it; they were run "
-        "again."),
-    "mosh_sex": (
-        "Sex from markers",
-        "python tests/benchmarks/mosh_sex.py --models DIR", sex,
-        "Synthetic people not learned from, 41 markers 5 mm off, 24 frames of walking. Half and a quarter: "
-        "people half way "
-        "and less to the middle between the sexes; there men are taken for women."),
-    "mosh_characters": (
-        "A motion on two cartoon figures",
-        "python tests/benchmarks/mosh_characters.py", characters,
-        "The synthetic walk, soft tissue twice. Triangles that turn over against the rotations of their parts, all "
-        "frames, before and after what pictures and GLB smooth. Where we lose: acrobatics on the template of the SCAPE "
-        "scans turn over tens of triangles a frame, on the person too."),
-    "mosh_design": (
-        "Which markers to put on",
-        "python tests/benchmarks/mosh_design.py -m MODEL --men held-out", marker_sets,
-        "45 held-out men in 8 poses, 114 symmetric candidates, left and right together. Settings were chosen "
-        "on training "
-        "men. The eight poses are among those of the pose prior, so that few markers look better than they are."),
-}
+def other_programs(report: dict) -> str:
+    """Every file: how far it is from the exact bodies in each program."""
+    programs = report["programs"]
+    rows: Rows = [(name, one["size_MB"], *(f"{one[p]['mean_mm']:.3g} / {one[p]['largest_mm']:.3g}" if p in one else ""
+                                           for p in programs)) for name, one in report["files"].items()]
+    return table(("file", "size (MB)", *(f"{p}, mean / largest (mm)" for p in programs)), rows)
+
+
+def threads(report: dict) -> str:
+    """Whole commands by the number of threads."""
+    return table(("command", "threads", "wall (s)", "processor (s)", "same files"),
+                 [tuple(r[n] for n in ("command", "threads", "wall_s", "cpu_s", "same")) for r in report["commands"]])

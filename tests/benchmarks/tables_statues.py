@@ -1,7 +1,7 @@
 """Tables of BENCHMARKS.md on statues."""
 from __future__ import annotations
 
-from summary_scans import Rows, table
+from tables_scans import Rows, table
 
 
 def statues(report: dict) -> str:
@@ -24,14 +24,3 @@ def surface_fits(report: dict) -> str:
                    one["scan_against_percent"]) for one in report["figure_7"]]
     return table(("from a sphere to a head", "scan to mesh, RMS (mm)", "distortion", "inverted triangles",
                   "scan turned against the mesh (%)"), rows)
-
-
-STATUES = {
-    "statues": ("Animated Statues", "python tests/benchmarks/statues.py SCAN...", statues,
-                "No clicks. Scans with known relief of 1 to 3 mm: two SCAPE poses, two SPRING men, a synthetic man and "
-                "woman through the virtual scanner. Where we lose: fists and hands, folded against the mittens of the "
-                "control mesh; in scape038 (arms up, knees bent) one hand was not found, which the fit flags."),
-    "statue_fit": ("Statues: fit of the control mesh", "python tests/benchmarks/statue_fit.py", surface_fits,
-                   "Fig. 7 of the paper. `published` are its Euler steps, and its own slack where said. Where we lose: "
-                   "time, to the last pass of registration alone."),
-}

@@ -1,9 +1,7 @@
 """Tables of BENCHMARKS.md on completion: half views, people, markers, frames of points."""
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from summary_scans import Rows, table
+from tables_scans import Rows, table
 
 
 def half_views(report: dict) -> str:
@@ -40,8 +38,8 @@ def half_people(report: dict) -> str:
         ("nearest training body, bent", "nearest_posed")) if f"{name}_seen_mm" in mean]
     rows: Rows = [(label, mean[f"{name}_seen_mm"], mean.get(f"{name}_unseen_mm", ""), mean[f"{name}_closest_mm"])
                   for label, name in kinds]
-    poisson = report["beside"]["mean"]
-    rows.append(("screened Poisson", poisson["seen_mm"], "", poisson["closest_mm"]))
+    if "poisson_seen_mm" in mean:
+        rows.append(("screened Poisson", mean["poisson_seen_mm"], "", mean["poisson_closest_mm"]))
     facts: Rows = [(r["k"], r["completed_seen_mm"], r["completed_unseen_mm"], r["predicted_unseen_mm"],
                     r.get("nearest_posed_unseen_mm", ""), r["expected_mm"], r["rms_mm"], r["cpu_seconds"])
                    for r in report["rows"]]
@@ -173,114 +171,3 @@ def viewer_speed(report: dict) -> str:
     rows: Rows = [(kind, report[kind]["a_second"], report[kind]["median_ms"], report[kind]["p95_ms"])
                   for kind in ("shape", "pose", "both")]
     return table(("slider", "round trips a second", "median (ms)", "95th percentile (ms)"), rows)
-
-
-COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
-    "half_views": (
-        "Half views of held-out poses, known subject, seven landmarks",
-        "python tests/benchmarks/half_views.py -m FOLD_0", half_views,
-        "Fold 0, model of 20 parts, viewpoint not told; settings were chosen on fold 1. A part of which a fifth was "
-        "seen counts as flipped when it is 100 mm off. Where we lose: fists that are turned about themselves, and "
-        "an arm that no point of the scan touches."),
-    "half_views_blind": (
-        "The same without landmarks",
-        "python tests/benchmarks/half_views.py -m FOLD_0 --marks 0", half_views,
-        "Started from the training poses in 600 turns each. On fold 1, which settings were chosen on, two of 14 "
-        "arms that are wholly hidden end elsewhere; no prior that we tried knows where they are."),
-    "half_views_published": (
-        "The same with the settings of the paper, seven landmarks",
-        "python tests/benchmarks/half_views.py -m FOLD_0 --only 0 3 6 9 12 --published", half_views,
-        "Rotations, surface and shape in turns [SCAPE] Eq. 11. The default on these five views: seen 0.78 mm, unseen "
-        "12.3 mm, predicted 2.5 and 12.9 mm, 8.0 s."),
-    "imported_models": (
-        "Imported models beside SCAPE, on synthetic people not learned",
-        "python tests/benchmarks/imported_models.py --star --smplx --frames 120 --bodies 3", imported_models,
-        "Wall-clock seconds of a machine that others used too: read them as upper bounds. The pose columns of the STAR "
-        "and SMPL-X layouts are noise here, and the latter's hands too: their distances say only that the fits end; "
-        "the seconds are what counts."),
-    "few_scans": (
-        "Few scans: a model of 8 poses of one man and 10 men", "python tests/benchmarks/few_scans.py --before BEFORE",
-        few_scans,
-        "Three draws of training scans. Before: a prior of the eight poses and how people stand, limbs drawn once. The "
-        "limit from which a part is told, 60 mm expected, was set on tuning bodies (offsets 1 and 3), where it told 10 "
-        "of 10 limbs beyond 150 mm and two that were right. A viewpoint that was missed because of a patch of wrong "
-        "normals was seen on a held man, and mended. What was tried on tuning bodies and lost: a stronger free space, "
-        "a weaker prior, the middle of several draws for a hidden limb, wider matches alone. Mirrored poses in "
-        "learning lowered the error of left-out poses by 2 and 4% and are not taken. Where we lose: limbs that "
-        "nobody saw; of unknown men, who all stand, some arms now hang elsewhere than at the side."),
-    "few_scans_fewest": (
-        "The same with 3 poses and one man", "python tests/benchmarks/few_scans.py --poses 3 --men 1", few_scans,
-        "What it can still do: follow the man where he was seen. That a model 30 mm off in left-out poses makes every "
-        "completion doubtful was chosen after a look at these very results."),
-    "half_people": (
-        "Half views of held-out men, unknown shape",
-        "python tests/benchmarks/half_people.py -m MODEL --nearest --points DIR; --poisson DIR", half_people,
-        "45 men, seven landmarks, 40 components, settings chosen on a dozen of the training men with a model "
-        "without them; six of the 45 had been run once before, with a pose prior that did not know how people stand. "
-        "The nearest training body is the nearest of 182 by trimmed closest points; bent: made the template of a "
-        "pose-only model and fitted by our own solver. Poisson has no vertices in common with the truth."),
-    "depth_camera": (
-        "One picture of a depth camera",
-        "python tests/benchmarks/depth_camera.py -m MODEL --only 2 3 4 5 6 7 8 9 10 11 12 13 14 15", depth_camera,
-        "Dressed bodies before a wall, cut off by the border of the picture at hips, knees or neck, unknown shape, a "
-        "model of 43 poses and 46 men. A part is seen when a fifth of its vertices is. Tuned on other bodies, cameras "
-        "and clothes; held cases 0 and 1 were looked at and are left out. With nothing and seven landmarks, cases 2 to "
-        "11 only. Where we lose: limbs that the body hides, and legs of which the picture shows nothing."),
-    "searches": (
-        "Two searches for pose and shape",
-        "python tests/benchmarks/searches.py -m MODEL --fold FOLD_0", searches,
-        "Four held-out men and three held-out poses. The way of co-registration ends with a non-rigid registration, "
-        "after which pose and shape are found again. Where each loses: without landmarks, its time."),
-    "markers": (
-        "Markers on random vertices of held-out poses, and real recordings",
-        "python tests/benchmarks/markers.py -m FOLD_0 --c3d FOLDER --people MODEL", markers,
-        "Fold 0, known subject. First every pose a frame of its own; then a motion through these scans at 120 Hz, "
-        "with markers missing, exchanged and astray; then four recordings whose person comes from the markers. One "
-        "core, beside other work: frames a second of wall time are lower bounds. Streams predicted by velocity, which "
-        "were never better, are no longer offered. Where we lose: strays in the very "
-        "first frame, and acrobatics, where a quarter of the frames does not settle."),
-    "c3d": (
-        "Person and motion from real recordings",
-        "python tests/benchmarks/c3d.py FOLDER -m MODEL", recordings,
-        "One layout for four people. Its markers were moved by what was found over these same files, so the figures "
-        "are not of unseen data; markers that the layout calls loose are sought on each person."),
-    "tracking": (
-        "Frames of points without markers",
-        "python tests/benchmarks/tracking.py tracking.json", tracking,
-        "A walk of 120 frames at 30 Hz of a synthetic person who is not in the model of the synthetic people, two "
-        "depth cameras with 5 mm noise, no landmarks. The run was stopped before its last two rows, frames that show "
-        "nothing and frames that show half. `surface`: the model's vertices to the true surface of the whole body."),
-    "worn_markers": (
-        "Markers clicked on a scan of the person who wears them",
-        "python tests/benchmarks/worn_markers.py", worn_markers,
-        "Seven landmarks, all clicks without error, `cmu41`. The SCAPE man as an unknown person shows how differently "
-        "two sets of scans were registered along the skin: the shapes of this model are SPRING men. `flagged`: scans "
-        "whose completion is not judged good. Registration instead (`--register`), all around, means of the poses 2, "
-        "17 and 22: the template, which is this very man, 7.0, 10.7 and 10.0 mm where the completion of the known man "
-        "has 7.8, 11.7 and 12.8 (all 41 markers); of three SPRING men 16.3, 16.7 and 15.0 mm where it has 8.8, 9.2 and "
-        "8.1. The body at rest that the completion found, registered: 9.3, 10.6 and 10.3 mm, and 7.9 and 8.5 for two "
-        "of the men, in two to three times the time. Where we lose: places on a limb that is rolled about its axis, "
-        "and the trunk of bent bodies. Beside other work on two cores."),
-    "measures": (
-        "Measurements of people",
-        "python tests/benchmarks/measures.py -o FOLDER", measures,
-        "Twenty synthetic people against sections of their true triangles by trimesh, in the planes that the true "
-        "vertices carry: scans of four views near rest, registered with ten landmarks, each coordinate clicked with 3 "
-        "mm; half views in random poses, the known person being the registered body; 47 markers, 5 mm beside their "
-        "place. Repeated: six SPRING men, two scans each, registered each for itself. The constants of stated errors "
-        "were chosen on the even people. Where we lose: the under-bust and chest girths of women, as breasts are "
-        "where vertices slide most; upper arms, whose middle slides along the arm by 7 mm; thin limbs come out "
-        "2 to 3 mm small, as a registered mesh cuts corners twice and lies 0.2 mm inside the scan; the trunk of an "
-        "unknown person from one side."),
-    "wrong_landmarks": (
-        "Landmarks at wrong places",
-        "python tests/benchmarks/wrong_landmarks.py -m FOLD_0", wrong_landmarks,
-        "Half views of held-out poses, known subject, seven landmarks: as they are, exchanged, or one of them at the "
-        "place of another. Told rightly: the body that is found without landmarks is far from the wrong ones alone. "
-        "The time is that of finding it. Beside the suite of tests on two cores."),
-    "viewer_speed": (
-        "Sliders of a model in the browser",
-        "python tests/benchmarks/viewer_speed.py -m MODEL", viewer_speed,
-        "From a slider in the page to the new vertices there, 12,500 of them, without drawing; the suite of tests was "
-        "running on both cores. Chromium with software rendering."),
-}
