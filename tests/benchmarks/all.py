@@ -2,11 +2,11 @@
 
     SCAPEKIT_DATA=... python tests/benchmarks/all.py WORK [--quick] [--only NAME ...] [--at-once N]
 
-WORK is a folder outside the checkout: models and logs stay there, results (`results/NAME.json`) and BENCHMARKS.md are
-written here. `$SCAPEKIT_DATA` holds the real scans, and the recordings in `cmu_c3d`. Called again, it goes on: what was
-measured with the sources as they are is kept. A benchmark that cannot run, because data or a program are missing or it
-fails, says so, and the others run. Peers are measured where they are installed: `pip install ".[benchmarks]"`, and
-Bayesian coherent point drift as the program `bcpd`.
+WORK is a folder outside the checkout, where models and logs stay. Results (`results/NAME.json`), BENCHMARKS.md and the
+README's table of figures are written here. `$SCAPEKIT_DATA` holds the real scans, and the recordings in `cmu_c3d`.
+Called again, it goes on: what was measured with the sources as they are is kept. A benchmark that cannot run, because
+data or a program are missing or it fails, says so, and the others run. Peers are measured where they are installed:
+`pip install ".[benchmarks]"`, and Bayesian coherent point drift as the program `bcpd`.
 
 `--quick` takes fewer bodies where there are many. `--at-once` runs so many benchmarks beside each other, each on one
 thread; those that time whole commands always run alone, on all cores. With `--tables` nothing is run.
@@ -28,11 +28,14 @@ from functools import cache
 from pathlib import Path
 
 from catalogue import BENCHMARKS, Benchmark
+from headlines import HEADLINES
 from protocols import machine
+from tables_scans import Rows, table
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 RESULTS = HERE / "results"
+MARKS = "<!-- figures -->", "<!-- end of figures -->"       # in the README
 MODELS = {"MEN": "learning", "FOLD_0": "scape_5fold"}      # and the benchmarks that learn them
 PEERS = ("open3d", "pymeshlab", "trimesh", "meshmonk", "pycpd", "pyfmaps", "py-dem-bones", "pymeshfix", "pyfqmr",
          "pymomentum-core", "opensim", "usd-core")
@@ -168,8 +171,29 @@ def shown(one: Benchmark, runner: Runner) -> str:
     return "\n\n".join(part for part in (head + took, one.table(json.loads(path.read_text())), one.note) if part) + "\n"
 
 
+def headlines(runner: Runner) -> str:
+    """A table of the figures that the README quotes, with the command of each."""
+    rows: Rows = []
+    for one in BENCHMARKS:
+        if one.name in HEADLINES and runner.is_done(one):
+            report = json.loads((RESULTS / f"{one.name}.json").read_text())
+            rows += [(*line, f"`{runner.arguments(one)}`") for line in HEADLINES[one.name](report)]
+    return table(("", "", "command"), rows)
+
+
+def into_readme(figures: str) -> None:
+    """Put the table between its two marks in the README."""
+    path = ROOT / "README.md"
+    before, _, rest = path.read_text().partition(MARKS[0])
+    _, found, after = rest.partition(MARKS[1])
+    assert found, f"README.md: expected {MARKS[0]} and {MARKS[1]}"
+    path.write_text(f"{before}{MARKS[0]}\n{figures}\n{MARKS[1]}{after}")
+
+
 def write_tables(runner: Runner) -> None:
-    """BENCHMARKS.md from the results of this code."""
+    """BENCHMARKS.md, and the README's figures, from the results of this code."""
+    figures = headlines(runner)
+    into_readme(figures)
     here = [one for one in BENCHMARKS if runner.arguments(one)]
     out = [one for one in BENCHMARKS if not runner.arguments(one)]
     seconds = sum(runner.state(one).get("wall_s", 0.0) for one in here)
@@ -181,6 +205,7 @@ def write_tables(runner: Runner) -> None:
     if runner.quick:
         parts.append("\n`--quick` takes fewer bodies where there are many"
                      + (f", and leaves out {', '.join(one.name for one in out)}" if out else "") + ".\n")
+    parts.append(f"\n## In short\n\n{figures}\n")
     parts += [shown(one, runner) for one in here]
     (HERE / "BENCHMARKS.md").write_text("".join(parts))
 

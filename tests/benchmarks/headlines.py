@@ -1,0 +1,95 @@
+"""The figures that the README quotes, each read from the result of one benchmark."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+Lines = list[tuple[str, str]]        # what was measured, and the figures
+
+
+def _mm(*values: float) -> str:
+    return ", ".join(f"{value:.1f}" for value in values) + " mm"
+
+
+def registration(report: dict) -> Lines:
+    pose, man = (report["summary"][kind] for kind in ("pose", "man"))
+    return [("registration, 10 landmarks, four virtual views: one man in "
+             f"{sum(r['scan'].startswith('pose') for r in report['rows'])} poses; other men; both to the surface",
+             f"{_mm(pose['all_mm'])}; {_mm(man['all_mm'])}; {_mm(pose['surface_seen_mm'], man['surface_seen_mm'])}"),
+            ("one registration", f"{np.mean([r['cpu_s'] for r in report['rows']]):.0f} s")]
+
+
+def poses(report: dict) -> Lines:
+    kinds = {kind: np.concatenate([fold["kinds"][kind]["error_mm"] for fold in report["folds"].values()])
+             for kind in ("SCAPE, linear", "LBS + linear correctives")}
+    folds = len(report["folds"])
+    return [(f"known man in poses never seen ({folds} of 5 folds): SCAPE; skinning with corrective shapes",
+             "; ".join(_mm(errors.mean()) for errors in kinds.values()))]
+
+
+def learning(report: dict) -> Lines:
+    people = {row["components"]: row["mean_mm"] for row in report["people"]}
+    count, components = report["people"][0]["people"], ", ".join(map(str, people))
+    return [(f"{count} men never seen, model of 182 men: {components} components", _mm(*people.values())),
+            ("learning from 71 poses and 182 men, choice of parts included", f"{report['learn_s']:.0f} s"),
+            ("meshes of a fixed person", f"{report['fast_path']['float64_meshes_per_s']:,.0f} a second")]
+
+
+def half_views(report: dict) -> Lines:
+    mean = report["mean"]
+    return [(f"half view of the known man, {len(report['rows'])} poses never seen, 7 landmarks: seen; unseen surface",
+             f"{_mm(mean['completed_seen_mm'])}; {_mm(mean['completed_unseen_mm'])}")]
+
+
+def half_people(report: dict) -> Lines:
+    mean, seconds = report["mean"], [row["cpu_seconds"] for row in report["rows"]]
+    return [(f"half view of {len(seconds)} men never seen: seen; unseen surface",
+             f"{_mm(mean['completed_seen_mm'])}; {_mm(mean['completed_unseen_mm'])}"),
+            ("one completion: median, nine of ten, slowest",
+             f"{np.median(seconds):.1f}, {np.quantile(seconds, 0.9):.1f}, {max(seconds):.1f} s")]
+
+
+def few_scans(report: dict) -> Lines:
+    mean = report["mean"]
+    return [("half views, model of 8 poses and 10 men, unseen surface: known man; unknown men",
+             f"{_mm(mean['known_unseen_mm'])}; {_mm(mean['unknown_unseen_mm'])}")]
+
+
+def depth_camera(report: dict) -> Lines:
+    mean = report["mean"]
+    right = mean["up_right"] * mean["up_cases"]
+    return [("depth picture of a dressed man, cut off, `--up` told: within the picture; seen parts in their place",
+             f"{_mm(mean['up_within_median_mm'])}; {right:.0f} of {mean['up_cases']:.0f}")]
+
+
+def markers(report: dict) -> Lines:
+    return [("56 markers, known man: whole surface", _mm(report["mean"]["surface_mm"]))]
+
+
+def people(report: dict) -> Lines:
+    line = next(r for r in report["mean"] if r["markers"] == 47)
+    return [(f"shape of {line['men']} men never seen from 47 markers in 12 frames", _mm(line["error_mm"]))]
+
+
+def tracking(report: dict) -> Lines:
+    run = report["runs"]["unknown shape"]
+    return [("walk from two depth cameras, person unknown: distance to the true surface", _mm(run["surface"])),
+            ("frames tracked", f"{1 / run['CPU s a frame']:.1f} a second")]
+
+
+def statues(report: dict) -> Lines:
+    finest = [row["levels"][-1]["mean_mm"] for row in report["rows"] if not row["vectors"]]
+    return [(f"{len(finest)} scans as statues, 400,000 triangles: distance to the scan",
+             f"{min(finest):.2f} to {max(finest):.2f} mm")]
+
+
+def measures(report: dict) -> Lines:
+    girths = {row["how"]: row["mean_mm"] for row in report["means"] if row["girth"]}
+    return [(f"girths of synthetic people: {'; '.join(girths)}", "; ".join(_mm(value) for value in girths.values()))]
+
+
+HEADLINES: dict[str, Callable[[dict], Lines]] = {
+    "registration_10": registration, "scape_5fold": poses, "learning": learning, "half_views": half_views,
+    "half_people": half_people, "few_scans": few_scans, "depth_camera": depth_camera, "tracking": tracking,
+    "markers": markers, "mosh_people": people, "measures": measures, "statues": statues}
