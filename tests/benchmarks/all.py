@@ -68,7 +68,8 @@ class Runner:
 
     def __init__(self, work: Path, quick: bool) -> None:
         self.work, self.quick = work.resolve(), quick
-        self.data = Path(os.environ.get("SCAPEKIT_DATA", "SCAPEKIT_DATA"))
+        data = Path(os.environ.get("SCAPEKIT_DATA", "$SCAPEKIT_DATA")).resolve()
+        self.places = {"DATA": data, "C3D": data / "cmu_c3d", **{name: self.work / f"{name}.npz" for name in MODELS}}
         self.work.mkdir(parents=True, exist_ok=True)
 
     def arguments(self, one: Benchmark) -> str:
@@ -92,36 +93,48 @@ class Runner:
             and not state.get("failed")
 
     def command(self, one: Benchmark, scratch: Path) -> list[str]:
-        """Words for the shell, paths put in."""
-        places = {"DATA": self.data, "C3D": self.data / "cmu_c3d", "SCRATCH": scratch,
-                  **{name: self.work / f"{name}.npz" for name in MODELS}}
+        """Words for the shell, paths put in; FileNotFoundError for data or a model that are not there."""
         script, *words = shlex.split(self.arguments(one))
-        return [sys.executable, str(HERE / script),
-                *(re.sub(r"^[A-Z][A-Z0-9_]*", lambda m: str(places.get(m[0], m[0])), word) for word in words),
+
+        def place(found: re.Match) -> str:
+            path = {**self.places, "SCRATCH": scratch}.get(found[0])
+            if path is None or path.exists() or MODELS.get(found[0]) == one.name:
+                return str(path or found[0])
+            raise FileNotFoundError(f"{found[0]} is not there")
+
+        return [sys.executable, str(HERE / script), *(re.sub(r"^[A-Z][A-Z0-9_]*", place, word) for word in words),
                 "-o", str(scratch / "result.json")]
 
     def run(self, one: Benchmark) -> dict:
         """One benchmark in a process of its own; its state afterwards."""
         scratch = self.work / f"{one.name}.{self.code(one)}"
         scratch.mkdir(exist_ok=True)
+        state = {"code": self.code(one), "wall_s": 0.0}
+        try:
+            state |= self.measured(one, self.command(one, scratch), scratch)
+        except FileNotFoundError as missing:
+            state["failed"] = str(missing)
+        if "failed" not in state:
+            shutil.copy(scratch / "result.json", RESULTS / f"{one.name}.json")
+        (self.work / f"{one.name}.run.json").write_text(json.dumps(state))
+        return state
+
+    def measured(self, one: Benchmark, command: list[str], scratch: Path) -> dict:
+        """What a benchmark took, and the last line that it said where it failed."""
         threads = {} if one.alone else dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         environment = os.environ | threads | {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests")))}
         start, log = time.time(), self.work / f"{one.name}.log"
         with log.open("w") as said:
-            child = subprocess.Popen(self.command(one, scratch), stdout=said, stderr=said, env=environment, cwd=scratch,
+            child = subprocess.Popen(command, stdout=said, stderr=said, env=environment, cwd=scratch,
                                      stdin=subprocess.DEVNULL)
             _, status, used = os.wait4(child.pid, 0)
             child.returncode = os.waitstatus_to_exitcode(status)
-        state = {"code": self.code(one), "wall_s": time.time() - start, "cpu_s": used.ru_utime + used.ru_stime,
-                 "peak_gib": used.ru_maxrss / 2**20}
-        result = scratch / "result.json"
-        if child.returncode or not result.exists():
+        took = {"wall_s": time.time() - start, "cpu_s": used.ru_utime + used.ru_stime,
+                "peak_gib": used.ru_maxrss / 2**20}
+        if child.returncode or not (scratch / "result.json").exists():
             lines = log.read_text(errors="replace").strip().splitlines()
-            state["failed"] = lines[-1][:200] if lines else f"exit code {child.returncode}"
-        else:
-            shutil.copy(result, RESULTS / f"{one.name}.json")
-        (self.work / f"{one.name}.run.json").write_text(json.dumps(state))
-        return state
+            took["failed"] = lines[-1][:200] if lines else f"exit code {child.returncode}"
+        return took
 
 
 def run_all(runner: Runner, chosen: list[Benchmark], at_once: int) -> None:

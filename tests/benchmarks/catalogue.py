@@ -55,10 +55,10 @@ BENCHMARKS = (
               "Seconds beside a process that computes all the time on one of the cores, by the number of threads of "
               "the linear algebra; `own` is what scapekit decides.",
               quick="threads.py --busy 1 --threads own 2", alone=True),
-    Benchmark("folder", "A folder of scans", "folder.py SCRATCH", scans.folder,
+    Benchmark("folder", "A folder of scans", "folder.py SCRATCH", scans.as_they_are,
               "Ten landmarks a scan. The largest memory is that of the one process, and of the largest worker.",
               quick="folder.py SCRATCH --scans 8", alone=True),
-    Benchmark("mosh_speed", "How long `scape mosh` takes", "mosh_speed.py C3D -m MEN --long", mocap.speed,
+    Benchmark("mosh_speed", "How long `scape mosh` takes", "mosh_speed.py C3D -m MEN", mocap.speed,
               "Whole commands on one thread.", alone=True),
     Benchmark("viewer_speed", "Sliders of a model in the browser", "viewer_speed.py -m MEN", completion.viewer_speed,
               "From a slider in the page to the new vertices there, without drawing. Chromium with software "
@@ -241,9 +241,9 @@ BENCHMARKS = (
               "mosh_c3d.py C3D -m MEN --preset published", mocap.recordings,
               "No marker is an outlier, nothing is repaired; its prior of poses is that of 71 scans here."),
     Benchmark("peer_markers", "Another marker tracker on the same recordings", "peer_markers.py C3D -m MEN",
-              mocap.peer_markers,
+              scans.as_they_are,
               "What the other program was given stands in the head of the script."),
-    Benchmark("mosh_soft", "Soft tissue of known size", "mosh_soft.py C3D -m MEN", mocap.soft_tissue),
+    Benchmark("mosh_soft", "Soft tissue of known size", "mosh_soft.py C3D -m MEN", scans.as_they_are),
     Benchmark("mosh_faults", "Faults put into markers",
               "mosh_artefacts.py C3D -m MEN --men 3 --held-out --no-real --files basketball 85_02", mocap.faults,
               "Held-out men moved as in two recordings; a tenth of the markers exchanged at any time, a twentieth "

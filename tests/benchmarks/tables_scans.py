@@ -17,6 +17,12 @@ def table(header: tuple[str, ...], rows: Rows) -> str:
     return "\n".join("| " + " | ".join(map(text, line)) + " |" for line in lines)
 
 
+def as_they_are(report: dict) -> str:
+    """All rows of a result, a column for every figure."""
+    names = list(dict.fromkeys(name for row in report["rows"] for name in row))
+    return table(tuple(names), [tuple(row.get(name, "") for name in names) for row in report["rows"]])
+
+
 def registration(report: dict) -> str:
     """Every scan, and the means of poses and men."""
     names = ("all_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped", "cpu_s")

@@ -1,0 +1,83 @@
+"""The command that runs all benchmarks: what is kept, what is told where one cannot run, and its catalogue."""
+import importlib.util
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def benchmarks():
+    """The module of `all.py`, with its neighbours importable."""
+    sys.path.insert(0, str(FOLDER))
+    try:
+        found = importlib.util.spec_from_file_location("run_benchmarks", FOLDER / "all.py")
+        module = importlib.util.module_from_spec(found)
+        found.loader.exec_module(module)
+        yield module
+    finally:
+        sys.path.remove(str(FOLDER))
+
+
+@pytest.fixture()
+def runner(benchmarks, tmp_path, monkeypatch):
+    """One with scripts, results and work in folders of its own, and no data."""
+    monkeypatch.setattr(benchmarks, "HERE", tmp_path)
+    monkeypatch.setattr(benchmarks, "RESULTS", tmp_path / "results")
+    monkeypatch.delenv("SCAPEKIT_DATA", raising=False)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "good.py").write_text("import sys; open(sys.argv[-1], 'w').write('{\"rows\": 3}')")
+    (tmp_path / "bad.py").write_text("raise SystemExit('no such scans')")
+    return benchmarks.Runner(tmp_path / "work", quick=False)
+
+
+def entry(benchmarks, name, arguments):
+    return benchmarks.Benchmark(name, f"Title of {name}", arguments, lambda report: f"table of {report['rows']}")
+
+
+def test_what_cannot_run_says_so_and_the_others_run(benchmarks, runner, capsys):
+    chosen = [entry(benchmarks, name, arguments) for name, arguments in
+              (("bad", "bad.py"), ("dataless", "good.py C3D"), ("modelless", "good.py -m MEN"), ("good", "good.py"))]
+    benchmarks.run_all(runner, chosen, 2)
+    assert "good, " in capsys.readouterr().out
+    sections = [benchmarks.shown(one, runner) for one in chosen]
+    assert "no such scans" in sections[0]
+    assert "C3D is not there" in sections[1]
+    assert "MEN is not there" in sections[2]
+    assert "table of 3" in sections[3]
+
+
+def test_a_result_is_kept_until_the_code_changes(benchmarks, runner, tmp_path):
+    one = entry(benchmarks, "good", "good.py")
+    benchmarks.run_all(runner, [one], 1)
+    assert runner.is_done(one)
+    (tmp_path / "results" / "good.json").write_text(json.dumps({"rows": 4}))
+    benchmarks.run_all(runner, [one], 1)
+    assert "table of 4" in benchmarks.shown(one, runner)
+    with (tmp_path / "good.py").open("a") as script:
+        script.write("\n# changed")
+    assert not runner.is_done(one)
+    assert "not measured with this code" in benchmarks.shown(one, runner)
+    benchmarks.run_all(runner, [one], 1)
+    assert "table of 3" in benchmarks.shown(one, runner)
+
+
+def test_every_benchmark_names_a_script_and_options_that_it_has(benchmarks):
+    names = [one.name for one in benchmarks.BENCHMARKS]
+    assert len(set(names)) == len(names)
+    for one in benchmarks.BENCHMARKS:
+        for arguments in filter(None, (one.arguments, one.quick)):
+            script, *words = shlex.split(arguments)
+            text = (FOLDER / script).read_text()
+            for word in words:
+                assert not re.match("-[a-z-]", word) or f'"{word}"' in text, f"{arguments}: {script} has no {word}"
+            assert '"-o"' in text, f"{script}: expected -o"
+
+
+def test_every_headline_is_of_a_benchmark(benchmarks):
+    assert set(benchmarks.HEADLINES) <= {one.name for one in benchmarks.BENCHMARKS}
