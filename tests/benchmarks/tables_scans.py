@@ -54,13 +54,16 @@ def rolled_limbs(report: dict) -> str:
 
 
 def peers(report: dict) -> str:
-    """A row for every tool: its error on every body, and its time."""
+    """A row for every tool: its error on every body, or why there is none, and its time."""
+    def cell(row: dict) -> float | str:
+        return row.get("all_mm") or next(why for why in ("missing", "stopped", "failed") if why in row)
+
     bodies = list(dict.fromkeys(r["body"] for r in report["rows"]))
     rows: Rows = []
     for tool in dict.fromkeys(r["tool"] for r in report["rows"]):
         mine = {r["body"]: r for r in report["rows"] if r["tool"] == tool}
         done = [r for r in mine.values() if "all_mm" in r]
-        rows.append((tool, *(mine[b].get("all_mm", "missing") if b in mine else "" for b in bodies),
+        rows.append((tool, *(cell(mine[b]) if b in mine else "" for b in bodies),
                      float(np.mean([r["surface_seen_mm"] for r in done])) if done else "",
                      float(np.mean([r["seconds"] for r in done])) if done else ""))
     return table(("mean vertex error (mm)", *bodies, "to the true surface, where data (mm)", "time (s wall)"), rows)
