@@ -1,13 +1,20 @@
-"""A call in a process of its own, with a limit on its time: what it returned, how long it took, or why it did not."""
+"""A call in a process of its own, with a limit on its time: what it returned, how long it took, or why it did not.
+
+The process imports the function's module before anything else, so that a package whose C++ library must be loaded first
+is; it is this file, run as a program.
+"""
 from __future__ import annotations
 
-import multiprocessing
+import importlib
 import os
+import pickle
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 
@@ -28,56 +35,52 @@ class Outcome:
         Empty where it returned; else one of "missing": what, "stopped": the limit, "failed": the error.
     """
 
-    value: Any
-    seconds: float
-    cpu_s: float
-    why: dict[str, Any]
+    value: Any = None
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    why: dict[str, Any] | None = None
 
 
 def processor_seconds() -> float:
-    """Of this process and of the programs it started that have ended."""
+    """Of this process, all its threads, and of the programs it started that have ended."""
     return sum(os.times()[:4])
 
 
 def alone(limit: float, call: Callable[..., Any], *args: Any) -> Outcome:
-    """Call a function of a module with arguments that can be pickled; it is stopped after `limit` seconds."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_run, args=(theirs, call, args))
-    process.start()
-    theirs.close()
-    try:
-        if not ours.poll(limit):
-            return Outcome(None, limit, float("nan"), {"stopped": limit})
-        return Outcome(*ours.recv())
-    except EOFError:
-        process.join()
-        return Outcome(None, 0.0, 0.0, {"failed": f"the process ended with code {process.exitcode}"})
-    finally:
-        _end(process)
+    """Call a function of a module beside this one with arguments that can be pickled.
 
-
-def _run(out: Connection, call: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    if hasattr(os, "setsid"):
-        os.setsid()                              # so that the programs it starts are stopped with it
-    value, why = None, {}
-    wall, cpu = time.perf_counter(), processor_seconds()
-    try:
-        value = call(*args)
-    except Missing as missing:
-        why = {"missing": str(missing)}
-    except Exception as error:                   # one tool that fails must not end the run
-        why = {"failed": f"{type(error).__name__}: {error}"}
-    out.send((value, time.perf_counter() - wall, processor_seconds() - cpu, why))
-
-
-def _end(process: Any) -> None:
-    if not process.is_alive():
-        process.join()
-        return
-    process.join(5)
-    if process.is_alive():
-        if hasattr(os, "killpg"):
+    It is stopped after `limit` seconds, with the programs that it started. What it prints is dropped.
+    """
+    module = call.__module__
+    if module == "__main__":
+        module = Path(sys.modules["__main__"].__file__ or "").stem
+    with subprocess.Popen([sys.executable, __file__, module, call.__name__], stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE, start_new_session=True) as process:
+        try:
+            answer, _ = process.communicate(pickle.dumps(args), timeout=limit)
+        except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
-        process.kill()
-        process.join()
+            return Outcome(why={"stopped": limit})
+    if not answer:
+        return Outcome(why={"failed": f"the process ended with code {process.returncode}"})
+    return Outcome(*pickle.loads(answer))
+
+
+def main() -> None:
+    """The other process: module and function on the command line, arguments by stdin, the outcome by stdout."""
+    with os.fdopen(os.dup(1), "wb") as out, open(os.devnull, "w") as nothing:
+        os.dup2(nothing.fileno(), 1)             # progress bars
+        value, why, wall, cpu = None, None, time.perf_counter(), processor_seconds()
+        try:
+            call = getattr(importlib.import_module(sys.argv[1]), sys.argv[2])
+            args = pickle.load(sys.stdin.buffer)
+            wall, cpu = time.perf_counter(), processor_seconds()
+            value = call(*args)
+        except Exception as error:               # one tool that fails must not end the run
+            missing = type(error).__name__ == "Missing"
+            why = {"missing": str(error)} if missing else {"failed": f"{type(error).__name__}: {error}"}
+        pickle.dump((value, time.perf_counter() - wall, processor_seconds() - cpu, why), out)
+
+
+if __name__ == "__main__":
+    main()
