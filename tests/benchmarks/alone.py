@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ class Outcome:
     value: Any = None
     seconds: float = 0.0
     cpu_s: float = 0.0
-    why: dict[str, Any] | None = None
+    why: dict[str, Any] = field(default_factory=dict)
 
 
 def processor_seconds() -> float:
@@ -70,15 +70,15 @@ def main() -> None:
     """The other process: module and function on the command line, arguments by stdin, the outcome by stdout."""
     with os.fdopen(os.dup(1), "wb") as out, open(os.devnull, "w") as nothing:
         os.dup2(nothing.fileno(), 1)             # progress bars
-        value, why, wall, cpu = None, None, time.perf_counter(), processor_seconds()
+        value, why, wall, cpu = None, {}, time.perf_counter(), processor_seconds()
         try:
             call = getattr(importlib.import_module(sys.argv[1]), sys.argv[2])
             args = pickle.load(sys.stdin.buffer)
             wall, cpu = time.perf_counter(), processor_seconds()
             value = call(*args)
         except Exception as error:               # one tool that fails must not end the run
-            missing = type(error).__name__ == "Missing"
-            why = {"missing": str(error)} if missing else {"failed": f"{type(error).__name__}: {error}"}
+            kind = type(error).__name__          # by its name: this file is another module here
+            why = {"missing": str(error)} if kind == "Missing" else {"failed": f"{kind}: {error}"}
         pickle.dump((value, time.perf_counter() - wall, processor_seconds() - cpu, why), out)
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable
@@ -88,7 +89,8 @@ def geodesic_drift(data: RealData, item: TestScan, bcpd: str) -> np.ndarray:
         np.savetxt(Path(folder, "f.txt"), data.template.faces + 1, fmt="%d", delimiter="\t")
         subprocess.run([str(Path(bcpd).resolve()), "-x", "x.txt", "-y", "y.txt", "-Ggeodesic,0.2,f.txt",
                         "-w0.05", "-b1.2", "-l10", "-g0.1", "-A", "-n300", "-c1e-6", "-ux", "-DB,5000,0.02"],
-                       cwd=folder, check=True, stdout=subprocess.DEVNULL)
+                       cwd=folder, check=True, stdout=subprocess.DEVNULL,
+                       stderr=subprocess.DEVNULL)
         return np.loadtxt(Path(folder, "output_y.txt"))[:, :3]
 
 
@@ -155,7 +157,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bodies", default="pose2,pose22,pose47,pose67,man52")
     parser.add_argument("--only", default="", help="part of a tool's name")
-    parser.add_argument("--bcpd", default="", help="program of Bayesian coherent point drift")
+    parser.add_argument("--bcpd", default=shutil.which("bcpd") or "",
+                        help="program of Bayesian coherent point drift; else the one on the path")
     parser.add_argument("--limit", type=float, default=1800.0, help="seconds after which a tool is stopped")
     parser.add_argument("-o", "--output", default="peers.json")
     args = parser.parse_args()

@@ -134,3 +134,16 @@ def threads(report: dict) -> str:
     """Whole commands by the number of threads."""
     return table(("command", "threads", "wall (s)", "processor (s)", "same files"),
                  [tuple(r[n] for n in ("command", "threads", "wall_s", "cpu_s", "same")) for r in report["commands"]])
+
+
+def peer_markers(report: dict) -> str:
+    """A row for every tool and recording, and each tool's means."""
+    names = ("used_mm", "used_p95_mm", "held_out_mm", "held_out_p95_mm", "acceleration", "cpu_s", "frames_per_cpu_s")
+    rows: Rows = [(r["file"], r["tool"], *(r.get(n, "") for n in names)) for r in report["rows"]]
+    for tool in dict.fromkeys(r["tool"] for r in report["rows"]):
+        done = [r for r in report["rows"] if r["tool"] == tool and "used_mm" in r]
+        if done:
+            rows.append(("mean", tool, *(float(np.mean([r[n] for r in done])) for n in names[:-1]),
+                         sum(r["frames"] for r in done) / sum(r["cpu_s"] for r in done)))
+    return table(("file", "tool", "markers (mm)", "p95 (mm)", "held out, calibrated (mm)", "p95 (mm)",
+                  "acceleration of joints, RMS (rad/s²)", "time (s CPU)", "frames/s CPU"), rows)

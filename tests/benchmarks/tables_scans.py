@@ -65,8 +65,8 @@ def peers(report: dict) -> str:
         done = [r for r in mine.values() if "all_mm" in r]
         rows.append((tool, *(cell(mine[b]) if b in mine else "" for b in bodies),
                      float(np.mean([r["surface_seen_mm"] for r in done])) if done else "",
-                     float(np.mean([r["seconds"] for r in done])) if done else ""))
-    return table(("mean vertex error (mm)", *bodies, "to the true surface, where data (mm)", "time (s wall)"), rows)
+                     float(np.mean([r["cpu_s"] for r in done])) if done else ""))
+    return table(("mean vertex error (mm)", *bodies, "to the true surface, where data (mm)", "time (s CPU)"), rows)
 
 
 def correspondences(report: dict) -> str:
