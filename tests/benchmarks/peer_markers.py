@@ -2,7 +2,7 @@
 
     python tests/benchmarks/peer_markers.py FOLDER -m MODEL.npz [-o peer_markers.json] [--files 01_01,basketball]
 
-Needs pymomentum-core (`pip install scapekit[benchmarks]`). Both find the person and every frame from the recording alone;
+Needs pymomentum-core (`pip install scapekit[benchmarks]`). Both find person and frames from the recording alone;
 six markers are in no stage. Of `scapekit` it is `mosh` with a fixed shape and its own settings.
 
 What pymomentum was given. Its package brings no character, so it has ours: the joints of the mean person of the model,

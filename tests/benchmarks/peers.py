@@ -89,8 +89,7 @@ def geodesic_drift(data: RealData, item: TestScan, bcpd: str) -> np.ndarray:
         np.savetxt(Path(folder, "f.txt"), data.template.faces + 1, fmt="%d", delimiter="\t")
         subprocess.run([str(Path(bcpd).resolve()), "-x", "x.txt", "-y", "y.txt", "-Ggeodesic,0.2,f.txt",
                         "-w0.05", "-b1.2", "-l10", "-g0.1", "-A", "-n300", "-c1e-6", "-ux", "-DB,5000,0.02"],
-                       cwd=folder, check=True, stdout=subprocess.DEVNULL,
-                       stderr=subprocess.DEVNULL)
+                       cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         return np.loadtxt(Path(folder, "output_y.txt"))[:, :3]
 
 
@@ -115,6 +114,7 @@ def meshmonk_pyramid(data: RealData, item: TestScan, _: str) -> np.ndarray:
     need("meshmonk")
     import meshmonk
 
+    meshmonk.set_log_level("error")
     start, scan = data.template.with_vertices(1e3 * placed(data, item)), item.scan
     found = meshmonk.pyramid_register(
         floating_features=meshmonk.features_from_vertices(start.vertices, start.faces), floating_faces=start.faces,
