@@ -246,8 +246,7 @@ BENCHMARKS = (
               "person, three rotations each, a length for every bone and our places of the markers; what else stands "
               "in the head of the script. It has no prior of shapes and poses, and a rig made by hand may do better. "
               "Its second row was chosen by the used and held-out markers of 01_01.c3d; the weights of our poses and "
-              "our layout by the used markers of all four files. Part and frames of the calibration of held-out "
-              "markers are the same for both."),
+              "our layout by the used markers of all four files."),
     Benchmark("mosh_soft", "Soft tissue of known size", "mosh_soft.py C3D -m MEN", scans.as_they_are),
     Benchmark("mosh_faults", "Faults put into markers",
               "mosh_artefacts.py C3D -m MEN --men 3 --held-out --no-real --files basketball 85_02", mocap.faults,

@@ -23,9 +23,11 @@ the layout were chosen with the 35 markers of these four files.
 
 Told are, in millimetres: the distance of every marker that was used from where the solved body has it; and of the
 held-out markers, calibrated: a marker's place in the frame of its part is the mean over 12 frames in which the markers
-stand to each other in many ways, the error is the distance from there in all other frames. Part and frames are the same
-for both. `acceleration` is the root of the mean squared change of the joints' angular velocities: how smooth a motion
-is. Seconds are those of the processor, all threads, reading files and building the rig left out.
+stand to each other in many ways, the same for both; the error is the distance from there in all other frames. Its part
+is the one that has it in our layout or one that adjoins, where it moves least in the 12 frames, for each tool by
+itself: nothing but a prior tells how the abdomen turns, so T10 need not hang on it. `acceleration` is the root of the
+mean squared change of the joints' angular velocities: how smooth a motion is. Seconds are those of the processor, all
+threads, reading files and building the rig left out.
 """
 from __future__ import annotations
 
@@ -117,20 +119,31 @@ def measure(found: Solved, model: BodyModel, markers: MarkerSequence, layout: Ma
     off = 1e3 * np.linalg.norm(found.places - seen, axis=2)
     held = [label for label in layout.matched(markers.labels) if layout.aliases.get(label, label) in HELD_OUT]
     part = model.skeleton.part_of_vertex(model.template)[layout.select(held).nearest]
-    apart = calibrated(found, part, markers.select(held).positions, spread_frames(seen, CALIBRATED))
+    apart, parts = calibrated(found, model.skeleton, part, markers.select(held).positions,
+                              spread_frames(seen, CALIBRATED))
     return {"frames": len(seen), "markers": int(np.isfinite(off).sum()), "used_mm": float(np.nanmean(off)),
             "used_p95_mm": float(np.nanpercentile(off, 95)), "held_out_mm": float(np.nanmean(apart)),
             "held_out_p95_mm": float(np.nanpercentile(apart, 95)),
             "each_mm": dict(zip(held, np.nanmean(apart, axis=0).round(1).tolist(), strict=True)),
+            "parts": {label: model.skeleton.names[p] for label, p in zip(held, parts, strict=True)},
             "acceleration": angular_acceleration(model.skeleton, found.rotations, markers.rate),
             "cpu_s": found.cpu_s, "frames_per_cpu_s": len(seen) / found.cpu_s}
 
 
-def calibrated(found: Solved, part: np.ndarray, held: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(T', H) millimetres, in the frames that are not `known`, of held-out markers (T, H, 3) on parts (H,)."""
-    local = np.einsum("thba,thb->tha", found.rotations[:, part], held - found.joints[:, part])
-    rest = np.setdiff1d(np.arange(len(held)), known)
-    return 1e3 * np.linalg.norm(local[rest] - np.nanmean(local[known], axis=0), axis=2)
+def calibrated(found: Solved, skeleton: Skeleton, part: np.ndarray, held: np.ndarray, known: np.ndarray
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """(T', H) millimetres in the frames that are not `known`, of held-out markers (T, H, 3), and the parts (H,).
+
+    A marker is on the part (H,) that has it in the layout, or on one that adjoins: where it moves least when `known`.
+    """
+    local = np.einsum("tjba,tjhb->tjha", found.rotations, held[:, None] - found.joints[:, :, None])
+    places = np.nanmean(local[known], axis=0)                                                   # (J, H, 3)
+    moves = np.nanmean(np.linalg.norm(local[known] - places, axis=3), axis=0)
+    links = np.eye(len(places), dtype=bool)
+    links[np.arange(1, len(places)), skeleton.parents[1:]] = True
+    best = np.where((links | links.T)[:, part], moves, np.inf).argmin(axis=0)
+    rest, each = np.setdiff1d(np.arange(len(held)), known), np.arange(len(part))
+    return 1e3 * np.linalg.norm(local[rest][:, best, each] - places[best, each], axis=2), best
 
 
 def angular_acceleration(skeleton: Skeleton, R: np.ndarray, rate: float) -> float:
