@@ -25,9 +25,8 @@ Told are, in millimetres: the distance of every marker that was used from where 
 held-out markers, calibrated: a marker's place in the frame of its part is the mean over 12 frames in which the markers
 stand to each other in many ways, the same for both; the error is the distance from there in all other frames. Its part
 is the one that has it in our layout or one that adjoins, where it moves least in the 12 frames, for each tool by
-itself: nothing but a prior tells how the abdomen turns, so T10 need not hang on it. `acceleration` is the root of the
-mean squared change of the joints' angular velocities: how smooth a motion is. Seconds are those of the processor, all
-threads, reading files and building the rig left out.
+itself. `acceleration` is the root of the mean squared change of the joints' angular velocities: how smooth a motion is.
+Seconds are those of the processor, all threads, reading files and building the rig left out.
 """
 from __future__ import annotations
 
