@@ -15,7 +15,7 @@ from config_files import config_file
 
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.mosh import cli
+from completion.mocap.mosh import cli, report
 from completion.mocap.mosh.work import Work
 from scanprep.batch.workspace import HOME
 from scanprep.pictures import scene
@@ -81,6 +81,8 @@ class QuietWork(Work):
 
     def __call__(self, actor, room):
         with small_pictures(), pytest.MonkeyPatch.context() as patch:
+            for chart in ("chart_frames", "chart_map", "chart_timeline"):
+                patch.setattr(report, chart, lambda take: None)
             patch.setattr(Page, "chart", lambda page, *_rest: page)
             return super().__call__(actor, room)
 
