@@ -17,11 +17,11 @@ from click_app import app, server  # noqa: F401 -- fixtures
 
 from scanprep.command_line import run
 
-
-LONGEST = ("readme", "model_coregistration", "completion_mosh_resume", "scanprep_registration_nonrigid",
-           "scanprep_skeleton_search", "scanprep_skeleton_find", "scanprep_decimation", "demo", "completion_interactive",
-           "judgement", "completion_tracking", "model_learning_cli", "completion_stream", "completion_viewing_inside",
-           "completion_search", "scanprep_viewer_pick", "completion_tracking_cli", "scanprep_cli")
+LONGEST = (
+    "readme", "model_coregistration", "completion_mosh_resume", "scanprep_registration_nonrigid",
+    "scanprep_skeleton_search", "scanprep_skeleton_find", "scanprep_decimation", "demo", "completion_interactive",
+    "judgement", "completion_tracking", "model_learning_cli", "completion_stream", "completion_viewing_inside",
+    "completion_search", "scanprep_viewer_pick", "completion_tracking_cli", "scanprep_cli")
 PLACE = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
 
 

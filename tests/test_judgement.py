@@ -44,8 +44,9 @@ MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
 ROWS = np.random.default_rng(4).choice(396, 30, replace=False)
 QUICK = CompletionConfig(random_starts=4, rounds=3, scan_points=600, model_points=300)
-FEW_NODES = RegistrationConfig(tuple(dataclasses.replace(stage, nodes=min(stage.nodes, 100), rounds=min(stage.rounds, 8))
-                                     for stage in RegistrationConfig().graph))        # for a body of 398 vertices
+FEW_NODES = RegistrationConfig(tuple(                              # for a body of 398 vertices
+    dataclasses.replace(stage, nodes=min(stage.nodes, 100), rounds=min(stage.rounds, 8))
+    for stage in RegistrationConfig().graph))
 
 
 @pytest.fixture(scope="module", autouse=True)
