@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 from config_files import config_file
+from quiet_pictures import render
 
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
@@ -72,7 +73,7 @@ def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
         for module in (scene, motion_pictures):
-            patch.setattr(module, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+            patch.setattr(module, "render", render)
         yield
 
 

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
+from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from scanned_shapes import ball as sphere
 
 from completion import MarkerLayout, MarkerSequence, write_markers
@@ -33,7 +34,6 @@ from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.judgement import Judgement
-from scanprep.pictures import scene
 from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.registration.schedule import RegistrationConfig
@@ -47,14 +47,6 @@ QUICK = CompletionConfig(random_starts=4, rounds=3, scan_points=600, model_point
 FEW_NODES = RegistrationConfig(tuple(                              # for a body of 398 vertices
     dataclasses.replace(stage, nodes=min(stage.nodes, 100), rounds=min(stage.rounds, 8))
     for stage in RegistrationConfig().graph))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_pictures():
-    """Nobody looks at them here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
-        yield
 
 
 @pytest.fixture
