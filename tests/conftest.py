@@ -10,24 +10,44 @@ import pytest
 
 if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not take each other's cores
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.cpu_count = lambda: 1
 
 from browser import browser, new_page, page  # noqa: F401 -- fixtures
 from click_app import app, server  # noqa: F401 -- fixtures
 
 from scanprep.command_line import run
 
+LONGEST = (
+    "readme", "scanprep_pipeline", "model_coregistration", "model_learning_resume", "model_statue_cli", "demo",
+    "completion_mosh_resume", "scanprep_registration_nonrigid", "model_learning_cli", "judgement",
+    "scanprep_skeleton_search", "completion_interactive", "completion_viewing_inside", "scanprep_skeleton_find",
+    "scanprep_decimation", "completion_tracking", "completion_stream", "scanprep_viewer_pick", "model_mixing",
+    "completion_tracking_cli", "scanprep_cli", "completion_mend", "completion_search", "model_conformance")
+PLACE = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
+
 
 def pytest_collection_modifyitems(items):
-    """The longest files first, so that the other processes have enough to do beside them."""
-    items.sort(key=lambda item: not item.path.name.startswith("test_readme"))
+    """The longest files first, so that all processes end at about the same time.
+
+    `demo` waits for the folder that `readme` makes first, so it is not at the very beginning.
+    """
+    items.sort(key=lambda item: PLACE.get(item.path.name, len(PLACE)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def run_folder(tmp_path_factory):
+    """The folder that the processes of this run share, with a cache in the place of the user's."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SCAPEKIT_CACHE", str(base / "cache"))
+        yield base
 
 
 @pytest.fixture(scope="session")
-def demo_folder(tmp_path_factory):
+def demo_folder(run_folder):
     """The folder of one `scape demo --quick`, run once for all tests that look at it, in whatever process."""
-    base = tmp_path_factory.getbasetemp()
-    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    folder, ended = base / "demo" / "scape_demo", base / "demo.ended"
+    folder, ended = run_folder / "demo" / "scape_demo", run_folder / "demo.ended"
     try:
         folder.parent.mkdir()
     except FileExistsError:                                  # another process is at it

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 from config_files import config_file
+from quiet_pictures import render
 
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.mosh import cli
+from completion.mocap.mosh import cli, report
 from completion.mocap.mosh.work import Work
 from scanprep.batch.workspace import HOME
 from scanprep.pictures import scene
@@ -72,7 +73,7 @@ def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
         for module in (scene, motion_pictures):
-            patch.setattr(module, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+            patch.setattr(module, "render", render)
         yield
 
 
@@ -81,6 +82,8 @@ class QuietWork(Work):
 
     def __call__(self, actor, room):
         with small_pictures(), pytest.MonkeyPatch.context() as patch:
+            for chart in ("chart_frames", "chart_map", "chart_timeline"):
+                patch.setattr(report, chart, lambda take: None)
             patch.setattr(Page, "chart", lambda page, *_rest: page)
             return super().__call__(actor, room)
 

@@ -6,6 +6,7 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 from config_files import config_file
 from glb_reader import Glb
+from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 
 from completion.__main__ import main
 from completion.mocap.files import motion_files
@@ -13,7 +14,6 @@ from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
 from scanprep.geometry.format_glb import turn_up
-from scanprep.pictures import scene
 from scanprep.pictures.camera import upright
 
 FRAMES = 30
@@ -21,14 +21,6 @@ BETAS = np.array([0.9, -0.6, 0.4])
 WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "motion.trc",
            "joint_angles.csv", "joint_centres.csv", "residuals.csv",
            "report.html"}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_pictures():
-    """Nobody looks at them here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
-        yield
 
 
 @pytest.fixture(scope="module")

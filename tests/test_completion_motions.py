@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from people_bodies import small_people
+from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from test_model_motions import OTHERS, elsewhere, of_amass, random_poses
 
 from completion.__main__ import main
@@ -15,18 +16,9 @@ from model.export.rig import joint_places, make_rig
 from model.motion.onto import read_motion
 from scanprep import write_mesh
 from scanprep.geometry.storage import StorageError
-from scanprep.pictures import scene
 
 WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "report.html",
            "report.json", "motion.trc", "motion.mot"}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_pictures():
-    """Nobody looks at them here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
-        yield
 
 
 @pytest.fixture(scope="module")

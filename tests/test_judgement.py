@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
+from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from scanned_shapes import ball as sphere
 
 from completion import MarkerLayout, MarkerSequence, write_markers
@@ -26,15 +27,16 @@ from completion.tracking.sequence import tracking_problem
 from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import judge_model, learn_scape, learning_problem
-from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep import Mesh, config_files, write_landmarks, write_mesh
 from scanprep.alignment.views import align_views, views_problem
 from scanprep.batch.room import Room
 from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.judgement import Judgement
-from scanprep.pictures import scene
+from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.registration.nonrigid import Registration, registration_problem
+from scanprep.registration.schedule import RegistrationConfig
 from scanprep.skeleton.find import skeleton_problem
 from scanprep.skeleton.tree import Skeleton
 
@@ -42,14 +44,9 @@ MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
 ROWS = np.random.default_rng(4).choice(396, 30, replace=False)
 QUICK = CompletionConfig(random_starts=4, rounds=3, scan_points=600, model_points=300)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_pictures():
-    """Nobody looks at them here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
-        yield
+FEW_NODES = RegistrationConfig(tuple(                              # for a body of 398 vertices
+    dataclasses.replace(stage, nodes=min(stage.nodes, 100), rounds=min(stage.rounds, 8))
+    for stage in RegistrationConfig().graph))
 
 
 @pytest.fixture
@@ -71,10 +68,13 @@ def place(tmp_path, monkeypatch):
     write_mesh("large.ply", Mesh(30 * moved.vertices, moved.faces))
     write_landmarks("large.json", {name: 30 * moved.vertices[v] for name, v in MARKS.items()})
     write_points("half.ply", PointCloud(half_view(body, np.array([0.0, -1.0, 0.0]))[0]))
+    Path("quick.toml").write_text(config_files.write({"config": FEW_NODES}))
+    whole = PrepareConfig(dataclasses.replace(PrepareConfig().scan, registration=FEW_NODES))
+    Path("quick_set.toml").write_text(config_files.write({"config": whole}))
     return tmp_path
 
 
-REGISTER = "prep register {}.ply --template template.ply -o out.ply"
+REGISTER = "prep register {}.ply --template template.ply -o out.ply --config quick.toml"
 NOTHING = {
     "a ball": (REGISTER.format("ball"), ["of the scan lies off the template", "a scan of something else"]),
     "ten points": (REGISTER.format("ten"), ["0% of the template has data", "a scan of something else"]),
@@ -110,7 +110,8 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     Path("scans").mkdir()
     for name in ("ten", "good"):
         Path(f"{name}.ply").rename(f"scans/{name}.ply")
-    assert main("prep run scans --template template.ply -o set --init pose --workers 1".split()) == 1
+    command = "prep run scans --template template.ply -o set --init pose --workers 1 --config quick_set.toml"
+    assert main(command.split()) == 1
     assert "ten.ply: the template is not on it" in capsys.readouterr().err
     assert "ten" not in Path("set/registration.csv").read_text()
     assert "nan" not in Path("set/registration.csv").read_text() and "none" in Path("set/registration.csv").read_text()

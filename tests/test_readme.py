@@ -5,7 +5,11 @@ One file, so that one process does it all: the READMEs of the packages go on wit
 import re
 
 import pytest
+from people_bodies import SMALL
 from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder, with_demo_model
+
+from completion import synthetic_people
+from completion.synthetic_people import build_synthetic
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PACKAGES = [f"{package}/README.md" for package in ("scanprep", "model", "completion")]
@@ -14,13 +18,14 @@ pytestmark = pytest.mark.timeout(1800)
 
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
-    """The folder of a user in which the commands of the README were run."""
+    """The folder of a user in which the commands of the README were run; the model of those without one is small."""
     folder = user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("SCAPEKIT_CACHE", str(folder / "cache"))
+        patch.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: build_synthetic(SMALL, progress))
         run_commands("README.md")
-    return folder
+        yield folder
 
 
 @pytest.fixture(scope="module")

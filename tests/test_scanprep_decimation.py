@@ -239,7 +239,7 @@ def test_views_of_a_real_body_become_a_template():
         pytest.skip("SCAPEKIT_DATA does not point at the real scans")
     body = read_mesh(Path(folder) / "scape_poses" / "mesh000.ply")
     views = scan(body, ScannerConfig(views=4, noise=0.002)).views
-    template = make_template(views, 8000, TemplateConfig(merge=MergeConfig(voxel=0.007, min_cosine=0.15)))
+    template = make_template(views, 8000, TemplateConfig(merge=MergeConfig(voxel=0.01, min_cosine=0.15)))
     assert template.is_closed and template_problem(template) is None
     at = Surface(body).closest(template.vertices)
     assert at.distances.mean() < 0.002

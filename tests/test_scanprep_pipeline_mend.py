@@ -1,4 +1,5 @@
 """`scape pick SET`: scans worst first, landmarks mended, registered again; the others' files stay as they are."""
+import shutil
 import time
 
 import pytest
@@ -22,20 +23,29 @@ ENDING, WRONG = ".landmarks.json", {"top": "front", "front": "top"}        # who
 READY = "Boolean(window.program?.figure && program.state) && program.figure.panes.every((pane) => pane.drawn > 1)"
 
 
-@pytest.fixture
-def place(tmp_path):
-    """A set of three scans; two landmarks of body1 are exchanged."""
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A set of three scans; two landmarks of body1 are exchanged. The folder, and a copy that stays as it is."""
+    place = tmp_path_factory.mktemp("mend") / "place"
     template = ball()
-    write_mesh(tmp_path / "template.ply", template)
-    write_landmarks(tmp_path / "template.landmarks.json", MARKS)
-    scans = write_scans(tmp_path / "scans", template)
+    write_mesh(place / "template.ply", template)
+    write_landmarks(place / "template.landmarks.json", MARKS)
+    scans = write_scans(place / "scans", template)
     file = scans / "body1.landmarks.json"
     marks = read_landmarks(file)
     write_landmarks(file, {name: marks[WRONG.get(name, name)] for name in marks})
-    call = Call(scans, tmp_path / "template.ply", config=WITH_PICTURES)
-    with workspace(tmp_path / "set") as space:
+    call = Call(scans, place / "template.ply", config=WITH_PICTURES)
+    with workspace(place / "set") as space:
         carried_out(call, call.inputs(lambda line: None), space)
-    return tmp_path
+    return place, shutil.copytree(place, place.with_name("kept"))
+
+
+@pytest.fixture
+def place(made):
+    """That folder as it was, under the name that the set keeps."""
+    place, kept = made
+    shutil.rmtree(place)
+    return shutil.copytree(kept, place)
 
 
 def sent(app, kind, **fields):

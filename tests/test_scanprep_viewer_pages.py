@@ -1,4 +1,6 @@
 """Pages in a real browser with the network off: bodies are what Python packed, motions play, nothing is fetched."""
+import contextlib
+
 import numpy as np
 import pytest
 from browser import WITHOUT_3D, chromium, wait_until, watched
@@ -50,9 +52,18 @@ def test_without_webgl_the_pictures_stay(report):
         assert page.evaluate("[...document.images].every((image) => image.naturalWidth > 50)")
 
 
+@pytest.fixture(scope="module")
+def window(browser):
+    """A page for all tests, each of which loads the report anew."""
+    with contextlib.closing(browser.new_context(offline=True, viewport={"width": 1000, "height": 800})) as context:
+        yield watched(context)
+
+
 @pytest.fixture
-def shown(new_page, report):
-    page = new_page(offline=True, viewport={"width": 1000, "height": 800})
+def shown(window, report):
+    page = window
+    page.errors.clear()
+    page.requests.clear()
     page.goto(report.as_uri())
     for number in range(2):
         page.locator("figure").nth(number).scroll_into_view_if_needed()
