@@ -161,12 +161,13 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
 
     def page(folder: Path) -> None:
         start = time.perf_counter()
-        page = take_page(take, metrics)
+        picture = take_picture(take)
+        page = take_page(take, metrics, picture)
         if shown:
             page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
-        save_png(place(folder) / PICTURE, take_picture(take))
+        save_png(place(folder) / PICTURE, picture)
         doubts = (*found.result.worn.doubts(), *hardly_seen([take.motion]), *hardly_believed([take.motion]))
         judgement = Judgement.of(found.problem(take), doubts)
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
@@ -201,7 +202,7 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
     """
     motion, body, soft = take.motion, take.subject, take.soft
     write_motion(folder, motion, body, take.artefacts.virtual())
-    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
+    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.quick)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
         write_residuals(folder / "residuals_soft.csv", soft.motion)
