@@ -162,7 +162,7 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
         sequences, used = ([worn.named(each, layout) for each in some] for some in (sequences, used))
         layout = worn.placed(layout)
         person = _person(stages, model, used, layout, config, "worn")
-    none, motions, artefacts = [None] * len(used), list[Motion](), list[MarkerArtefacts]()
+    none, motions, artefacts = (None,) * len(used), list[Motion](), list[MarkerArtefacts]()
     for n in range(3):  # most times that a person is followed and the markers are judged
         motions = [_motion(stages, f"poses {n} {i}", person, each, config, near)    # [MoSh] Eq. 23, poses
                    for i, (each, near) in enumerate(zip(used, motions or none, strict=True))]
