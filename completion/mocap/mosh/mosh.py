@@ -108,8 +108,8 @@ class MoshResult:
     artefacts : one MarkerArtefacts for each sequence
     worn : Worn
         Markers that are worn elsewhere than in the layout, and pairs that bear each other's name.
-    seconds : {str: float}
-        How long each stage took: "person", "poses", "artefacts", "soft tissue".
+    seconds : {str: (2,) float}
+        How long each stage took, by the clock and of the processor: "person", "poses", "artefacts", "soft tissue".
     """
 
     betas: np.ndarray
@@ -119,7 +119,7 @@ class MoshResult:
     soft_tissue: tuple[SoftTissue, ...]
     artefacts: tuple[MarkerArtefacts, ...]
     worn: Worn = field(default_factory=Worn)
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @one_thread()
@@ -200,6 +200,11 @@ class _Person:
         return self.model.subject(self.fit.betas)
 
 
+def clocks() -> np.ndarray:
+    """(2,) seconds, of which differences count: by the clock, and of the processor for this process."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
 @dataclass
 class _Stages:
     """What runs the stages of a call: each is kept by what it depends on, its seconds count, the bar moves."""
@@ -208,7 +213,7 @@ class _Stages:
     progress: Progress | None
     total: int
     done: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
     def run(self, stage: str, name: str, inputs: Any, make: Callable[[Progress | None], T], told: bool = False) -> T:
         """What `make` finds, or found in an earlier run; it moves the bar if it is told."""
@@ -218,12 +223,12 @@ class _Stages:
             if self.progress:
                 self.progress(before + round(STEPS * done / max(total, 1)), self.total)
 
-        def timed() -> tuple[T, float]:
-            start = time.perf_counter()
-            return make(tell if told else None), time.perf_counter() - start
+        def timed() -> tuple[T, np.ndarray]:
+            start = clocks()
+            return make(tell if told else None), clocks() - start
 
         value, seconds = self.step(name, inputs, timed)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        self.seconds[stage] = self.seconds.get(stage, 0) + seconds
         return value
 
 
