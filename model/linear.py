@@ -89,9 +89,17 @@ class PointOperator(Points):
     def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """Positions (..., L, 3) of the points at poses (..., J, 3) and trans (..., 3)."""
         pose, trans = check_pose(self.skeleton, pose, trans)
-        y = self.turned(pose)
+        step = self._at_once(12)
+        if pose.ndim == 2 or len(pose) <= step:
+            y = self.turned(pose)
+        else:
+            y = np.concatenate([self.turned(pose[i:i + step]) for i in range(0, len(pose), step)])
         y += (self.origin + trans)[..., None].astype(y.dtype)
         return np.swapaxes(y, -1, -2)
+
+    def _at_once(self, numbers: int) -> int:
+        """Poses that are worked on together, if each takes so many times `load` numbers."""
+        return max(1, 2**24 // max(1, numbers * self.load))
 
     def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Positions (..., L, 3) and their derivatives (..., L, 3, 3J) by the pose, metres per radian.
@@ -105,8 +113,7 @@ class PointOperator(Points):
             return y, np.moveaxis(columns, 0, -1)
         B, J, L = len(pose), len(self.skeleton.parents), self.count
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
-        # numbers that a batch of derivatives holds at a time
-        step = max(1, 2**24 // max(1, 3 * L * self.load))
+        step = self._at_once(3 * L)
         for start in range(0, B, step):
             mine = slice(start, start + step)
             y[mine], columns = self.columns(pose[mine], trans[mine])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
+from completion.mocap.artefacts import simulated
 from completion.mocap.artefacts.find import ambiguous_swap, find_artefacts
 from completion.mocap.artefacts.results import ArtefactConfig, BadSpan, list_swaps
 from completion.mocap.artefacts.simulated import Simulation, bridged
@@ -13,7 +14,9 @@ from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.pictures import chart_artefacts
+from completion.mocap.pose import follow, marked_body, swaps
 from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.marked_body import MarkedBody
 from completion.mocap.pose.swaps import TORN, Tracks, _two_states, find_order
 from scanprep.geometry import rotations
 
@@ -276,6 +279,53 @@ def test_the_motion_of_repaired_markers_is_the_clean_one(subject, layout, moved)
     given = find_artefacts(subject, changed(positions), layout, CONFIG, animate(subject, changed(positions), layout,
                                                                              AnimateConfig()))
     assert given.swaps == () and given.bad == ()
+
+
+def test_what_a_person_before_has_told_is_begun_with(subject, layout, moved, monkeypatch):
+    """The same is found, and no key frame is followed for it."""
+    _, _, positions, turns = moved
+    faulty = positions.copy()
+    exchanged(faulty, *neighbours(positions)[:2], 40, 99)
+    faulty[60:, 20] += turns[60:, 20] @ [0.03, 0, 0]
+    first = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    motion = animate(subject, first.repaired, layout, AnimateConfig())
+    monkeypatch.setattr(simulated, "between_keys", None)
+    monkeypatch.setattr(follow, "between_keys", None)
+    again = find_artefacts(subject, changed(faulty), layout, CONFIG, motion, known=first)
+    assert [vars(e) for e in again.swaps] == [vars(e) for e in first.swaps]
+    assert [(b.label, b.kind, b.begin) for b in again.bad] == [(b.label, b.kind, b.begin) for b in first.bad]
+    np.testing.assert_array_equal(again.repaired.positions, first.repaired.positions)
+    near = animate(subject, first.repaired, layout, AnimateConfig(), near=motion)
+    assert np.linalg.norm(near.vertices(subject) - motion.vertices(subject), axis=2).max() < 1e-3
+
+
+def test_labels_are_found_some_frames_at_a_time(moved, monkeypatch):
+    _, _, positions, _ = moved
+    faulty = positions.copy()
+    exchanged(faulty, 3, 17, 0, 119)
+    faulty[90:, 5] = np.nan
+    monkeypatch.setattr(swaps, "AT_ONCE", 1000)
+    whole = find_order(faulty, RATE, positions, np.linspace(0.006, 0.01, FRAMES))
+    assert (whole[:120, [3, 17]] == [17, 3]).all() and (whole[120:] == np.arange(30)).all()
+    monkeypatch.setattr(swaps, "AT_ONCE", 7)
+    np.testing.assert_array_equal(find_order(faulty, RATE, positions, np.linspace(0.006, 0.01, FRAMES)), whole)
+
+
+def test_frames_are_smoothed_and_solved_some_at_a_time(subject, layout, moved, monkeypatch):
+    """A long sequence is never held whole: windows that overlap, and pieces of what is independent, tell the same."""
+    _, _, positions, _ = moved
+    body = MarkedBody(subject, layout, 1.0, 0.3)
+    config, weights = AnimateConfig(), np.full(positions.shape[:2], 1e4)
+    x = body.body.join(moved[0] + 0.02, moved[1])
+    arguments = body, config.inertia(RATE, body.n_unknowns), x, positions, weights
+    whole, alone = follow.smoothed(*arguments), body.solve(x, positions, weights, 5, 1e-6)
+    monkeypatch.setattr(follow, "WINDOW", 150)
+    monkeypatch.setattr(follow, "OVERLAP", 50)
+    monkeypatch.setattr(marked_body, "MOST", 50)
+    assert np.abs(follow.smoothed(*arguments) - whole).max() < 1e-6
+    pieces = body.solve(x, positions, weights, 5, 1e-6)
+    for one, other in ((pieces.x, alone.x), (pieces.energy, alone.energy), (pieces.converged, alone.converged)):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):

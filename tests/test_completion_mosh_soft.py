@@ -10,6 +10,7 @@ from conformance_bodies import KINDS
 
 from completion import MarkerLayout, MarkerSequence, Motion, follow_soft_tissue
 from completion.energy import lifted
+from completion.mocap.mosh.quick_bodies import QuickBodies
 from completion.mocap.pose.marked_body import supports
 from completion.mocap.soft_tissue.changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 from completion.mocap.soft_tissue.soft_tissue import (
@@ -254,3 +255,16 @@ def test_what_does_not_belong_together_is_refused() -> None:
             SoftFollower(model, motion, markers, where, SoftTissueConfig(**{name: value}))
     with pytest.raises(ValueError, match="k at most 3"):
         changing_bodies(model, motion.poses, np.zeros((T, 4)), motion.trans)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_quick_bodies_are_exact_in_key_frames_and_near_between(kind):
+    model = body(kind)
+    poses, trans, changes = moving(model)
+    soft = SoftTissue(fixed(poses, trans, layout(model)), changes)
+    keys, ids = np.array([0, 8, 16, T - 1]), np.arange(0, len(model.template.vertices), 3)
+    exact, subject = soft.vertices(model)[:, ids], model.subject(OWN)
+    quick = QuickBodies.of(model, subject, soft, ids, keys, exact[keys]).vertices(np.arange(T))
+    off, moved = (np.linalg.norm(other - exact, axis=2) for other in (quick, subject.vertices(poses, trans)[:, ids]))
+    assert off[keys].max() < 2e-6                                      # metres, in single precision
+    assert off.mean() < 0.2 * moved.mean()

@@ -108,6 +108,14 @@ def test_json_that_cannot_be_read(tmp_path, content, words):
 TABLE = "name{0}sex{0} note\r\nZoë{0}f{0}\r\n{0}{0}\r\n Ann {0}m{0}x\r\n"
 
 
+def test_numbers_are_printed_as_one_by_one_and_nothing_for_nan():
+    rows = np.array([[0.1, -2e-9, np.nan, 1234567.0], [np.nan, -0.0, np.inf, 5.0]])
+    wanted = [["" if np.isnan(value) else f"{value:.6g}" for value in row] for row in rows]
+    assert tables.number_lines(rows, separator="\t") == ["\t".join(row) for row in wanted]
+    assert tables.number_table(("a", "nan", 'b "c", d', "e"), rows) == (
+        'a,nan,"b ""c"", d",e\n' + "".join(",".join(row) + "\n" for row in wanted))
+
+
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252", "latin-1"])
 def test_tables_as_spreadsheets_save_them(tmp_path, separator, encoding):

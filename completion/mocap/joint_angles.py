@@ -250,12 +250,13 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
     both -= 2 * np.pi * np.rint(both / (2 * np.pi))
     size = SIZE * np.abs(both).sum(axis=2)
     jump = np.abs(np.exp(1j * both[:, None, 1:]) - np.exp(1j * both[None, :, :-1])).sum(axis=3)      # (2, 2, T - 1)
-    cost, came = size[:, 0], np.zeros((len(angles), 2), dtype=int)
-    for t in range(1, len(angles)):
-        ways = cost + jump[:, :, t - 1]
-        came[t] = ways.argmin(axis=1)
-        cost = ways.min(axis=1) + size[:, t]
-    state, out = int(cost.argmin()), np.empty_like(angles)
+    cost, came = size[:, 0].tolist(), np.zeros((len(angles), 2), dtype=int)
+    for t, (((a, b), (c, d)), (first, second)) in enumerate(zip(jump.transpose(2, 0, 1).tolist(), size.T[1:].tolist(),
+                                                                strict=True), start=1):
+        stay, back, onward, remain = cost[0] + a, cost[1] + c, cost[0] + b, cost[1] + d
+        came[t] = back < stay, remain < onward
+        cost = [min(stay, back) + first, min(onward, remain) + second]
+    state, out = int(cost[1] < cost[0]), np.empty_like(angles)
     for t in range(len(angles) - 1, -1, -1):
         out[t], state = both[state, t], came[t, state]
     return out

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
+from scanprep.geometry.tables import number_lines
 from scanprep.skeleton.tree import Skeleton
 
 from .rig import check_motion, turn_up
@@ -64,8 +65,8 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
              "MOTION", f"Frames: {len(poses)}", f"Frame Time: {1 / rate:.9f}"]
     places = scale * (skeleton.joints[0] + trans) @ U
     angles = euler_degrees(poses @ U)[:, _written(skeleton)]
-    for row in np.concatenate([places, angles.reshape(len(poses), -1)], axis=1):
-        lines.append(" ".join(_number(value) for value in row))
+    frames = np.concatenate([places, angles.reshape(len(poses), -1)], axis=1)
+    lines += _numbers(frames)
     with writing(path) as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -127,8 +128,10 @@ def _hierarchy(skeleton: Skeleton, joints: np.ndarray, ends: np.ndarray) -> list
 
 
 def _offset(offset: np.ndarray) -> str:
-    return "OFFSET " + " ".join(_number(value) for value in offset)
+    return "OFFSET " + _numbers(offset[None])[0]
 
 
-def _number(value: float) -> str:
-    return f"{round(float(value), _DIGITS) + 0.0:.{_DIGITS}f}"
+def _numbers(rows: np.ndarray) -> list[str]:
+    """Lines of numbers (T, K), none of which is a negative zero."""
+    zero = f"{0:.{_DIGITS}f}"
+    return [line.replace(f"-{zero}", zero) for line in number_lines(rows, f"%.{_DIGITS}f", " ")]

@@ -34,7 +34,7 @@ def rest_corrections(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarr
     """Changes of the rest mesh (T, N, 3), metres, that skinning carries onto the exact bodies (T, N, 3), trans zero."""
     out = np.empty_like(exact, dtype=np.float64)
     for t, pose in enumerate(poses):
-        blended = np.einsum("nj,jab->nab", rig.weights, rig.skeleton.part_rotations(pose))
+        blended = (rig.weights @ rig.skeleton.part_rotations(pose).reshape(-1, 9)).reshape(-1, 3, 3)
         # opposite rotations can cancel; the damped inverse leaves alone what they blot out
         # share of a blended rotation below which it is not undone
         square = np.swapaxes(blended, 1, 2) @ blended + 0.1**2 * _lost(blended)[:, None, None] * np.eye(3)

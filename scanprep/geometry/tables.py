@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart, write
 
 
@@ -36,6 +38,19 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     table.writerow(header)
     table.writerows(rows)
     write(path, text.getvalue())
+
+
+def number_lines(rows: np.ndarray, number: str = "%.6g", separator: str = ",") -> list[str]:
+    """A line of text for each row (K,) of numbers, all printed as `number` says; nothing where one is NaN."""
+    line = separator.join([number] * rows.shape[1])
+    return [(line % tuple(row.tolist())).replace("nan", "") for row in rows]
+
+
+def number_table(header: Sequence[str], rows: np.ndarray, number: str = "%.6g") -> str:
+    """A CSV table of numbers (T, K), K at least 2: `number_lines` below a heading."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(header)
+    return "\n".join([text.getvalue()[:-1], *number_lines(rows, number), ""])
 
 
 def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError

@@ -36,15 +36,14 @@ def recordings(report: dict) -> str:
 
 
 def speed(report: dict) -> str:
-    """The stages beside the paper's times."""
-    rows: Rows = [(f["file"], f["frames"], f["person_cpu_s"], f["person_wall_s"], f["poses_frames_per_cpu_s"],
-                   f["poses_frames_per_wall_s"], f["soft_frames_per_cpu_s"], f["soft_frames_per_wall_s"],
-                   f["mesh_cpu_ms"], f["fixed_mm"], f["soft_mm"]) for f in report["files"]]
-    paper = report["paper"]
-    rows.append(("the paper", "", "", paper["person"], "", paper["poses"], "", paper["soft"], "", "", ""))
-    return table(("file", "frames", "person (s CPU)", "person (s)", "poses, frames/s CPU", "poses, frames/s",
-                  "soft tissue, frames/s CPU", "soft tissue, frames/s", "changing mesh (ms CPU)", "fixed shape (mm)",
-                  "soft tissue (mm)"), rows)
+    """Where the processor's time went, and how much memory it took."""
+    stages = ("person", "artefacts", "poses", "soft tissue", "files", "pages")
+    rows: Rows = [(f["file"], f["frames"], *(f["stages_cpu_s"].get(stage, "") for stage in stages), f["cpu_s"],
+                   f["wall_s"], f["frames_per_s"], f["frames_per_s_all"], f["peak_MiB"], f["fixed shape"],
+                   f["soft tissue"]) for f in report["files"]]
+    return table(("file", "frames", *(f"{stage} (s CPU)" for stage in stages), "all (s CPU)", "all (s)",
+                  "frames/s CPU, without pages", "with pages", "peak (MiB)", "fixed shape (mm)", "soft tissue (mm)"),
+                 rows)
 
 
 def faults(report: dict) -> str:

@@ -46,7 +46,7 @@ class _State:
 
 def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
                    config: ArtefactConfig | None = None, motion: Motion | None = None,
-                   progress: Progress | None = None) -> MarkerArtefacts:
+                   progress: Progress | None = None, known: MarkerArtefacts | None = None) -> MarkerArtefacts:
     """Labels that were swapped, and markers that slip, jitter or stray.
 
     First the tracks alone tell where two labels change places. The body follows the markers so repaired, and where
@@ -62,9 +62,11 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
         Where on the person the markers sit. Swaps are also found among labels that it does not know.
     config : ArtefactConfig, optional
     motion : Motion, optional
-        Of the person in this sequence, where it is known already; it is followed anew where markers are repaired.
+        Of the person in this sequence as `known` has repaired it, else `relabelled_by_tracks`, if it is known already.
     progress : callable, optional
         Called with (done, total) rounds.
+    known : MarkerArtefacts, optional
+        What was found in this sequence with nearly this person, to begin with.
 
     Raises
     ------
@@ -75,9 +77,11 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
     if motion is not None and len(motion.poses) != len(markers.positions):
         raise ValueError(f"motion: expected {len(markers.positions)} frames as the markers have, "
                          f"got {len(motion.poses)}")
-    body, state = Simulation(subject, markers, layout, FOLLOW), _by_tracks(markers)
+    body = Simulation(subject, markers, layout, FOLLOW)
+    state = _by_tracks(markers) if known is None else _State(
+        known.order, np.zeros(known.order.shape[1], dtype=bool), known.bad)
     for done in range(ROUNDS):
-        if motion is not None and not done and (state.order == np.arange(state.order.shape[1])).all():
+        if motion is not None and not done and not state.unsure.any():
             x = body.taken_from(motion, state.repaired(markers))
         else:
             x = _followed(body, markers, state)
@@ -116,7 +120,7 @@ def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: Ar
     assert state.x is not None, "the body has followed"
     places, simulated = np.full(markers.positions.shape, np.nan), body.body.positions(state.x)
     places[:, body.rows] = _expected(body, state, state.repaired(markers)[:, body.rows], simulated)
-    order = swaps.find_order(markers.positions, markers.rate, swaps.marker_levels(places, markers.positions))
+    order = swaps.find_order(markers.positions, markers.rate, places)
     sure, tried = not state.unsure.any(), state.both_ways_tried
     if sure and not tried and (order == state.order).all():
         order, tried = _both_ways(body, markers, state.x, order, places), True
@@ -147,7 +151,7 @@ def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: 
     length = np.linalg.norm(usual, axis=1, keepdims=True)
     # metres, most that a marker's usual place is taken to be from its simulation
     usual *= np.minimum(1, 0.04 / np.maximum(length, 1e-12))
-    return simulated + np.einsum("tldc,lc->tld", body.part_rotations(state.x), usual)
+    return simulated + body.world(np.broadcast_to(usual, simulated.shape), state.x)
 
 
 def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: np.ndarray, places: np.ndarray
@@ -216,7 +220,7 @@ def _result(body: Simulation, markers: MarkerSequence, state: _State) -> MarkerA
     weights, _ = marker_weights(simulated, targets, 1.0, FOLLOW.outlier)
     # seconds that a marker out of sight takes to its usual place, and from there
     off = bridged(body.local(targets - simulated, state.x), 0.5 * markers.rate)
-    expected = simulated + np.einsum("tldc,tlc->tld", body.part_rotations(state.x), off)
+    expected = simulated + body.world(off, state.x)
     return MarkerArtefacts(list_swaps(state.order, markers.seen, markers.labels), state.bad, simulated, body.labels,
                            MarkerSequence(repaired, markers.labels, markers.rate), weights, expected, state.order)
 

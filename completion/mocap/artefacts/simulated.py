@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import interp1d
 
 from model.linear import Subject
 
@@ -57,20 +56,30 @@ class Simulation:
         """
         T, every = len(x), max(1, round(self.rate / 15))                # 15 looks a second at how markers draw the body
         frames = np.arange(min(every // 2, T - 1), T, every)
-        freed = self._freed(x[frames], frames)
-        ends = freed[0], freed[-1]                                      # before the first and after the last look
-        freed = np.repeat(freed, T, axis=0) if len(frames) == 1 else interp1d(
-            frames, freed, axis=0, bounds_error=False, fill_value=ends, assume_sorted=True)(np.arange(T))
-        return (freed @ off[..., None])[..., 0]
+        freed, out = self._freed(x[frames], frames), np.empty_like(off)
+        for some in batches(T):
+            t = np.clip(np.arange(T)[some], frames[0], frames[-1])      # before the first and after the last look
+            i = np.clip(np.searchsorted(frames, t, side="right") - 1, 0, max(len(frames) - 2, 0))
+            share = ((t - frames[i]) / every)[:, None, None, None]
+            now = freed[i] + share * (freed[np.minimum(i + 1, len(frames) - 1)] - freed[i])
+            out[some] = (now @ off[some][..., None])[..., 0]
+        return out
 
     def local(self, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Vectors (T, L, 3) of markers in the frames of their parts, the body being at x (T, P)."""
-        return np.einsum("tldc,tld->tlc", self.part_rotations(x), vectors)
+        return self._turned("tldc,tld->tlc", vectors, x)
 
-    def part_rotations(self, x: np.ndarray) -> np.ndarray:
-        """Rotations (T, L, 3, 3) of the markers' parts, from the part to the world."""
+    def world(self, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Vectors (T, L, 3) in the frames of the markers' parts as they are in the world: the inverse of `local`."""
+        return self._turned("tldc,tlc->tld", vectors, x)
+
+    def _turned(self, how: str, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Products (T, L, 3) of the rotations of the markers' parts, from the part to the world, and vectors."""
         pose, _, _ = self.body.body.split(x)
-        return self.body.body.skeleton.part_rotations(pose)[:, self.part]
+        R, out = self.body.body.skeleton.part_rotations(pose), np.empty(vectors.shape)
+        for some in batches(len(x)):
+            out[some] = np.einsum(how, R[some][:, self.part], vectors[some])
+        return out
 
     def _freed(self, x: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Matrices (n, L, 3, 3) from what is left of a displacement to the whole of it, at unknowns (n, P)."""

@@ -14,7 +14,7 @@ from model.export.glb import write_skinned_glb
 from model.export.rig import subject_rig
 from model.linear import Subject
 from scanprep.console import Metric
-from scanprep.geometry import tables
+from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
@@ -100,5 +100,4 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
 
 def write_table(path: Path, columns: list[str], rows: np.ndarray) -> None:
     """Numbers as CSV, whole or not at all; NaN becomes an empty cell."""
-    tables.write_table(path, columns, (["" if np.isnan(value) else f"{value:.6g}" for value in row]
-                                       for row in rows.tolist()))
+    storage.write(path, tables.number_table(columns, rows))

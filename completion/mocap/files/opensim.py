@@ -12,7 +12,7 @@ import numpy as np
 from model.linear import Subject
 from model.motion.roles import numbered_roles
 from scanprep.console import say
-from scanprep.geometry import storage
+from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import stance
 from scanprep.skeleton.tree import Skeleton
 
@@ -84,6 +84,6 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
              "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
              f"Axes x, y, z are {', '.join(axes)} of the recording.",
              *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []), "", "endheader"]
-    lines += ["\t".join(names), *("\t".join(f"{value:.8g}" for value in row) for row in table.tolist())]
+    lines += ["\t".join(names), *tables.number_lines(table, "%.8g", "\t")]
     with storage.writing(Path(path)) as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

@@ -1,8 +1,6 @@
 """Marker sequences as text, TRC and CSV, and what all readers of marker files share."""
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,9 +73,8 @@ def encode_trc(positions: np.ndarray, labels: Sequence[str], rate: float, name: 
              f"{rate:.9g}\t{rate:.9g}\t{T}\t{L}\tmm\t{rate:.9g}\t1\t{T}",
              "Frame#\tTime\t" + "\t\t\t".join(spelled) + "\t\t",
              "\t\t" + "\t".join(f"{axis}{i + 1}" for i in range(L) for axis in "XYZ"), ""]
-    for t, frame in enumerate((1000 * positions).reshape(T, -1).tolist()):
-        cells = ("" if np.isnan(value) else f"{value:.5f}" for value in frame)
-        lines.append(f"{t + 1}\t{t / rate:.9g}\t" + "\t".join(cells) + "\t")
+    for t, cells in enumerate(tables.number_lines((1000 * positions).reshape(T, -1), "%.5f", "\t")):
+        lines.append(f"{t + 1}\t{t / rate:.9g}\t{cells}\t")
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -132,9 +129,6 @@ def _rate(path: Path, times: np.ndarray, numbers: Sequence[int]) -> float | None
 
 def encode_csv(positions: np.ndarray, labels: Sequence[str], rate: float) -> bytes:
     """Positions (T, L, 3), metres, as the CSV that `read_csv` reads."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["time", *(f"{label}_{axis}" for label in labels for axis in "xyz")])
-    for t, frame in enumerate(positions):
-        table.writerow([f"{t / rate:.9g}", *("" if np.isnan(v) else f"{v:.9g}" for v in frame.ravel())])
-    return text.getvalue().encode()
+    rows = np.column_stack([np.arange(len(positions)) / rate, positions.reshape(len(positions), -1)])
+    header = ["time", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
+    return tables.number_table(header, rows, "%.9g").encode()

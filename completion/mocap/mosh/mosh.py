@@ -108,8 +108,8 @@ class MoshResult:
     artefacts : one MarkerArtefacts for each sequence
     worn : Worn
         Markers that are worn elsewhere than in the layout, and pairs that bear each other's name.
-    seconds : {str: float}
-        How long each stage took: "person", "poses", "artefacts", "soft tissue".
+    seconds : {str: (2,) float}
+        How long each stage took, by the clock and of the processor: "person", "poses", "artefacts", "soft tissue".
     """
 
     betas: np.ndarray
@@ -119,7 +119,7 @@ class MoshResult:
     soft_tissue: tuple[SoftTissue, ...]
     artefacts: tuple[MarkerArtefacts, ...]
     worn: Worn = field(default_factory=Worn)
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @one_thread()
@@ -162,17 +162,19 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
         sequences, used = ([worn.named(each, layout) for each in some] for some in (sequences, used))
         layout = worn.placed(layout)
         person = _person(stages, model, used, layout, config, "worn")
+    none, motions, artefacts = (None,) * len(used), list[Motion](), list[MarkerArtefacts]()
     for n in range(3):  # most times that a person is followed and the markers are judged
-        motions = [_motion(stages, f"poses {n} {i}", person, each, config, n == 0)  # [MoSh] Eq. 23, poses
-                   for i, each in enumerate(used)]
-        artefacts = [_artefacts(stages, f"artefacts {n} {i}", person, each, motion, config, n == 0)
-                     for i, (each, motion) in enumerate(zip(sequences, motions, strict=True))]
+        motions = [_motion(stages, f"poses {n} {i}", person, each, config, near)    # [MoSh] Eq. 23, poses
+                   for i, (each, near) in enumerate(zip(used, motions or none, strict=True))]
+        artefacts = [_artefacts(stages, f"artefacts {n} {i}", person, each, motion, config, known) for i, (
+            each, motion, known) in enumerate(zip(sequences, motions, artefacts or none, strict=True))]
         before, used = used, [each.repaired for each in artefacts]
         settled = all(_same(before[i], used[i], t) for i, t in person.fit.frames)
         if settled:
             break
         person = _person(stages, model, used, layout, config, f"again {n}")
-    motions = [motion if settled and _same(old, new) else _motion(stages, f"poses last {i}", person, new, config, False)
+    motions = [motion if settled and _same(old, new) else _motion(
+        stages, f"poses last {i}", person, new, config, motion)
                for i, (motion, old, new) in enumerate(zip(motions, before, used, strict=True))]
     soft = [_soft_tissue(stages, i, person, each, motion, config)               # [MoSh] Eq. 24
             for i, (each, motion) in enumerate(zip(used, motions, strict=True)) if config.soft_tissue]
@@ -198,6 +200,11 @@ class _Person:
         return self.model.subject(self.fit.betas)
 
 
+def clocks() -> np.ndarray:
+    """(2,) seconds, of which differences count: by the clock, and of the processor for this process."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
 @dataclass
 class _Stages:
     """What runs the stages of a call: each is kept by what it depends on, its seconds count, the bar moves."""
@@ -206,7 +213,7 @@ class _Stages:
     progress: Progress | None
     total: int
     done: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
     def run(self, stage: str, name: str, inputs: Any, make: Callable[[Progress | None], T], told: bool = False) -> T:
         """What `make` finds, or found in an earlier run; it moves the bar if it is told."""
@@ -216,12 +223,12 @@ class _Stages:
             if self.progress:
                 self.progress(before + round(STEPS * done / max(total, 1)), self.total)
 
-        def timed() -> tuple[T, float]:
-            start = time.perf_counter()
-            return make(tell if told else None), time.perf_counter() - start
+        def timed() -> tuple[T, np.ndarray]:
+            start = clocks()
+            return make(tell if told else None), clocks() - start
 
         value, seconds = self.step(name, inputs, timed)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        self.seconds[stage] = self.seconds.get(stage, 0) + seconds
         return value
 
 
@@ -251,22 +258,23 @@ def _worn(stages: _Stages, person: _Person, sequences: Sequence[MarkerSequence],
         model, sequences, layout, person.fit, config.person))
 
 
-def _motion(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, config: MoshConfig, told: bool
-            ) -> Motion:
-    """The motion of a person of fixed shape."""
+def _motion(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, config: MoshConfig,
+            near: Motion | None) -> Motion:
+    """The motion of a person of fixed shape; `near` is that of a person who was thought to be a little different."""
     fit, poses = person.fit, config.poses
-    return stages.run("poses", name, (person.model, fit.betas, fit.layout, markers, poses),
-                      lambda tell: animate(person.subject, markers, fit.layout, poses, tell), told)
+    return stages.run("poses", name, (person.model, fit.betas, fit.layout, markers, poses, near),
+                      lambda tell: animate(person.subject, markers, fit.layout, poses, tell, near), near is None)
 
 
 def _artefacts(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, motion: Motion,
-               config: MoshConfig, told: bool) -> MarkerArtefacts:
-    """What is wrong with the markers, by the body that carries them."""
+               config: MoshConfig, known: MarkerArtefacts | None) -> MarkerArtefacts:
+    """What is wrong with the markers, by the body that carries them; `known` is what the person before has told."""
     fit, judge = person.fit, config.artefacts
     if not config.repair:
         return no_artefacts(person.subject, markers, fit.layout, motion)
-    return stages.run("artefacts", name, (person.model, fit.betas, fit.layout, markers, motion, judge), lambda tell:
-                      find_artefacts(person.subject, markers, fit.layout, judge, motion, tell), told)
+    return stages.run("artefacts", name, (person.model, fit.betas, fit.layout, markers, motion, judge, known),
+                      lambda tell: find_artefacts(person.subject, markers, fit.layout, judge, motion, tell, known),
+                      known is None)
 
 
 def _soft_tissue(stages: _Stages, i: int, person: _Person, markers: MarkerSequence, motion: Motion, config: MoshConfig

@@ -76,14 +76,14 @@ def _worn_section(page: Page, result: MoshResult) -> None:
                ("marker", "what was found", "from the layout's place (mm)", "from the new place (mm)"))
 
 
-def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
+def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Page:
     """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
-    frames = spread_frames(len(take.motion.poses), SOME)
+    frames = take.keys[spread_frames(len(take.keys), SOME)]
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
     page.table(rows(_main(metrics)))
     page.section("The whole sequence").bodies(
         [pictures.take_pane(take)], "Press the triangle to play, drag the body to turn it; it is kept in the middle.",
-        520, webp_bytes(take_picture(take)))
+        520, webp_bytes(picture))
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
     page.chart(chart_frames(take), "mean of the markers, over time")
     page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "

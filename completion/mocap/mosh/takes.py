@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -10,16 +11,19 @@ from model.body import BodyModel
 from model.linear import Subject
 
 from ...energy import lifted
-from ...motion import Motion
+from ...motion import Motion, spread_frames
 from ...motion_pictures import LightMesh
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
+from ..files.motion_files import MEASURED
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from ..soft_tissue.soft_tissue import SoftTissue
+from .quick_bodies import QuickBodies
 from .recordings import Recording
 
 AT_ONCE = 128                        # frames whose changes are held at a time
+KEYS = 100                           # frames of soft tissue whose bodies are exact in files and pictures that move
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,20 @@ class Take:
         if len(new):
             self._kept.update(zip(new.tolist(), self.make(new).astype(np.float32), strict=True))
         return np.stack([self._kept[int(t)] for t in frames]).astype(float)
+
+    @cached_property
+    def keys(self) -> np.ndarray:
+        """Frames (k,) in order, spread over the sequence; those in which a GLB is measured are among them."""
+        return np.union1d(*(spread_frames(len(self.motion.poses), count) for count in (KEYS, MEASURED)))
+
+    @cached_property
+    def _quick(self) -> QuickBodies | None:
+        return None if self.soft is None else QuickBodies.of(
+            self.model, self.subject, self.soft, np.arange(self.subject.n_vertices), self.keys, self.bodies(self.keys))
+
+    def quick(self, frames: np.ndarray) -> np.ndarray:
+        """As `make`, and exact in `keys`: in between, soft tissue is as of `QuickBodies`."""
+        return self.make(frames) if self._quick is None else self._quick.vertices(frames)
 
     def make(self, frames: np.ndarray) -> np.ndarray:
         """As `bodies`, which are not kept."""

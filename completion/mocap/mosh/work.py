@@ -31,7 +31,7 @@ from ..marker_sets.named import choose_layout
 from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
-from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
+from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
 from .pictures import standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
@@ -62,18 +62,21 @@ class Work:
         A recording that cannot be read is left out and told; ValueError where none can. The first figure says
         what the motions are worth.
         """
-        start, folder = time.perf_counter(), room.folder
+        start, folder = clocks(), room.folder
         found, failures = _solve(self, actor, room)
+        solved = clocks() - start
         settings = {"mosh": self.config, "model": self.name, "layout": found.layout_name, "held out": self.hold_out}
         _write_person(folder, found.result, {
             "model": self.name, "layout": found.layout_name, "held_out": self.hold_out, "sex": found.guess,
             "recordings": [r.path.name for r in actor.recordings]})
         figures: dict[str, list[Metric]] = {}
-        total = len(found.takes) + 1
+        pages, total = np.zeros(2), len(found.takes) + 1
         for i, take in enumerate(found.takes):
             room.tell(HALF + HALF * i // total, 2 * HALF)
-            figures[take.name] = _write(self, found, take, room, settings)
+            figures[take.name], seconds = _write(self, found, take, room, settings)
+            pages += seconds
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
+        pages -= clocks()
         problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
         motions = [take.motion for take in found.takes]
         doubts = (*found.result.worn.doubts(), *hardly_seen(motions), *hardly_believed(motions))
@@ -82,8 +85,11 @@ class Work:
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                     settings).write(folder / "report.html")
         save_png(folder / PICTURE, person_picture(found.model, found.result))
-        metrics += _speeds(found)                    # not on the page: it is the same however often it is made
-        write_report(Outcome(folder, metrics, settings, failures), self.command, time.perf_counter() - start)
+        pages += clocks()
+        whole = clocks() - start
+        # not on the page: it is the same however often it is made
+        metrics += _times(found, {"files": whole - solved - pages, "pages": pages}, whole)
+        write_report(Outcome(folder, metrics, settings, failures), self.command, float(whole[0]))
         room.tell(2 * HALF, 2 * HALF)
         return metrics, failures
 
@@ -146,8 +152,9 @@ def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording],
     return found, sequences, failures
 
 
-def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]) -> list[Metric]:
-    """A sequence into its folder, in steps that are kept; the figures."""
+def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]
+           ) -> tuple[list[Metric], np.ndarray]:
+    """A sequence into its folder, in steps that are kept; the figures, and the seconds (2,) of the page."""
     metrics, factor = [Metric("layout", found.layout_name), *_figures([take])], work.config.exaggeration
     solved = found.model, take.markers, take.motion, take.soft, take.artefacts, take.held
 
@@ -161,12 +168,13 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
 
     def page(folder: Path) -> None:
         start = time.perf_counter()
-        page = take_page(take, metrics)
+        picture = take_picture(take)
+        page = take_page(take, metrics, picture)
         if shown:
             page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
-        save_png(place(folder) / PICTURE, take_picture(take))
+        save_png(place(folder) / PICTURE, picture)
         doubts = (*found.result.worn.doubts(), *hardly_seen([take.motion]), *hardly_believed([take.motion]))
         judgement = Judgement.of(found.problem(take), doubts)
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
@@ -178,8 +186,9 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
     if work.character is not None:
         *shown, told = room.files(f"{take.name} character", (solved, work.character, factor), character)
         metrics += told
+    start = clocks()
     room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
-    return metrics
+    return metrics, clocks() - start
 
 
 def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) -> None:
@@ -201,7 +210,7 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
     """
     motion, body, soft = take.motion, take.subject, take.soft
     write_motion(folder, motion, body, take.artefacts.virtual())
-    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
+    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.quick)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
         write_residuals(folder / "residuals_soft.csv", soft.motion)
@@ -258,11 +267,13 @@ def _person_metrics(found: _Found) -> list[Metric]:
     return told
 
 
-def _speeds(found: _Found) -> list[Metric]:
+def _times(found: _Found, written: Mapping[str, np.ndarray], whole: np.ndarray) -> list[Metric]:
+    """How long the stages took, those done in an earlier run too, and the `whole` (2,) of this one."""
     frames = sum(len(take.motion.poses) for take in found.takes)
-    return [Metric(f"{stage}, time", seconds, "s") if stage == "person" else
-            Metric(f"{stage}, speed", frames / max(seconds, 1e-9), "frames/s")
-            for stage, seconds in found.result.seconds.items()]
+    stages = {**found.result.seconds, **written, "all": whole}
+    return [*(Metric(f"{stage}, processor time", float(seconds[1]), "s") for stage, seconds in stages.items()),
+            *(Metric(f"{stage}, time by the clock", float(seconds[0]), "s") for stage, seconds in stages.items()),
+            Metric("speed", frames / max(float(whole[1]), 1e-9), "frames/s")]
 
 
 def _figures(takes: Sequence[Take]) -> list[Metric]:

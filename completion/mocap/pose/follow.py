@@ -7,10 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from model.linear import Subject
+from scanprep.geometry.sparse import overlapping_windows
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
-from ...smoothing import coupled_steps
+from ...smoothing import OVERLAP, WINDOW, coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .foot_contact import Floor, FootContact, HeldPoints
@@ -27,7 +28,7 @@ STILL = 0.005                        # metres that the last round moves any mark
 
 @one_thread()
 def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig | None = None,
-            progress: Progress | None = None) -> Motion:
+            progress: Progress | None = None, near: Motion | None = None) -> Motion:
     """The motion of a body that carries markers.
 
     Key frames are followed one after the other, each from a prediction. All frames between them begin on the
@@ -44,6 +45,8 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     config : AnimateConfig, optional
     progress : callable, optional
         Called with (done, total) frames.
+    near : Motion, optional
+        Of nearly this body with nearly these markers, to begin with instead of key frames.
 
     Raises
     ------
@@ -57,7 +60,8 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     targets, tell = markers.positions[:, columns], progress or (lambda done, total: None)
     body = MarkedBody(subject, layout.select(labels), config.prior_weight, config.prior_shrinkage)
     if config.smoothing or config.ground:
-        x, order, converged = follow_whole(body, targets, markers.rate, config, tell)
+        start = None if near is None else body.body.join(near.poses, near.trans)
+        x, order, converged = follow_whole(body, targets, markers.rate, config, tell, start)
     else:
         x, order, converged = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config, tell)
     pose, trans, _ = body.body.split(x)
@@ -93,11 +97,15 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
     return x, order, converged
 
 
-def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames converged (T,)."""
+def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress,
+                 start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames converged (T,).
+
+    They begin at unknowns `start` (T, P), or on the way from key to key.
+    """
     T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
-    x, moved, feet = between_keys(body, targets, rate, config), np.zeros(T), None
+    x = between_keys(body, targets, rate, config) if start is None else start.copy()
+    moved, feet = np.zeros(T), None
     seen = ~np.isnan(targets[..., 0])
     inside = seen_span(targets)
     free = max(config.smoothing, 1)
@@ -148,19 +156,28 @@ FURTHEST = 0.5                       # radians or metres that a step may go
 def smoothed(body: MarkedBody, stiffness: np.ndarray, x: np.ndarray, targets: np.ndarray, weights: np.ndarray,
              held: HeldPoints | None = None) -> np.ndarray:
     """Frames (T, P) after one Gauss-Newton step on markers (T, L, 3), weighted (T, L), and `coupled_steps`."""
-    T, P = x.shape
-    if T < 3:
+    if len(x) < 3:
         return x
-    gradient, hessian = np.empty((T, P)), np.empty((T, P, P))
-    for some in batches(T):
-        _, gradient[some], hessian[some] = body.system(x[some], targets[some], weights[some])
-        if held is not None:
-            _, pull, stiff = held.system(*body.body.split(x[some])[:2], some)
-            gradient[some] += pull
-            hessian[some] += stiff
-    step = coupled_steps(x, gradient, hessian, stiffness)
+    step = np.empty_like(x)
+    for near, kept, where in overlapping_windows(len(x), WINDOW - 2 * OVERLAP, OVERLAP):
+        step[where] = _window_steps(body, stiffness, x, targets, weights, held, near)[kept]
     longest = np.abs(step).max(axis=1, keepdims=True)
     return body.retract(x, step * np.minimum(1, FURTHEST / np.maximum(longest, 1e-12)))
+
+
+def _window_steps(body: MarkedBody, stiffness: np.ndarray, x: np.ndarray, targets: np.ndarray, weights: np.ndarray,
+                  held: HeldPoints | None, near: slice) -> np.ndarray:
+    """The steps (n, P) of the frames of a window; the others are as of `smoothed`."""
+    n, P = len(x[near]), x.shape[1]
+    gradient, hessian = np.empty((n, P)), np.empty((n, P, P))
+    for some in batches(n):
+        at = slice(near.start + some.start, min(near.start + some.stop, near.stop))
+        _, gradient[some], hessian[some] = body.system(x[at], targets[at], weights[at])
+        if held is not None:
+            _, pull, stiff = held.system(*body.body.split(x[at])[:2], at)
+            gradient[some] += pull
+            hessian[some] += stiff
+    return coupled_steps(x[near], gradient, hessian, stiffness)
 
 
 def low_pass(pose: np.ndarray, trans: np.ndarray, rate: float, cutoff: float) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ a half turn.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from ..marker_sets.layout import MarkerLayout
 from .part_shapes import PartShapes, part_shapes
 
 BATCH = 64                           # frames whose parts are held at once
+MOST = 512                           # frames that are solved, each by itself, at once
 SAMPLES = 120                        # poses from which the turning of the normals is learned
 
 
@@ -57,8 +59,15 @@ class MarkedBody:
               stiff: float = 1.0) -> Minimum[np.ndarray]:
         """The best unknowns near x (B, P), each row by itself; arguments as of `system`, without B if all are alike."""
         targets, weights = (np.broadcast_to(of, (len(x), *of.shape[-k:])) for of, k in ((targets, 2), (weights, 1)))
-        return levenberg_marquardt(lambda at: self.system(at, targets, weights, stiff), x, iterations, tolerance,
-                                   retract=self.retract)
+        ends = [levenberg_marquardt(partial(self._rows, targets[some], weights[some], stiff), x[some], iterations,
+                                    tolerance, retract=self.retract) for some in batches(len(x), MOST)]
+        return ends[0] if len(ends) == 1 else Minimum(
+            np.concatenate([end.x for end in ends]),
+            Dense(*map(np.concatenate, zip(*(end.equations for end in ends), strict=True))),
+            np.concatenate([end.converged for end in ends]), max(end.iterations for end in ends))
+
+    def _rows(self, targets: np.ndarray, weights: np.ndarray, stiff: float, x: np.ndarray) -> Dense:
+        return self.system(x, targets, weights, stiff)
 
     def with_prior(self, data: Dense, pose: np.ndarray, stiff: float = 1.0) -> Dense:
         """Equations whose first unknowns are those of poses (B, J, 3), and the pose prior."""
@@ -83,9 +92,9 @@ class MarkedBody:
         return step_between(x, goal, self.body.n_angles)
 
 
-def batches(count: int) -> Iterator[slice]:
+def batches(count: int, size: int = BATCH) -> Iterator[slice]:
     """So many frames, some at a time."""
-    return (slice(start, start + BATCH) for start in range(0, count, BATCH))
+    return (slice(start, start + size) for start in range(0, count, size))
 
 
 def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:

@@ -13,7 +13,7 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .settings import AnimateConfig
-from .swaps import DEVIATION, find_order, marker_levels
+from .swaps import DEVIATION, find_order
 
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are swapped, and put back
 
@@ -76,7 +76,7 @@ def label_order(positions: np.ndarray, targets: np.ndarray, rate: float, outlier
     shift = known_median(positions - targets, -2)[..., None, :]
     # on a body that fits badly a marker is as much farther from its place as one must be to be an outlier
     deviation = DEVIATION * scale[..., 0] / AnimateConfig.outlier
-    return find_order(targets, rate, marker_levels(positions - shift, targets, deviation))
+    return find_order(targets, rate, positions - shift, deviation)
 
 
 class LabelWatch:

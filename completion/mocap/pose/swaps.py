@@ -5,6 +5,8 @@ body has the markers tells which label belongs to a stretch of track.
 """
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import median_filter
 
@@ -14,6 +16,7 @@ CHANGE = 4.0                         # what each change of a label must be worth
 WORTH = 2.0                          # least gain for which labels are swapped
 DEVIATION = 0.008                    # metres from its usual place on the body that a marker lies, in each direction
 MEMORY = 0.1                         # seconds that this distance stays much the same
+AT_ONCE = 64                         # frames whose levels of all pairs are held
 
 
 class Tracks:
@@ -97,34 +100,59 @@ def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
     return np.take_along_axis(positions, order[..., None], axis=1)
 
 
-def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
-    """What it counts (..., L, L) that a column's label is the marker of a row: half squared deviations, at most `AWAY`.
+@dataclass(frozen=True, eq=False)
+class Seats:
+    """Where the body has the markers: places (T, L, 3), metres, NaN where unknown, then nowhere near.
 
-    Places (..., L, 3) on the body are NaN where unknown, then nowhere near; `deviation`, metres, one for each frame.
+    A marker lies off them by a standard `deviation` (T,), metres, in each direction; a level counts `share` times.
     """
-    squared = sum((places[..., :, None, d] - positions[..., None, :, d])**2 for d in range(3))
-    cost = np.minimum(np.nan_to_num(squared / (2 * np.asarray(deviation)[..., None, None]**2), nan=AWAY), AWAY)
-    return np.asarray(cost * np.isfinite(positions[..., None, :, 0]))
+
+    places: np.ndarray
+    deviation: np.ndarray
+    share: float
+
+    def levels(self, frames: slice, rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """What it counts (n, R, C) that labels at positions (n, C, 3) are the markers of rows: see `marker_levels`."""
+        return self.share * marker_levels(self.places[frames, rows, None], positions[:, None],
+                                          self.deviation[frames, None, None])
+
+    def own(self, positions: np.ndarray) -> np.ndarray:
+        """What it counts (T, L) that labels at positions (T, L, 3) are the markers of the same rows."""
+        return self.share * marker_levels(self.places, positions, self.deviation[:, None])
+
+    def exchanged(self, positions: np.ndarray, a: int, b: int) -> np.ndarray:
+        """What it counts (T,) that the markers of two rows bear each other's label."""
+        two = [a, b]
+        return self.share * marker_levels(self.places[:, two], positions[:, two[::-1]],
+                                          self.deviation[:, None]).sum(axis=1)
 
 
-def find_order(positions: np.ndarray, rate: float, levels: np.ndarray | None = None) -> np.ndarray:
-    """Which column (T, L) each marker is to be taken from, by its track and by `marker_levels`, if there are any.
+def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """What it counts (...) that a label is a marker: half squared deviations, at most `AWAY`; places (..., 3)."""
+    squared = sum((places[..., d] - positions[..., d])**2 for d in range(3))
+    cost = np.minimum(np.nan_to_num(squared / (2 * deviation**2), nan=AWAY), AWAY)
+    return np.asarray(cost * np.isfinite(positions[..., 0]))
 
-    The frames of `MEMORY` count as one. The best pair and span is swapped, then the best of what is left, until nothing
-    gains: of a longer cycle each swap puts one marker right.
+
+def find_order(positions: np.ndarray, rate: float, places: np.ndarray | None = None,
+               deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
+    """Which column (T, L) each marker is to be taken from, by its track and by places (T, L, 3) on a body, if any.
+
+    A marker lies off its place by a standard `deviation`, metres, one for all or for each frame. The frames of
+    `MEMORY` count as one. The best pair and span is swapped, then the best of what is left, until nothing gains: of a
+    longer cycle each swap puts one marker right.
     """
     T, L = positions.shape[:2]
     order, tracks = np.tile(np.arange(L), (T, 1)), Tracks(positions, rate)
-    levels = np.zeros((T, L, L)) if levels is None else min(1.0, 1 / (MEMORY * rate)) * levels
+    seats = None if places is None else Seats(places, np.broadcast_to(deviation, T), min(1.0, 1 / (MEMORY * rate)))
     touched = set(range(L))
     for _ in range(12):                                                 # longer cycles come apart into pairs
-        found = _best_spans(tracks, levels, touched)
+        found = _best_spans(tracks, seats, touched)
         touched = set()
         for _, a, b, swapped in sorted(found, key=lambda f: -f[0]):
             if not touched & {a, b}:
-                two, every = np.array([a, b]), np.arange(L)
+                two = np.array([a, b])
                 order[np.ix_(swapped, two)] = order[np.ix_(swapped, two[::-1])]
-                levels[np.ix_(swapped, every, two)] = levels[np.ix_(swapped, every, two[::-1])]
                 touched |= {a, b}
         if not touched:
             break
@@ -133,14 +161,16 @@ def find_order(positions: np.ndarray, rate: float, levels: np.ndarray | None = N
     return order
 
 
-def _best_spans(tracks: Tracks, levels: np.ndarray, touched: set[int]
-                ) -> list[tuple[float, int, int, np.ndarray]]:
+def _best_spans(tracks: Tracks, seats: Seats | None, touched: set[int]) -> list[tuple[float, int, int, np.ndarray]]:
     """Gain, pair and frames (n,) of all pairs with a label of `touched` that gain by being swapped."""
-    own = np.einsum("tll->tl", levels)
+    pairs, at = pairs_that_jump(tracks, touched), tracks.positions
+    own = np.zeros(at.shape[:2]) if seats is None else seats.own(at)
+    if seats is not None:
+        pairs |= _pairs_that_fit(seats, at, own, np.array(sorted(touched)))
     out = []
-    for a, b in sorted(pairs_that_jump(tracks, touched) | _pairs_that_fit(own, levels, touched)):
+    for a, b in sorted(pairs):
         begins = tracks.loose_ends(a, b)
-        gain = own[:, a] + own[:, b] - levels[:, a, b] - levels[:, b, a]
+        gain = own[:, a] + own[:, b] - (0.0 if seats is None else seats.exchanged(at, a, b))
         total, swapped = best_stretches(tracks, a, b, begins, np.add.reduceat(gain, begins))
         if total > WORTH:
             out.append((total, a, b, swapped))
@@ -172,17 +202,22 @@ def pairs_that_jump(tracks: Tracks, touched: set[int]) -> set[tuple[int, int]]:
     return {pair for pair in pairs if touched & set(pair)}
 
 
-def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, touched: set[int]) -> set[tuple[int, int]]:
-    """Pairs of labels that over some stretch lie where the body has the other one."""
-    pairs: set[tuple[int, int]] = set()
-    if not levels.any():
-        return pairs
-    for a in touched:
-        total = np.zeros((len(own) + 1, own.shape[1]))
-        np.cumsum(own[:, [a]] + own - levels[:, a] - levels[:, :, a], axis=0, out=total[1:])
-        best = (total - np.minimum.accumulate(total, axis=0)).max(axis=0)
-        pairs |= {(min(a, int(b)), max(a, int(b))) for b in np.flatnonzero(best > CHANGE + WORTH) if b != a}
-    return pairs
+def _pairs_that_fit(seats: Seats, positions: np.ndarray, own: np.ndarray, rows: np.ndarray) -> set[tuple[int, int]]:
+    """Pairs with a label of some rows that over some stretch lie where the body has the other one."""
+    T, L = own.shape
+    total, least, best = (np.zeros((1, len(rows), L)) for _ in range(3))   # up to here; the least so far; most since
+    for start in range(0, T, AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        there = seats.levels(some, rows, positions[some])
+        back = there if len(rows) == L else seats.levels(some, np.arange(L), positions[some][:, rows])
+        gain = own[some][:, rows, None] + own[some][:, None] - there - np.swapaxes(back, 1, 2)
+        run = np.cumsum(np.concatenate([total, gain]), axis=0)
+        low = np.minimum.accumulate(np.concatenate([least, run[1:]]), axis=0)
+        best = np.maximum(best, (run - low).max(axis=0))
+        total, least = run[-1:], low[-1:]
+    fit = best[0] > CHANGE + WORTH
+    fit[np.arange(len(rows)), rows] = False
+    return {(min(a, b), max(a, b)) for a, b in ((int(rows[i]), int(b)) for i, b in np.argwhere(fit))}
 
 
 def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tuple[float, np.ndarray]:

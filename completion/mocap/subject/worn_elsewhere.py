@@ -18,6 +18,7 @@ from scanprep.geometry.mesh import Mesh
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
+from .frame_starts import mean_person, start_frames
 from .person import PersonConfig, PersonFit, common_markers, find_person
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
@@ -236,13 +237,31 @@ def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layo
     """
     labels, off = at.layout.labels, np.nan_to_num(at.off_usual())
     best: tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames] = (), sequences, at
-    for tried in _limbs(model.skeleton.parents, at) if (off > FAR).sum() >= SEVERAL else ():
+    for tried in _promising(model, at) if (off > FAR).sum() >= SEVERAL else ():
         names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in tried))
         renamed = [names.named(each, layout) for each in sequences]
         other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout)
         if _burden(other) < 0.5 * _burden(at) and _burden(other) < _burden(best[2]):
             best = names.exchanged, renamed, other
     return best
+
+
+def _promising(model: BodyModel, at: _Frames) -> list[list[tuple[int, int]]]:
+    """Those of `_limbs` that the mean person explains better than the names as they came: a fit of poses tells soon."""
+    mean = mean_person(model.subject(np.zeros(model.n_betas)), at.layout)
+
+    def burden(targets: np.ndarray) -> float:
+        x = start_frames(mean, targets, lambda done: None)
+        return _capped(_rms(np.linalg.norm(mean.positions(x) - targets, axis=2)))
+
+    found, as_they_came = [], burden(at.targets)
+    for pairs in _limbs(model.skeleton.parents, at):
+        targets = at.targets.copy()
+        for i, j in pairs:
+            targets[:, [i, j]] = at.targets[:, [j, i]]
+        if burden(targets) < as_they_came:
+            found.append(pairs)
+    return found
 
 
 def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
@@ -261,8 +280,13 @@ def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
 
 
 def _burden(at: _Frames) -> float:
-    """How badly a body explains its markers; beyond some distance it does not matter how far they are."""
-    return float(np.minimum(np.nan_to_num(at.off_usual()), 2 * FAR).sum())
+    """How badly a body explains its markers."""
+    return _capped(at.off_usual())
+
+
+def _capped(off: np.ndarray) -> float:
+    """The sum of distances (L,), NaN for none; beyond some distance it does not matter how far a marker is."""
+    return float(np.minimum(np.nan_to_num(off), 2 * FAR).sum())
 
 
 def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
