@@ -123,6 +123,7 @@ def main() -> None:
     """Run and print a row for each figure and factor."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("-o", "--output", default="mosh_characters.json")
     parser.add_argument("-m", "--model", type=Path, help="of the file's person; else the embedded one")
     parser.add_argument("--c3d", type=Path, help="whose motion it is; else an embedded man walks")
     parser.add_argument("--frames", type=int, default=60, help="that are measured and shown")

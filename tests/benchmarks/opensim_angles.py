@@ -166,6 +166,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("-o", "--output", default="opensim_angles.json")
     args = parser.parse_args()
     opensim.Logger.removeFileSink()                          # opensim.log, in the folder where one stands
     if scape(["mosh", str(args.recording), "-o", str(args.folder / "mosh")]):
