@@ -19,8 +19,6 @@ from ..pose.marked_body import supports
 from ..soft_tissue.soft_tissue import SoftTissue
 from .recordings import Recording
 
-AT_ONCE = 128                        # frames whose changes are held at a time
-
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
@@ -90,15 +88,8 @@ def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], mark
     ids, weights = supports(model.template, places)
     lift, seen = np.asarray(places.distances), markers.select(names).positions
     assert motion.betas is not None, "a person of a shape space"
-    K = len(motion.betas) if soft is None else max(len(motion.betas), soft.changes.shape[1])
-    shaped = model.points(ids, weights, K)
-    points = shaped.operator(motion.betas)
-    fixed = lifted(points.evaluate(motion.poses, motion.trans), lift)
+    points = model.points(ids, weights, len(motion.betas)).operator(motion.betas)
+    fixed = np.linalg.norm(lifted(points.evaluate(motion.poses, motion.trans), lift) - seen, axis=2)
     if soft is None:
-        return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), None)
-    moving = points.evaluate(soft.motion.poses, soft.motion.trans)
-    changes = np.pad(soft.changes, ((0, 0), (0, K - soft.changes.shape[1])))
-    for start in range(0, len(moving), AT_ONCE):
-        some = slice(start, start + AT_ONCE)
-        moving[some] += np.einsum("tk,tldk->tld", changes[some], shaped.shape_jacobian(soft.motion.poses[some]))
-    return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), np.linalg.norm(lifted(moving, lift) - seen, axis=2))
+        return HeldOut(names, fixed, None)
+    return HeldOut(names, fixed, np.linalg.norm(lifted(soft.points(model, ids, weights), lift) - seen, axis=2))
