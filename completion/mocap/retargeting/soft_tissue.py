@@ -30,8 +30,8 @@ SOLES = 60                           # points that may touch the ground
 def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyModel, factor: float = 1.0) -> SoftTissue:
     """The motion and the soft tissue of a person on a character.
 
-    Joints turn as they did, and the skin moves as far as it did, on the character instead of the person. The way over the
-    ground is as long as the character's legs are, and it reaches the ground when the person does (see `retarget`).
+    Joints turn as they did, and the skin moves as far as it did, on the character instead of the person. The way over
+    the ground is as long as the character's legs are, and it reaches the ground when the person does (see `retarget`).
 
     Parameters
     ----------

@@ -23,8 +23,9 @@ from .skin import SkinMovement, in_root, in_world, smooth_modes
 from .soft_tissue import SoftTissue
 
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
-ROUNDS = 2                           # Gauss-Newton steps over the whole sequence, which begins near its end
-QUIET = 0.75                         # share of the markers by which it is told how far one lies off without soft tissue
+ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
+QUIET = 0.6                          # share of the markers by which it is told how far one lies off without soft tissue
+LOOSE = 3.0                          # sizes of the movement by which the prior allows it; at 1 it shrinks what it finds
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
 
 
@@ -58,7 +59,7 @@ class SoftTissueConfig(Settings):
     pose: float = 0.3
     velocity: Positive = 57600.0
     marker_sd: Positive = 0.001
-    reach: Positive = 0.1
+    reach: Positive = 0.09
     temporal_smoothness: float = 2.0
     outlier: Positive = 0.06
 
@@ -160,7 +161,7 @@ class SoftFollower:
     def round(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> np.ndarray:
         """Frames (T, P) that follow each other after one Gauss-Newton step, the movement of the skin integrated out.
 
-        How far three quarters of the markers lie off at most is noise to the pose; beyond it is movement of the skin.
+        How far most of the markers lie off is noise to the pose; what a marker is beyond it is movement of the skin.
         """
         strays = variances(self.off(x, targets), share)
         noise = max(float(np.quantile(strays, QUIET)), self.config.marker_sd**2)
@@ -190,17 +191,18 @@ class SoftFollower:
                                     pose)
 
     def displaced(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """The movement of the skin under the markers (T, L, 3), metres, along the axes of the root, poses x held."""
+        """The movement of the skin under the markers (T, L, 3), metres, along the axes of the root, poses x held.
+
+        [MoSh] Eq. 24, with |z|² in place of |β_t|²
+        """
         off, sd = self.off(x, targets), self.config.marker_sd
-        size = np.sqrt(np.maximum(variances(off, share) - sd**2, (0.1 * sd)**2))
-        root = np.linalg.cholesky(size[:, None] * self.correlation * size)         # the movement is root @ z, z ~ N(0, 1)
-        z, eye = np.empty(off.shape), np.eye(self.body.count)
-        for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP) if len(x) > 2 else (
-                3 * (slice(None),),):
-            counts = share[near] / sd**2
-            blocks = root.T @ (counts[:, :, None] * root) + eye                    # [MoSh] Eq. 24: |z|² in place of |β_t|²
-            pull = root.T @ (counts[:, :, None] * off[near])
-            z[where] = solve_smooth(blocks, self.smoothness, pull)[kept] if len(x) > 2 else np.linalg.solve(blocks, pull)
+        size = LOOSE * np.sqrt(np.maximum(variances(off, share) - sd**2, (0.1 * sd)**2))
+        root = np.linalg.cholesky(size[:, None] * self.correlation * size)     # the movement is root @ z, z ~ N(0, 1)
+        z, coupled = np.empty(off.shape), len(x) > 2
+        for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP) if coupled else [(slice(None),) * 3]:
+            counts = share[near, :, None] / sd**2
+            blocks, pull = root.T @ (counts * root) + np.eye(len(root)), root.T @ (counts * off[near])
+            z[where] = (solve_smooth(blocks, self.smoothness, pull) if coupled else np.linalg.solve(blocks, pull))[kept]
         return root @ z
 
 

@@ -28,8 +28,7 @@ class SkinMovement:
     moved: np.ndarray
 
     def at(self, places: np.ndarray, poses: np.ndarray, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Displacements (n, L, 3), metres, of points with shares (L, R) in some frames, in which the poses are (n, J, 3).
-        """
+        """Displacements (n, L, 3), metres, of points with shares (L, R) in some frames with their poses (n, J, 3)."""
         return np.asarray(places @ in_world(self.moved[frames], poses))
 
     def times(self, factor: float) -> SkinMovement:

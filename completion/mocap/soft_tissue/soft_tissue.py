@@ -66,8 +66,8 @@ class SoftTissue:
 
     def movement(self, model: BodyModel) -> np.ndarray:
         """How far soft tissue moves every vertex (N,) of the skin, metres: the root of the mean square over time."""
-        squared = skin_movement(model, self.changes)**2 if self.changes.any() else np.zeros(len(model.template.vertices))
-        return np.sqrt(squared if self.skin is None else squared + self.skin.squared())
+        by_betas = skin_movement(model, self.changes) if self.changes.any() or self.skin is None else 0.0
+        return np.sqrt(by_betas**2 + (0.0 if self.skin is None else self.skin.squared()))
 
     def save(self, path: str | Path) -> None:
         """Write a motion file (see `Motion.save`) that also holds soft tissue.
