@@ -128,11 +128,15 @@ def test_noise_is_not_taken_for_soft_tissue() -> None:
 def test_modes_are_one_at_their_place_and_die_away() -> None:
     model = body()
     places = layout(model, count=12).nearest
-    modes, correlation = smooth_modes(model.template, places, 0.1)
+    modes, root = smooth_modes(model.template, places, 0.1)
     np.testing.assert_allclose(modes[places], np.eye(12), atol=1e-9)
     far = SurfaceGraph(model.template).distances(places).min(axis=0) > 0.4
     assert far.any() and not modes[far].any()
-    assert np.linalg.eigvalsh(correlation)[0] > 0 and np.allclose(np.diag(correlation), 1)
+    np.testing.assert_allclose(np.diag(root @ root.T), 1)
+    places, smooth = np.arange(0, 398, 2), bump(model, 0.3)
+    close, root = smooth_modes(model.template, places, 0.15)
+    assert root.shape[1] < 150                                               # many places: the finest patterns are out
+    np.testing.assert_allclose(close @ smooth[places], smooth, atol=0.05)
 
 
 def test_whitened_markers_are_independent() -> None:
@@ -153,7 +157,7 @@ def test_derivatives_are_finite_differences() -> None:
     markers, motion = seen(model, where, noise=0.005)
     follower = SoftFollower(model, motion, markers, where, SoftTissueConfig())
     x = follower.body.body.join(motion.poses[:2], motion.trans[:2])
-    given = markers.positions[:2], 100 * whitening(follower.correlation, np.full((2, 20), 0.7))
+    given = markers.positions[:2], 100 * whitening(follower.root @ follower.root.T, np.full((2, 20), 0.7))
     _, gradient, _ = follower.system(x, *given)
     for k in range(x.shape[1]):
         d = np.zeros(x.shape)
@@ -172,7 +176,8 @@ def test_the_movement_is_the_mean_of_a_gaussian_process() -> None:
     share[3, 5] = 0
     off = follower.off(x, markers.positions)
     size = follow.LOOSE * np.sqrt(np.maximum(variances(off, share) - 1e-6, 1e-8))
-    K, some = size[:, None] * follower.correlation * size, np.arange(20) != 5
+    root, some = size[:, None] * follower.root, np.arange(20) != 5
+    K = root @ root.T
     found = follower.displaced(x, markers.positions, share)
     for t, used in ((3, some), (7, np.full(20, True))):
         wanted = K[:, used] @ np.linalg.solve(K[np.ix_(used, used)] + 1e-6 * np.eye(used.sum()), off[t, used])

@@ -19,7 +19,7 @@ from ..pose.follow import FURTHEST, STILL
 from ..pose.marked_body import MarkedBody, batches, point_system
 from ..pose.robust import marker_weights
 from ..pose.settings import RATE, AnimateConfig
-from .skin import SkinMovement, in_root, in_world, smooth_modes
+from .skin import SkinMovement, in_root, smooth_modes
 from .soft_tissue import SoftTissue
 
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
@@ -105,7 +105,7 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     pose, trans, _ = follower.body.body.split(x)
     found = replace(motion, poses=pose.copy(), trans=trans.copy(), converged=motion.converged & settled)
     residuals = np.full(markers.positions.shape[:2], np.nan)
-    places = follower.body.positions(x) + in_world(skin.moved, pose)
+    places = follower.body.positions(x) + skin.at(skin.modes[follower.nearest], pose)
     residuals[:, follower.rows] = np.linalg.norm(places - follower.targets, axis=2)
     assert motion.betas is not None, "checked"
     return SoftTissue(replace(found, residuals=residuals), np.zeros((len(x), len(motion.betas))), skin)
@@ -127,7 +127,8 @@ class SoftFollower:
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
         self.body = MarkedBody(model.subject(motion.betas), layout, config.pose, poses.prior_shrinkage)
         self.inertia = poses.inertia(markers.rate, self.body.n_unknowns)
-        self.modes, self.correlation = smooth_modes(model.template, layout.nearest, config.reach)
+        self.nearest = layout.nearest
+        self.modes, self.root = smooth_modes(model.template, self.nearest, config.reach)
         self.smoothness = config.temporal_smoothness * (markers.rate / RATE)**4
 
     def solve(self, progress: Progress | None = None) -> tuple[np.ndarray, SkinMovement, np.ndarray]:
@@ -166,7 +167,8 @@ class SoftFollower:
         strays = variances(self.off(x, targets), share)
         noise = max(float(np.quantile(strays, QUIET)), self.config.marker_sd**2)
         size = np.sqrt(np.maximum(strays / noise - 1, 0))
-        covariance, weight = size[:, None] * self.correlation * size, np.sqrt(self.config.data * PER_SQUARE_METRE)
+        root = size[:, None] * self.root
+        covariance, weight = root @ root.T, np.sqrt(self.config.data * PER_SQUARE_METRE)
 
         def equations(near: slice) -> tuple[np.ndarray, np.ndarray]:
             at, goal, counts = x[near], targets[near], share[near]
@@ -197,11 +199,11 @@ class SoftFollower:
         """
         off, sd = self.off(x, targets), self.config.marker_sd
         size = LOOSE * np.sqrt(np.maximum(variances(off, share) - sd**2, (0.1 * sd)**2))
-        root = np.linalg.cholesky(size[:, None] * self.correlation * size)     # the movement is root @ z, z ~ N(0, 1)
-        z, coupled = np.empty(off.shape), len(x) > 2
+        root = size[:, None] * self.root                                       # the movement is root @ z, z ~ N(0, 1)
+        z, coupled = np.empty((len(x), root.shape[1], 3)), len(x) > 2
         for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP) if coupled else [(slice(None),) * 3]:
             counts = share[near, :, None] / sd**2
-            blocks, pull = root.T @ (counts * root) + np.eye(len(root)), root.T @ (counts * off[near])
+            blocks, pull = root.T @ (counts * root) + np.eye(root.shape[1]), root.T @ (counts * off[near])
             z[where] = (solve_smooth(blocks, self.smoothness, pull) if coupled else np.linalg.solve(blocks, pull))[kept]
         return root @ z
 

@@ -9,7 +9,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 
-LEAST = 1e-2                         # eigenvalue of correlations: distances over a curved surface make some negative
+LEAST = 1e-2                         # eigenvalue of a pattern that is kept: finer ones are noise, or none of a process
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +52,15 @@ def in_root(moved: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 def smooth_modes(skin: Mesh, places: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """What displacements of some vertices (R,) tell of all others, (N, R), and how they are correlated, (R, R).
+    """What displacements of some vertices (R,) tell of all others, (N, R), and a root (R, r) of their correlation.
 
     The displacement is a Gaussian process over the skin: correlations fall with the distance along it as a bell does,
-    to exp(-1/2) at `reach`, metres. The modes are its mean, the displacements of the places given.
+    to exp(-1/2) at `reach`, metres. The modes are its mean, the displacements of the places given. Patterns over the
+    places that hardly occur are left out; distances along a curved surface make some impossible.
     """
     distances = SurfaceGraph(skin).distances(places, limit=4 * reach)              # beyond it the bell is 0.0003
     bell = np.exp(-0.5 * (distances / reach)**2)
     near = bell[:, places]
     values, vectors = np.linalg.eigh(0.5 * (near + near.T))
-    values = np.maximum(values, LEAST)
-    return bell.T @ (vectors / values) @ vectors.T, (vectors * values) @ vectors.T
+    values, vectors = values[values > LEAST], vectors[:, values > LEAST]
+    return bell.T @ (vectors / values) @ vectors.T, vectors * np.sqrt(values)
