@@ -24,7 +24,7 @@ from .soft_tissue import SoftTissue
 
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
-QUIET = 0.6                          # share of the markers by which it is told how far one lies off without soft tissue
+USUAL = 2.0                          # medians of how far markers lie off (squared) within which it is noise to the pose
 LOOSE = 3.0                          # sizes of the movement by which the prior allows it; at 1 it shrinks what it finds
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
 
@@ -165,7 +165,7 @@ class SoftFollower:
         How far most of the markers lie off is noise to the pose; what a marker is beyond it is movement of the skin.
         """
         strays = variances(self.off(x, targets), share)
-        noise = max(float(np.quantile(strays, QUIET)), self.config.marker_sd**2)
+        noise = max(USUAL * float(np.median(strays)), self.config.marker_sd**2)
         size = np.sqrt(np.maximum(strays / noise - 1, 0))
         root = size[:, None] * self.root
         covariance, weight = root @ root.T, np.sqrt(self.config.data * PER_SQUARE_METRE)
