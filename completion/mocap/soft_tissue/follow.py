@@ -74,8 +74,8 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
                        config: SoftTissueConfig | None = None, progress: Progress | None = None) -> SoftTissue:
     """A motion in which the skin moves on the body, as the markers tell.
 
-    [MoSh] changes the betas in every frame and holds the change by its squared length. Betas of 182 people make up a
-    sixth to a quarter of what a bump of 6 to 12 cm needs, so here the skin itself moves: a Gaussian process over the
+    [MoSh] changes the betas in every frame and holds the change by its squared length. Betas of 182 people have a
+    sixth to a third of the energy of a bump of 6 to 12 cm, so here the skin itself moves: a Gaussian process over the
     surface, whose size at each marker is taken from how far that marker strays. Poses are found again, and a marker
     that strays more than most counts the less for them, so that they do not follow soft tissue. Where no marker is
     near, the skin does not move; markers that were not seen, and those that the motion did not trust, count nothing.
