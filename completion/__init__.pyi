@@ -36,7 +36,7 @@ from .mocap.retargeting.retarget import morphed_vertices as morphed_vertices
 from .mocap.retargeting.retarget import retarget as retarget
 from .mocap.retargeting.soft_tissue import deformation as deformation
 from .mocap.retargeting.soft_tissue import retarget_soft_tissue as retarget_soft_tissue
-from .mocap.soft_tissue.soft_tissue import follow_soft_tissue as follow_soft_tissue
+from .mocap.soft_tissue.follow import follow_soft_tissue as follow_soft_tissue
 from .mocap.subject.person import PersonConfig as PersonConfig
 from .mocap.subject.person import PersonFit as PersonFit
 from .mocap.subject.person import find_person as find_person

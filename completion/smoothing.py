@@ -1,6 +1,8 @@
 """Frames that follow each other, coupled by how little a body accelerates; unknowns are pose (3J) and trans (3)."""
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from scanprep.geometry.least_squares import retract_pose, step_between
@@ -28,13 +30,19 @@ def coupled_steps(x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, stif
     Of everything else come half the gradient (T, P) and the Gauss-Newton matrix (T, P, P), by small rotations of the
     joints from the right. Velocities are differences of these, which is exact for slow motion.
     """
+    return windowed_steps(x, lambda near: (gradient[near].copy(), hessian[near]), stiffness)
+
+
+def windowed_steps(x: np.ndarray, equations: Callable[[slice], tuple[np.ndarray, np.ndarray]], stiffness: np.ndarray
+                   ) -> np.ndarray:
+    """As `coupled_steps`; gradient and matrix are made of some frames at a time, so that few are held."""
     step = np.empty_like(x)
     for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):
-        at, pull = x[near], gradient[near].copy()
+        at, (pull, hessian) = x[near], equations(near)
         bend = np.diff(step_between(at[:-1], at[1:], x.shape[1] - 3), axis=0)
         for i, share in enumerate((1.0, -2.0, 1.0)):
             pull[i:len(at) - 2 + i] += share * stiffness * bend
-        step[where] = -solve_smooth(hessian[near], stiffness, pull)[kept]
+        step[where] = -solve_smooth(hessian, stiffness, pull)[kept]
     return step
 
 

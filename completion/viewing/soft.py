@@ -70,7 +70,7 @@ def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tupl
     """Columns (N, r) and coefficients (T, r, 3) of all vertices in all frames, from some of the frames (n, N, 3).
 
     As `as_columns` for a body of fixed shape: what the fast path adds up is linear in betas too, so every direction in
-    which they change adds a product of its own.
+    which they change adds a product of its own. Skin that moves on the body adds its displacements.
     """
     made, _ = low_rank(frames)
     even = np.full((made.shape[0], 1), made.shape[0] ** -0.5)              # moves all vertices alike
@@ -88,4 +88,5 @@ def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tupl
         for i in range(0, len(poses), AT_ONCE):
             now = slice(i, i + AT_ONCE)
             out[now] += amount[now, None, None] * (columns.turned(poses[now]) + origin)
-    return basis, np.swapaxes(out, 1, 2)
+    out = np.swapaxes(out, 1, 2)
+    return basis, out if soft.skin is None else out + soft.skin.at(basis.T @ soft.skin.modes, poses)

@@ -80,10 +80,12 @@ def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarr
 def solve_smooth(blocks: np.ndarray, stiffness: np.ndarray | float, rhs: np.ndarray) -> np.ndarray:
     """Frames x (T, P) that their second differences couple: `blocks[t] x[t] + stiffness (D₂ᵀ D₂ x)[t] = rhs[t]`.
 
+    Right-hand sides (T, P, m) are solved for together.
+
     `blocks` (T, P, P) are symmetric and positive semidefinite, `stiffness` is (P,) or one number, T at least 3: one
     Cholesky factorisation of a band of width 2 P.
     """
-    T, P = rhs.shape
+    T, P = rhs.shape[:2]
     lower = np.zeros((2 * P + 1, T * P))
     for k in range(P):                               # entries k below the diagonal, inside the blocks
         lower[k].reshape(T, P)[:, :P - k] = np.einsum("tii->ti", blocks[:, k:, :P - k])
@@ -92,8 +94,8 @@ def solve_smooth(blocks: np.ndarray, stiffness: np.ndarray | float, rhs: np.ndar
         for j in range(i, 3):
             lower[(j - i) * P].reshape(T, P)[i:T - 2 + i] += D[i] * D[j] * stiffness
     lower[0] += 1e-9 * lower[0].max()
-    return np.asarray(solveh_banded(lower, rhs.ravel(), overwrite_ab=True, lower=True,
-                                    check_finite=False).reshape(T, P))
+    return np.asarray(solveh_banded(lower, rhs.reshape(T * P, *rhs.shape[2:]), overwrite_ab=True, lower=True,
+                                    check_finite=False).reshape(rhs.shape))
 
 
 def overlapping_windows(count: int, size: int, overlap: int) -> Iterator[tuple[slice, slice, slice]]:

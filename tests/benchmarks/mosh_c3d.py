@@ -4,9 +4,9 @@
 
 The six are in no stage; they are compared with where the layout file has them on the found body. For each file: the
 mean distance of observed markers from the simulated ones with fixed shape and, with `--soft`, with a changing one; the
-held-out markers, each by itself; seconds of one processor. `steady` is what is left of a held-out distance when the
-mean displacement of each marker, in the frame of its part, is taken away: what body and pose are off, without where
-somebody happened to put the marker.
+held-out markers, each by itself; seconds of one processor. `calibrated` finds the place of each held-out marker on the
+finished body, fixed in the frame of a triangle, from 12 frames spread over the poses, and is the error in all other
+frames: what body and pose are off, without where somebody happened to put the marker.
 
 Tuned on these four files: the places of loose markers in the layout `cmu41` and of feet and hands, from markers that
 are not held out; the weights of the poses of every frame. The held-out ones got the mirror image of their partners, and
@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,29 +28,73 @@ from protocols import machine, write_report
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.mosh import takes
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
-from completion.mocap.pose.marked_body import MarkedBody
-from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
-from completion.mocap.subject.person import PersonFit, find_person
+from completion.mocap.soft_tissue.follow import follow_soft_tissue
+from completion.mocap.soft_tissue.soft_tissue import SoftTissue
+from completion.mocap.subject.attachment import LatentMarkers, latent_markers
+from completion.mocap.subject.person import PersonFit, find_person, spread_frames
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
 
+CALIBRATED = 12                      # frames that tell where a held-out marker sits
 
-def held_out(model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout) -> dict[str, object]:
-    """Distances of the markers that were in no stage from where the layout has them on the body, millimetres."""
-    labels = [label for label in layout.matched(markers.labels) if layout.aliases.get(label, label) in HELD_OUT]
-    places = layout.select(labels)
-    body = MarkedBody(model.subject(motion.betas), places, 0.3, 0.3)
-    off = markers.select(labels).positions - body.positions(body.body.join(motion.poses, motion.trans))
-    part = model.skeleton.part_of_vertex(model.template)[places.nearest]
-    R = model.skeleton.part_rotations(motion.poses)[:, part]
-    local = (np.swapaxes(R, -1, -2) @ off[..., None])[..., 0]
-    steady = np.linalg.norm(local - np.nanmean(local, axis=0), axis=2)
-    far = 1e3 * np.linalg.norm(off, axis=2)
-    return {"held_out_mm": float(np.nanmean(far)), "held_out_steady_mm": 1e3 * float(np.nanmean(steady)),
-            "each_mm": dict(zip(labels, np.nanmean(far, axis=0).round(1).tolist(), strict=True))}
+
+def held_out(model: BodyModel, motion: Motion, soft: SoftTissue | None, markers: MarkerSequence, layout: MarkerLayout
+             ) -> dict[str, object]:
+    """How far the body is from the markers that were in no stage, millimetres: plain, and calibrated."""
+    plain = takes.held_out(model, layout, HELD_OUT, markers, motion, soft)
+    assert plain is not None and motion.betas is not None, "markers were held out of a person"
+    seen, subject = markers.select(plain.labels).positions, model.subject(motion.betas)
+    known = [label for label in markers.labels if label not in plain.labels]
+    frames = spread_frames(markers.select(known).positions, CALIBRATED)
+
+    def fixed(ids: np.ndarray) -> np.ndarray:
+        return subject.points(ids).evaluate(motion.poses, motion.trans)
+
+    near = calibrated(model, fixed, motion.vertices(subject, frames), seen, frames)
+    row: dict[str, object] = {
+        "held_out_mm": mean_mm(plain.fixed), "calibrated_mm": mean_mm(near),
+        "each_mm": dict(zip(plain.labels, (1e3 * np.nanmean(plain.fixed, axis=0)).round(1).tolist(), strict=True)),
+        "each_calibrated_mm": dict(zip(plain.labels, (1e3 * np.nanmean(near, axis=0)).round(1).tolist(), strict=True))}
+    if soft is None or plain.soft is None:
+        return row
+    near = calibrated(model, lambda ids: soft.points(model, ids[:, None], np.ones((len(ids), 1))),
+                      soft.vertices(model, frames), seen, frames)
+    return row | {"soft_held_out_mm": mean_mm(plain.soft), "soft_calibrated_mm": mean_mm(near),
+                  "soft_each_calibrated_mm": dict(zip(plain.labels, (1e3 * np.nanmean(near, axis=0)).round(1).tolist(),
+                                                      strict=True))}
+
+
+def calibrated(model: BodyModel, places: Callable[[np.ndarray], np.ndarray], bodies: np.ndarray, seen: np.ndarray,
+               frames: np.ndarray) -> np.ndarray:
+    """How far markers seen (T, H, 3) are from fixed places on the body, metres, NaN in the frames that tell the places.
+
+    Each hangs on the triangle, of those nearest to it in these frames (n,), in whose frame it moves least; `bodies`
+    (n, N, 3) are the meshes there, `places` tells where vertices are in all frames.
+    """
+    out = np.full(seen.shape[:2], np.nan)
+    alone = LatentMarkers("triangle", np.arange(3)[:, None], np.ones((3, 1)), np.arange(3)[None])
+    for h in range(seen.shape[1]):
+        there = ~np.isnan(seen[frames, h, 0])
+        meshes, points = bodies[there], seen[frames[there], h]
+        hung = {hanging.corners.tobytes(): hanging for hanging in (
+            latent_markers(model.template.with_vertices(v), p[None]) for v, p in zip(meshes, points, strict=True))}
+        best = np.inf
+        for hanging in hung.values():
+            local = np.array([hanging.coefficients(v, p[None]) for v, p in zip(meshes, points, strict=True)])
+            if local.var(axis=0).sum() < best:
+                best, where, corners = local.var(axis=0).sum(), local.mean(axis=0), hanging.corners[0]
+        if np.isfinite(best):
+            out[:, h] = np.linalg.norm(alone.places(places(corners), where)[:, 0] - seen[:, h], axis=1)
+    out[frames] = np.nan
+    return out
+
+
+def mean_mm(distances: np.ndarray) -> float:
+    return 1e3 * float(np.nanmean(distances))
 
 
 def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, config: MoshConfig
@@ -64,16 +109,17 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, conf
     frames = np.nanmean(off, axis=1)
     row = {"frames": len(off), "observed_mm": float(np.nanmean(off)), "p95_mm": float(np.nanpercentile(off, 95)),
            "worst_frame_mm": float(frames.max()), "worst_frame": int(frames.argmax()),
-           **held_out(model, motion, markers, layout), "person_cpu_s": found - start,
+           "person_cpu_s": found - start,
            "frames_per_cpu_s": len(off) / (followed - found), "settled": float(motion.converged.mean()),
            "person_converged": person.converged, "beta_rms": float(np.sqrt((person.betas**2).mean())),
            "beta_largest": float(np.abs(person.betas).max()), "moved_mm": 1e3 * float(np.median(person.moved))}
+    soft = None
     if config.soft_tissue:
         before = time.process_time()
         soft = follow_soft_tissue(model, motion, markers, person.layout, config.soft)
         row |= {"soft_observed_mm": 1e3 * float(np.nanmean(soft.motion.residuals)),
                 "soft_frames_per_cpu_s": len(off) / (time.process_time() - before)}
-    return person, motion, row
+    return person, motion, row | held_out(model, motion, soft, markers, layout)
 
 
 def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: int, path: Path, columns: int = 10
@@ -119,7 +165,8 @@ def main() -> None:
         if args.pictures:
             args.pictures.mkdir(parents=True, exist_ok=True)
             picture(model, motion, markers, 50, args.pictures / f"{path.stem}.png")
-    wanted = ("observed_mm", "soft_observed_mm", "held_out_mm", "held_out_steady_mm")
+    wanted = ("observed_mm", "soft_observed_mm", "held_out_mm", "soft_held_out_mm", "calibrated_mm",
+              "soft_calibrated_mm")
     names = [name for name in wanted if name in rows[0]]
     share = np.array([row["frames"] for row in rows]) / sum(row["frames"] for row in rows)
     mean = {name: {"of_files": float(np.mean([row[name] for row in rows])),

@@ -1,26 +1,27 @@
-"""Soft tissue: is it what moves, or noise? Markers left out of real files, and simulated people who breathe and shake.
+"""Soft tissue of known size: how much of a simulated jiggle is found, with how many markers.
 
-    python tests/benchmarks/mosh_soft.py FOLDER -m MODEL.npz -o mosh_soft.json [--frames 150] [--files 02_05 ...]
+    python tests/benchmarks/mosh_soft.py FOLDER -m MODEL.npz -o mosh_soft.json [--file 02_05] [--frames 240]
 
-Left out: poses and changes of some frames of each file are found again without a sixth of the markers, six times; the
-error is that of the markers left out (mm, mean), beside that of markers that were used. `fixed` is the same with the
-change held at nothing. Markers sit where stage 1 put them with all of them.
+A person moves as in a recording, with 1 mm of noise on every coordinate of the markers. On waist, chest, thighs,
+buttocks and calves, left and right, a bump of the skin swings along the normals by 10 mm: exp(-(d / R)²) at distance d
+along the skin, R drawn between 6 and 12 cm, its centre within 6 cm of a point of the anatomy, its phase drawn, its
+frequency 2, 5, 10 or 15 Hz. In four runs every place has every frequency once. Betas make up little of such a bump:
+`betas_share` is what of its energy the best change of all betas has. `still` is the same without bumps.
 
-Simulated: a person of random betas moves as in the first file, with 1 mm of noise on the markers. His skin does
-nothing, or swings around the breastbone (0.6 Hz) or around thigh and breastbone (4 and 3 Hz) along those directions of
-the model that move little else. Given are the root mean square over the skin of the true change, of the error of the
-change that was found (both in the mean pose), how much of the true change was found (1 is all), and the mean distance
-of the whole moving skin from the true one (mm).
+For every bump: `amplitude` and `phase` (degrees) of what soft tissue moves its skin at that frequency against the
+truth, by complex regression; `with_pose` is the amplitude of the whole skin, which the pose moves too. `spacing` is how
+far apart markers are there: 2.6 times the mean distance of the region (weight above a half) from its nearest marker, as
+on a square grid. Also the distance of the whole skin from the true one, with fixed shape and with soft tissue, and the
+root mean square of what soft tissue moves it (mm). 90 markers are the 67, and farthest points where the bumps are.
 """
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from protocols import machine, write_report
-from scipy.linalg import eigh
 
 from completion.energy import lifted
 from completion.mocap.files.markers import MarkerSequence, read_markers
@@ -29,79 +30,145 @@ from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
-from completion.mocap.soft_tissue.changing_body import changing_bodies
-from completion.mocap.soft_tissue.soft_tissue import SoftFollower, SoftTissueConfig, follow_soft_tissue
+from completion.mocap.soft_tissue.follow import follow_soft_tissue
+from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
+from scanprep.geometry.geodesics import SurfaceGraph
 
-OURS, POSES = SoftTissueConfig(), MoshConfig().poses
-PAPER = SoftTissueConfig.published()
-CHOICES = {"paper, fixed": replace(PAPER, change=1e8), "paper": PAPER, "fixed": replace(OURS, change=1e8), "ours": OURS,
-           "not smooth": replace(OURS, temporal_smoothness=0.0), "no skin": replace(OURS, skin=0.0)}
-GROUPS = 6
-NOISE = 0.001                        # metres
-
-
-def left_out(model: BodyModel, markers: MarkerSequence, motion: Motion, layout: MarkerLayout, config: SoftTissueConfig
-             ) -> dict[str, float]:
-    """Errors, mm, of markers that were used and of those left out."""
-    follower = SoftFollower(model, motion, markers, layout, config)
-    order = np.random.default_rng(1).permutation(len(follower.rows))
-    without, used = np.full(follower.targets.shape[:2], np.nan), np.nan
-    for group in range(GROUPS + 1):
-        mine, trusted = order[group::GROUPS] if group < GROUPS else order[:0], motion.trusted.copy()
-        trusted[:, follower.rows[mine]] = False
-        follower.motion = replace(motion, trusted=trusted)
-        x, z, _ = follower.solve()
-        off = np.linalg.norm(follower.body.positions(x, z) - follower.targets, axis=2)
-        off[~motion.trusted[:, follower.rows]] = np.nan
-        without[:, mine] = off[:, mine]
-        used = np.nanmean(off)
-    return {"used_mm": 1e3 * float(used), "left_out_mm": 1e3 * float(np.nanmean(without)),
-            "left_out_median_mm": 1e3 * float(np.nanmedian(without))}
+PLACES = {"waist": ("LBEL", "RBEL"), "chest": ("LPEC", "RPEC"), "thigh": ("LQUA", "RQUA"), "buttock": ("LGLU", "RGLU"),
+          "calf": ("LCAL", "RCAL")}
+FREQUENCIES = (2.0, 5.0, 10.0, 15.0)
+SIZE, NOISE, NEAR = 0.010, 0.001, 0.06                  # metres
+RADIUS = (0.06, 0.12)                                   # metres
+CLASSES = {"spacing below 12 cm": (0, 12), "12 to 16 cm": (12, 16), "above 16 cm": (16, np.inf)}
+SAMPLED = 8                                             # every so many vertices are the whole skin
 
 
-def swinging(model: BodyModel, slopes: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """The change of betas (K,) that moves the skin around a point by 1 m, root mean square, and the rest least."""
-    near = np.exp(-((model.template.vertices - centre)**2).sum(axis=1) / radius**2)
-    inside, outside = (np.einsum("n,ndk,ndl->kl", w, slopes, slopes) / len(w) for w in (near, 1 - near))
-    direction = eigh(inside, outside + 1e-8 * np.eye(len(inside)))[1][:, -1]
-    moved = ((slopes @ direction)**2).sum(axis=1)
-    return np.asarray(direction / np.sqrt((near * moved).sum() / near.sum()))
+@dataclass(frozen=True, eq=False)
+class Bump:
+    """A region of the skin that swings."""
+
+    region: str
+    weight: np.ndarray          # (N,)
+    radius: float               # metres
+    frequency: float            # hertz
+    phase: float                # radians
+
+    def swing(self, t: np.ndarray) -> np.ndarray:
+        return SIZE * np.sin(2 * np.pi * self.frequency * t + self.phase)
+
+    def regression(self, moved: np.ndarray, normals: np.ndarray, t: np.ndarray) -> complex:
+        """What skin that moves (T, n, 3) has of the swing: 1 is all of it, in phase."""
+        w = self.weight[::SAMPLED]
+        along = np.einsum("n,tnd,tnd->t", w, moved, normals) / (w**2).sum()
+        turn = 2 * np.pi * self.frequency * t
+        sine, cosine, *_ = np.linalg.lstsq(np.stack([np.sin(turn), np.cos(turn), np.ones(len(t)), t], 1), along,
+                                           rcond=None)[0]
+        return complex(sine, cosine) / (SIZE * np.exp(1j * self.phase))
 
 
-def simulated(model: BodyModel, motion: Motion, layout: MarkerLayout, rng: np.random.Generator
-              ) -> list[dict[str, object]]:
-    """The rows of every case and choice."""
-    t, slopes = motion.times, model.shape_jacobian(model.pose_mean)
-    places = dict(zip(layout.labels, layout.place(model.template), strict=True))
-    chest, thigh = (swinging(model, slopes, places[label], 0.11) for label in ("STRN", "RTHI"))
-    cases = {"still": np.zeros((len(t), model.n_betas)), "breath": np.outer(0.008 * np.sin(1.2 * np.pi * t), chest),
-             "shake": np.outer(0.010 * np.sin(8 * np.pi * t), thigh) + np.outer(0.006 * np.cos(6 * np.pi * t), chest)}
-    own = np.pad(rng.normal(0, 0.7, min(40, model.n_betas)), (0, max(0, model.n_betas - 40)))
-    ids, weights = supports(model.template, layout)
-    rows: list[dict[str, object]] = []
-    for name, change in cases.items():
-        truth = changing_bodies(model, motion.poses, own + change, motion.trans)
-        markers = lifted(np.einsum("lk,tlkd->tld", weights, truth[:, ids]), np.asarray(layout.distances))
-        seen = MarkerSequence(markers + rng.normal(0, NOISE, markers.shape), layout.labels, motion.rate)
-        start = animate(model.subject(own), seen, layout, POSES)
-        for choice, config in CHOICES.items():
-            soft = follow_soft_tissue(model, start, seen, layout, config)
-            found = np.pad(soft.changes, ((0, 0), (0, model.n_betas - soft.changes.shape[1])))
-            true, error = (np.einsum("tk,ndk->tnd", c, slopes) for c in (change, found - change))
-            off = np.linalg.norm(soft.vertices(model) - truth, axis=2)
-            rows.append({"case": name, "choice": choice, "true_rms_mm": _rms(true), "error_rms_mm": _rms(error),
-                         "found_share": float(((error + true) * true).sum() / max((true**2).sum(), 1e-12)),
-                         "skin_mean_mm": 1e3 * float(off.mean())})
-            print(rows[-1], flush=True)
-    return rows
+class Scene:
+    """A person in motion, and bumps for each run."""
+
+    def __init__(self, model: BodyModel, motion: Motion) -> None:
+        self.model, self.motion, self.graph = model, motion, SurfaceGraph(model.template)
+        self.subject = model.subject(motion.betas)
+        self.skin = motion.vertices(self.subject)
+        self.normals = np.array([model.template.with_vertices(v).vertex_normals for v in self.skin])
+        self.marks = named_layout("mosh67", model.template)
+        D = model.shape_jacobian(model.pose_mean)
+        self.area = np.sqrt(model.template.vertex_areas)
+        self.betas = np.linalg.qr((self.area[:, None, None] * D).reshape(-1, D.shape[-1]))[0]
+        self.at_rest = model.template.with_vertices(model.vertices(model.pose_mean, motion.betas)).vertex_normals
+
+    def vertex(self, label: str) -> int:
+        return int(self.marks.nearest[self.marks.labels.index(label)])
+
+    def bumps(self, run: int) -> list[Bump]:
+        """The same for every layout."""
+        rng, out = np.random.default_rng(run), []
+        for i, (region, labels) in enumerate(PLACES.items()):
+            for side, label in enumerate(labels):
+                near = np.flatnonzero(self.graph.distances(self.vertex(label), limit=NEAR) < NEAR)
+                radius = rng.uniform(*RADIUS)
+                far = self.graph.distances(int(rng.choice(near)), limit=4 * radius)
+                out.append(Bump(region, np.exp(-(far / radius)**2), radius,
+                                FREQUENCIES[(i + run + 2 * side) % len(FREQUENCIES)], rng.uniform(0, 2 * np.pi)))
+        return out
+
+    def moved(self, bumps: list[Bump]) -> np.ndarray:
+        """The true skin (T, N, 3)."""
+        out = self.skin.copy()
+        for bump in bumps:
+            some = np.flatnonzero(bump.weight)
+            out[:, some] += bump.swing(self.motion.times)[:, None, None] * (
+                bump.weight[some, None] * self.normals[:, some])
+        return out
+
+    def betas_share(self, bump: Bump) -> float:
+        """What share of the energy of a bump the best change of betas has."""
+        wanted = (self.area[:, None] * bump.weight[:, None] * self.at_rest).ravel()
+        return float(((self.betas.T @ wanted)**2).sum() / (wanted**2).sum())
+
+    def spacing(self, bump: Bump, layout: MarkerLayout) -> float:
+        """How far apart the markers are at a bump, centimetres."""
+        nearest, _ = self.graph.nearest(layout.nearest)
+        return 100 * float(nearest[bump.weight > 0.5].mean()) / 0.383
+
+    def layouts(self) -> dict[int, MarkerLayout]:
+        """By their number of markers."""
+        soft = np.flatnonzero(self.graph.nearest(np.array([self.vertex(label) for labels in PLACES.values()
+                                                           for label in labels]))[0] < 2 * NEAR)
+        chosen = list(self.marks.nearest)
+        while len(chosen) < 90:
+            chosen.append(int(soft[np.argmax(self.graph.nearest(np.array(chosen))[0][soft])]))
+        more = np.array(chosen[len(self.marks.labels):])
+        dense = self.marks.joined(MarkerLayout(tuple(f"M{i}" for i in range(len(more))), more))
+        return {41: named_layout("cmu41", self.model.template), 67: self.marks, 90: dense}
+
+    def found(self, truth: np.ndarray, layout: MarkerLayout, seed: int) -> tuple[Motion, SoftTissue]:
+        """The motion of fixed shape and that with soft tissue, from the markers of a true skin."""
+        ids, weights = supports(self.model.template, layout)
+        places = lifted(np.einsum("lk,tlkd->tld", weights, truth[:, ids]), np.asarray(layout.distances))
+        noise = np.random.default_rng(seed).normal(0, NOISE, places.shape)
+        markers = MarkerSequence(places + noise, layout.labels, self.motion.rate)
+        fixed = animate(self.subject, markers, layout, MoshConfig().poses)
+        return fixed, follow_soft_tissue(self.model, fixed, markers, layout)
 
 
-def _rms(moved: np.ndarray) -> float:
-    return 1e3 * float(np.sqrt((moved**2).sum(axis=2).mean()))
+def run(scene: Scene, layout: MarkerLayout, bumps: list[Bump], seed: int) -> tuple[list[dict], dict[str, float]]:
+    """A row for each bump, and what the whole skin is off."""
+    truth = scene.moved(bumps)
+    motion, soft = scene.found(truth, layout, seed)
+    some = slice(None, None, SAMPLED)
+    poses, trans = soft.motion.poses, soft.motion.trans
+    fixed, own = (scene.subject.vertices(*at)[:, some] for at in ((motion.poses, motion.trans), (poses, trans)))
+    alone = soft.skin.at(soft.skin.modes[some], poses)
+    rows = []
+    for bump in bumps:
+        share, whole = (bump.regression(moved, scene.normals[:, some], motion.times)
+                        for moved in (alone, own + alone - scene.skin[:, some]))
+        rows.append({"region": bump.region, "radius_cm": 100 * bump.radius, "frequency": bump.frequency,
+                     "spacing_cm": scene.spacing(bump, layout), "amplitude": abs(share),
+                     "phase_deg": float(np.degrees(np.angle(share))), "with_pose": abs(whole),
+                     "betas_share": scene.betas_share(bump)})
+    off = {"fixed_mm": fixed, "soft_mm": own + alone}
+    return rows, {**{name: 1e3 * float(np.linalg.norm(skin - truth[:, some], axis=2).mean())
+                     for name, skin in off.items()}, "moved_rms_mm": 1e3 * float(np.sqrt((alone**2).sum(2).mean()))}
+
+
+def summary(markers: int, where: str, rows: list[dict]) -> dict[str, object]:
+    """The means of some bumps."""
+    amplitude = np.array([row["amplitude"] for row in rows])
+    at = {f"{f:g} Hz": float(np.mean(mine)) for f in FREQUENCIES
+          if len(mine := [r["amplitude"] for r in rows if r["frequency"] == f])}
+    return {"markers": markers, "where": where, "bumps": len(rows), "amplitude": float(amplitude.mean()), **at,
+            "least": float(amplitude.min()), "with_pose": float(np.mean([r["with_pose"] for r in rows])),
+            "phase_deg": float(np.mean([abs(r["phase_deg"]) for r in rows])),
+            "betas_share": float(np.mean([r["betas_share"] for r in rows]))}
 
 
 def main() -> None:
@@ -110,28 +177,41 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("-m", "--model", required=True)
     parser.add_argument("-o", "--output", default="mosh_soft.json")
-    parser.add_argument("--layout", default="cmu41")
-    parser.add_argument("--frames", type=int, default=150, help="of each file, from its middle")
-    parser.add_argument("--files", nargs="*", help="stems; all of the folder when not given")
+    parser.add_argument("--file", default="02_05", help="stem of the recording")
+    parser.add_argument("--frames", type=int, default=240, help="from its middle")
+    parser.add_argument("--runs", type=int, default=len(FREQUENCIES))
     args = parser.parse_args()
-    model = load_model(args.model)
-    layout, rows, simulation = named_layout(args.layout, model.template), [], None
-    for path in sorted(args.folder.glob("*.c3d")):
-        if args.files and path.stem not in args.files:
-            continue
-        whole = read_markers(path)
-        first = max(0, (len(whole.positions) - args.frames) // 2)
-        markers = whole.frames(slice(first, first + args.frames))
-        person = find_person(model, whole, layout)
-        motion = animate(model.subject(person.betas), markers, person.layout, POSES)
-        if simulation is None:
-            simulation = simulated(model, motion, layout, np.random.default_rng(0))
-        for choice, config in CHOICES.items():
-            rows.append({"file": path.name, "choice": choice,
-                         **left_out(model, markers, motion, person.layout, config)})
-            print(rows[-1], flush=True)
-    write_report(args.output, {"protocol": "soft tissue: left-out markers and simulated change", "machine": machine(),
-                               "left_out": rows, "simulated": simulation})
+    model, whole = load_model(args.model), read_markers(args.folder / f"{args.file}.c3d")
+    layout = named_layout("cmu41", model.template)
+    first = max(0, (len(whole.positions) - args.frames) // 2)
+    person = find_person(model, whole, layout)
+    scene = Scene(model, animate(model.subject(person.betas), whole.frames(slice(first, first + args.frames)),
+                                 person.layout, MoshConfig().poses))
+    rows: list[dict] = []
+    details: list[dict] = []
+    for count, layout in scene.layouts().items():
+        bumps: list[dict] = []
+        skins = []
+        for i in range(args.runs):
+            found, skin = run(scene, layout, scene.bumps(i), i)
+            bumps += found
+            skins.append(skin)
+        for where, (low, high) in CLASSES.items():
+            mine = [row for row in bumps if low <= row["spacing_cm"] < high]
+            rows += [summary(count, where, mine)] if mine else []
+        for region in PLACES:
+            mine = [row for row in bumps if row["region"] == region and row["spacing_cm"] < 12]
+            rows += [summary(count, f"{region}, below 12 cm", mine)] if mine else []
+        rows.append({"markers": count, "where": "whole skin",
+                     **{name: float(np.mean([skin[name] for skin in skins])) for name in skins[0]}})
+        rows.append({"markers": count, "where": "whole skin, still", **run(scene, layout, [], 0)[1]})
+        details += [{"markers": count, **row} for row in bumps]
+        for row in rows:
+            if row["markers"] == count:
+                print("  ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{value}"
+                                for name, value in row.items()), flush=True)
+    write_report(args.output, {"protocol": f"swinging skin on the motion of {args.file}, {args.frames} frames",
+                               "machine": machine(), "rows": rows, "bumps": details})
 
 
 if __name__ == "__main__":

@@ -24,15 +24,17 @@ def people(report: dict) -> str:
 
 def recordings(report: dict) -> str:
     """Observed and held-out markers of real files."""
+    names = ("held_out_mm", "soft_held_out_mm", "calibrated_mm", "soft_calibrated_mm")
     rows: Rows = [(f["file"], f["frames"], f["observed_mm"], f.get("soft_observed_mm", ""), f["p95_mm"],
-                   f["worst_frame_mm"], f["held_out_mm"], f["held_out_steady_mm"],
+                   f["worst_frame_mm"], *(f.get(name, "") for name in names),
                    ", ".join(f"{label} {far:.0f}" for label, far in f["each_mm"].items()), f["beta_rms"])
                   for f in report["files"]]
     mean = {name: both["of_files"] for name, both in report["mean"].items()}
-    rows.append(("mean", "", mean["observed_mm"], mean.get("soft_observed_mm", ""), "", "", mean["held_out_mm"],
-                 mean["held_out_steady_mm"], "", ""))
+    rows.append(("mean", "", mean["observed_mm"], mean.get("soft_observed_mm", ""), "", "",
+                 *(mean.get(name, "") for name in names), "", ""))
     return table(("file", "frames", "markers, fixed shape (mm)", "with soft tissue (mm)", "p95 (mm)",
-                  "worst frame (mm)", "held out (mm)", "held out, what varies (mm)", "each (mm)", "betas (RMS)"), rows)
+                  "worst frame (mm)", "held out, plain (mm)", "the same, soft tissue", "calibrated (mm)",
+                  "the same, soft tissue", "each, plain (mm)", "betas (RMS)"), rows)
 
 
 def speed(report: dict) -> str:

@@ -64,7 +64,7 @@ def take_pane(take: Take) -> Pane:
     frames, _ = played(take.shown)
     dots = [(Dots(at[0], color, 0.013, name=name, labels=take.markers.labels), at[frames])
             for name, (color, at) in kinds_of_markers(take).items()]
-    return moving_pane(take.shown, take.subject, dots, take.quick, take.light)
+    return moving_pane(take.shown, take.subject, dots, take.make, take.light)
 
 
 def frame_panes(take: Take, frames: np.ndarray) -> list[Pane]:

@@ -78,7 +78,7 @@ def _worn_section(page: Page, result: MoshResult) -> None:
 
 def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Page:
     """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
-    frames = take.keys[spread_frames(len(take.keys), SOME)]
+    frames = spread_frames(len(take.shown.poses), SOME)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
     page.table(rows(_main(metrics)))
     page.section("The whole sequence").bodies(

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
@@ -11,19 +10,14 @@ from model.body import BodyModel
 from model.linear import Subject
 
 from ...energy import lifted
-from ...motion import Motion, spread_frames
+from ...motion import Motion
 from ...motion_pictures import LightMesh
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
-from ..files.motion_files import MEASURED
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from ..soft_tissue.soft_tissue import SoftTissue
-from .quick_bodies import QuickBodies
 from .recordings import Recording
-
-AT_ONCE = 128                        # frames whose changes are held at a time
-KEYS = 100                           # frames of soft tissue whose bodies are exact in files and pictures that move
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,24 +66,10 @@ class Take:
             self._kept.update(zip(new.tolist(), self.make(new).astype(np.float32), strict=True))
         return np.stack([self._kept[int(t)] for t in frames]).astype(float)
 
-    @cached_property
-    def keys(self) -> np.ndarray:
-        """Frames (k,) in order, spread over the sequence; those in which a GLB is measured are among them."""
-        return np.union1d(*(spread_frames(len(self.motion.poses), count) for count in (KEYS, MEASURED)))
-
-    @cached_property
-    def _quick(self) -> QuickBodies | None:
-        return None if self.soft is None else QuickBodies.of(
-            self.model, self.subject, self.soft, np.arange(self.subject.n_vertices), self.keys, self.bodies(self.keys))
-
-    def quick(self, frames: np.ndarray) -> np.ndarray:
-        """As `make`, and exact in `keys`: in between, soft tissue is as of `QuickBodies`."""
-        return self.make(frames) if self._quick is None else self._quick.vertices(frames)
-
     def make(self, frames: np.ndarray) -> np.ndarray:
         """As `bodies`, which are not kept."""
         return self.motion.vertices(self.subject, frames) if self.soft is None else \
-            self.soft.vertices(self.model, frames)
+            self.soft.on(self.subject, frames)
 
     def rigid(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
         """The meshes (n, N, 3) of the same poses with the person's own shape."""
@@ -108,15 +88,8 @@ def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], mark
     ids, weights = supports(model.template, places)
     lift, seen = np.asarray(places.distances), markers.select(names).positions
     assert motion.betas is not None, "a person of a shape space"
-    K = len(motion.betas) if soft is None else max(len(motion.betas), soft.changes.shape[1])
-    shaped = model.points(ids, weights, K)
-    points = shaped.operator(motion.betas)
-    fixed = lifted(points.evaluate(motion.poses, motion.trans), lift)
+    points = model.points(ids, weights, len(motion.betas)).operator(motion.betas)
+    fixed = np.linalg.norm(lifted(points.evaluate(motion.poses, motion.trans), lift) - seen, axis=2)
     if soft is None:
-        return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), None)
-    moving = points.evaluate(soft.motion.poses, soft.motion.trans)
-    changes = np.pad(soft.changes, ((0, 0), (0, K - soft.changes.shape[1])))
-    for start in range(0, len(moving), AT_ONCE):
-        some = slice(start, start + AT_ONCE)
-        moving[some] += np.einsum("tk,tldk->tld", changes[some], shaped.shape_jacobian(soft.motion.poses[some]))
-    return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), np.linalg.norm(lifted(moving, lift) - seen, axis=2))
+        return HeldOut(names, fixed, None)
+    return HeldOut(names, fixed, np.linalg.norm(lifted(soft.points(model, ids, weights), lift) - seen, axis=2))

@@ -210,13 +210,13 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
     """
     motion, body, soft = take.motion, take.subject, take.soft
     write_motion(folder, motion, body, take.artefacts.virtual())
-    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.quick)
+    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
             told += write_glb(folder / "exaggerated.glb", soft.motion, body,
-                              partial(soft.vertices, take.model, factor=factor))
+                              partial(soft.on, body, factor=factor))
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
                   take.source.who, take.unit,

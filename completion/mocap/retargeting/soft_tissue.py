@@ -30,8 +30,8 @@ SOLES = 60                           # points that may touch the ground
 def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyModel, factor: float = 1.0) -> SoftTissue:
     """The motion and the soft tissue of a person on a character.
 
-    Joints turn as they did and betas change as they did, around the character instead of the person. The way over the
-    ground is as long as the character's legs are, and it reaches the ground when the person does (see `retarget`).
+    Joints turn as they did, and the skin moves as far as it did, on the character instead of the person. The way over
+    the ground is as long as the character's legs are, and it reaches the ground when the person does (see `retarget`).
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyMode
     Returns
     -------
     SoftTissue
-        Of the character model: the character's own betas are zero, the factor is in the changes.
+        Of the character model: the character's own betas are zero, the factor is in the soft tissue.
 
     Raises
     ------
@@ -61,18 +61,14 @@ def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyMode
         raise ValueError(f"character: expected a model with the {K} betas that change, got {character.n_betas}")
     target = character.subject(np.zeros(K))
     motion = retarget(soft.motion, model.subject(soft.motion.betas), target)
-    changes = factor * soft.changes
+    moving = replace(soft.times(factor), motion=motion)
     up, sign = world_up(motion, target)
     soles = _soles(target, motion.poses, up, sign)
-    points = character.points(soles, n_betas=K)
     trans = motion.trans.copy()
-    for start in range(0, len(trans), AT_ONCE):
-        some = slice(start, start + AT_ONCE)
-        fixed = points.operator(np.zeros(K)).evaluate(motion.poses[some])[..., up]
-        slopes = points.shape_jacobian(motion.poses[some])[..., up, :]
-        changed = fixed + np.einsum("tlk,tk->tl", slopes, changes[some])
-        trans[some, up] += sign * ((sign * fixed).min(axis=1) - (sign * changed).min(axis=1))
-    return SoftTissue(replace(motion, trans=trans), changes)
+    fixed, changed = (sign * each.points(character, soles[:, None], np.ones((len(soles), 1)))[..., up]
+                      for each in (moving.times(0.0), moving))
+    trans[:, up] += sign * (fixed.min(axis=1) - changed.min(axis=1))
+    return replace(moving, motion=replace(motion, trans=trans))
 
 
 def _soles(subject: Subject, poses: np.ndarray, up: int, sign: float) -> np.ndarray:
@@ -125,9 +121,7 @@ def _products(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 
 def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The meshes (n, N, 3), metres, of some frames (n,) without and with soft tissue."""
-    poses, trans = soft.motion.poses[frames], soft.motion.trans[frames]
-    fixed = soft.motion.vertices(character.subject(soft.motion.betas), frames)
-    return fixed, character.vertices(poses, soft.betas()[frames], trans)
+    return soft.motion.vertices(character.subject(soft.motion.betas), frames), soft.vertices(character, frames)
 
 
 FULL = 0.2                           # deformation at the end of the heat map
