@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -325,7 +325,8 @@ class GraphFit:
             now = terms(self.graph, at, wanted, stiffness)
 
             def assemble() -> tuple[np.ndarray, csc_array]:
-                blocks, half = (sum(parts) for parts in zip(*(t.normal(pattern) for t in now.values()), strict=True))
+                normals = (term.normal(pattern) for term in now.values())
+                blocks, half = (reduce(np.add, parts) for parts in zip(*normals, strict=True))
                 if not stiffness.growth:
                     blocks[:, 3], blocks[:, :, 3], half[:, 3] = 0, 0, 0               # the log-scale
                 return half.reshape(-1), pattern.matrix(blocks)
