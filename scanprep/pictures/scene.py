@@ -82,7 +82,7 @@ def small_scene(panes: Sequence[Pane]) -> bytes:
 
 def worst_that_turn(paths: Sequence[Path]) -> list[bytes | None]:
     """The packed scenes of files, worst first, of as many as a page can carry; None where there is none, or no room."""
-    return carried(paths[:MOST_TURN], MOST_BYTES) + [None] * len(paths[MOST_TURN:])
+    return [*carried(paths[:MOST_TURN], MOST_BYTES), *(None for _ in paths[MOST_TURN:])]
 
 
 def carried(paths: Iterable[Path], room: int) -> list[bytes | None]:

@@ -3,10 +3,10 @@
     SCAPEKIT_DATA=... python tests/benchmarks/folder.py FOLDER [--scans 20] [--workers 1 2] [--different 4]
         [--json FILE]
 
-Ten landmarks a scan, template mesh000, no skeleton; scans of some 100,000 triangles. With `--different` there are only
+Ten landmarks a scan, template mesh000, every scan a person, so no skeleton; some 100,000 triangles. With `--different` there are only
 so many scans, each several times under other names, and registered each time: thus a folder of a thousand needs no
-thousand scans. Memory is the largest that was resident, of the process that was started and of any of its workers. Run it with
-nothing else on the machine. Linux only.
+thousand scans. Memory is the largest that was resident, of the process that was started and of any of its workers. Run
+it with nothing else on the machine. Linux only.
 """
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def measured(folder: Path, count: int, triangles: int, workers: int) -> Run:
     shutil.rmtree(output, ignore_errors=True)
     start = time.perf_counter()
     child = subprocess.Popen([sys.executable, "-m", "completion", "prep", "run", str(repeated(folder, count)),
-                              "--template", str(folder / "template.ply"), "-o", str(output), "--workers", str(workers),
-                              "--min-poses", "100000"], stdout=subprocess.DEVNULL)
+                              "--template", str(folder / "template.ply"), "-o", str(output), "--workers", str(workers)],
+                             stdout=subprocess.DEVNULL)
     most: dict[int, float] = {}
     while os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
         for pid in (child.pid, *descendants(child.pid)):
