@@ -3,10 +3,10 @@
     SCAPEKIT_DATA=... python tests/benchmarks/folder.py FOLDER [--scans 20] [--workers 1 2] [--different 4]
         [--json FILE]
 
-Ten landmarks a scan, template mesh000, every scan a person, so no skeleton; some 100,000 triangles. With `--different` there are only
-so many scans, each several times under other names, and registered each time: thus a folder of a thousand needs no
-thousand scans. Memory is the largest that was resident, of the process that was started and of any of its workers. Run
-it with nothing else on the machine. Linux only.
+Ten landmarks a scan, template mesh000, every scan a person of its own, so no skeleton; some 100,000 triangles. With
+`--different` there are only so many scans, each several times under other names, and registered each time: thus a
+folder of a thousand needs no thousand scans. Memory is the largest that was resident, of the process that was started
+and of any of its workers. Run it with nothing else on the machine. Linux only.
 """
 from __future__ import annotations
 
