@@ -1,7 +1,7 @@
 """A folder of virtual scans through `scape prep run`: time, processor and memory by the number of scans and workers.
 
     SCAPEKIT_DATA=... python tests/benchmarks/folder.py FOLDER [--scans 20] [--workers 1 2] [--different 4]
-        [--json FILE]
+        [-o FILE]
 
 Ten landmarks a scan, template mesh000, every scan a person of its own, so no skeleton; some 100,000 triangles. With
 `--different` there are only so many scans, each several times under other names, and registered each time: thus a
@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, nargs="*", default=[20], help="in the folder, one run for each number")
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--different", type=int, default=20, help="how many different ones there are, at most 20")
-    parser.add_argument("--json", help="write all figures here")
+    parser.add_argument("-o", "--output", help="write all figures here")
     asked = parser.parse_args()
     triangles = write_scans(asked.folder, (*HELD_POSES, *TUNING_POSES)[:min(asked.different, max(asked.scans))])
     runs = []
@@ -129,8 +129,8 @@ def main() -> None:
         for count in asked.scans:
             runs.append(measured(asked.folder, count, triangles, workers))
             print(" ".join(f"{key}={value:.4g}" for key, value in runs[-1]._asdict().items()), flush=True)
-    if asked.json:
-        write_report(asked.json, {"protocol": "scape prep run over folders", "machine": machine(),
+    if asked.output:
+        write_report(asked.output, {"protocol": "scape prep run over folders", "machine": machine(),
                                   "rows": [run._asdict() for run in runs]})
 
 
