@@ -112,6 +112,17 @@ def test_projection_gives_the_nearest_rotation_and_never_a_reflection():
     np.testing.assert_allclose(rotations.project(R), R, atol=1e-12)
 
 
+def test_many_projections_are_those_of_each_alone():
+    """Reflections, singular matrices and nothing at all are among them."""
+    rng = np.random.default_rng(2)
+    M = rng.normal(size=(3, 200, 3, 3)) * np.geomspace(1e-6, 1e6, 200)[:, None, None]
+    M[1] = rotations.exp(rng.normal(size=(200, 3))) + 0.1 * rng.normal(size=(200, 3, 3))
+    M[2, :3] = np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), np.diag([1.0, 1.0, -1.0])
+    every = rotations.project(M)
+    alone = np.stack([rotations.project(m[None])[0] for m in M.reshape(-1, 3, 3)]).reshape(M.shape)
+    np.testing.assert_allclose(every, alone, atol=1e-9)
+
+
 def test_mean_of_rotations_about_one_axis_is_the_middle():
     R = rotations.exp(np.outer([0.1, 0.3, 0.5], [0, 1, 0]))
     np.testing.assert_allclose(rotations.log(rotations.mean(R)), [0, 0.3, 0], atol=1e-12)

@@ -87,6 +87,16 @@ def test_size_is_sane(folder):
     assert 1000 < max(strips) < 20_000 and len(strips) == len(scenes) and max(scenes) < 200_000
 
 
+def test_a_long_page_leaves_pictures_in_the_folder(folder, monkeypatch):
+    """Those of the worst scans are in it, the others come when they are scrolled to."""
+    worst = (folder / "pictures" / "body3.webp").stat().st_size
+    monkeypatch.setattr(pictures, "MOST_CARRIED", worst + 10)
+    page = write_set_page(folder, to=folder.parent).read_text()
+    linked = re.findall(r'<img src="(pictures/[^"]+)"[^>]* loading="lazy"', page)
+    assert len(linked) == 3 and "pictures/body3.webp" not in linked and "data:image/webp" in page
+    assert all((folder / path).is_file() for path in linked)
+
+
 def test_a_set_of_an_earlier_version_has_no_scenes(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "set")
     for path in (tmp_path / "set" / "pictures").glob("*.scene"):

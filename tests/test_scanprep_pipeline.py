@@ -26,6 +26,7 @@ from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import RegisterScan, prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
+from scanprep.registration.limbs import Doubt
 
 
 @pytest.fixture(scope="module")
@@ -70,10 +71,14 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
         given.append((parts, len(landmarks[0]), config, correspondences))
         return dataclasses.replace(fit, rolled=parts is person)
 
+    told = (Doubt(1.5, "the head is rolled by 90 degrees against the chest"),)
     monkeypatch.setattr(one_scan, "repaired", repaired)
+    monkeypatch.setattr(one_scan, "limb_doubts", lambda body, parts, vertices: told)
     task = find_scans(scans)[0]
-    assert one_scan.register_scan(task, template, MARKS, QUICK.scan, person).figures.rolled
-    assert not one_scan.register_scan(task, template, MARKS, QUICK.scan).figures.rolled
+    found = one_scan.register_scan(task, template, MARKS, QUICK.scan, person).figures
+    assert found.rolled and found.doubts == told
+    animal = one_scan.register_scan(task, template, MARKS, QUICK.scan).figures
+    assert not animal.rolled and animal.doubts == ()
     assert given == [(who, len(MARKS), QUICK.scan.registration, None) for who in (person, None)]
 
 
@@ -106,6 +111,7 @@ def test_registers_all(scans, template, tmp_path):
     assert calls[0] == (0, 3) and calls[-1] == (3, 3)
     assert all(f.distance < 0.001 and f.seen > 0.6 and f.missed < 0.01 for f in done.figures)
     assert {f.init for f in done.figures} == {"5 landmarks"}
+    assert not (tmp_path / "set" / "limbs.csv").exists()                 # the template is no person
     again = RegisteredSet.load(tmp_path / "set")
     assert again.subjects == ("anna", "ben") and len(again.poses()) == 2
     assert json.loads((tmp_path / "set" / "landmarks.json").read_text()) == MARKS

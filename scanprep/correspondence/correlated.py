@@ -12,6 +12,7 @@ Seeds that nobody gave are the ends of the limbs, matched by the ways between th
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -22,7 +23,7 @@ from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences, checked_pairs
-from .search import BeliefLevel, CorrelatedConfig, result, search, surfaces_of
+from .search import BeliefLevel, CorrelatedConfig, Seeds, result, search, surfaces_of
 from .sheet import Sheet
 
 # Of the trial of a hypothesis: fewer points, and one coarse level
@@ -62,10 +63,12 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
     if seeds is None:
         found = find_seeds(template, scan)
         seeds = (found.template_vertices, found.scan_points)
-    seeds = checked_pairs(template, *seeds, "seeds")
+    vertices, places = checked_pairs(template, *seeds, "seeds")
     total = 2 + 2 * len(config.levels)
     sheet = Sheet(target_of(scan), config.spacing * float(np.sqrt(template.face_areas.sum())))
-    surfaces, images = surfaces_of(template, sheet, SurfaceGraph(template), seeds, config), None
+    points = sheet.at(places)
+    known = Seeds(vertices, places, points, _surface(template).distances(vertices), sheet.distances(points))
+    surfaces, images = surfaces_of(template, sheet, known, config), None
     tell(2, total)
     for number, level in enumerate(config.levels):
         surfaces, images = search(surfaces, images, level, config)
@@ -86,20 +89,20 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypothese
     """
     check_template(template)
     size = float(np.sqrt(template.face_areas.sum()))
-    surface = SurfaceGraph(template)
-    own, ways = _ends(template.vertices, surface.distances, ends, APART * size)
+    own, ways = _template_ends(template, ends, APART * size)
     if len(own) < 3:
         raise ValueError(f"template: expected at least three limbs, found {len(own)} ends")
     sheet = Sheet(target_of(scan), TRIAL.spacing * size)
     seen, seen_ways = _ends(sheet.points, sheet.distances, ends + 2, APART * size)
     if len(seen) < 3:
         raise ValueError(f"scan: expected at least three ends of limbs, found {len(seen)}")
-    matches = matched_ends(ways, seen_ways, hypotheses)
+    matches = matched_ends(ways[:, own], seen_ways[:, seen], hypotheses)
     trials = []
     for image in matches:
         there = image >= 0
-        pairs = own[there], sheet.points[seen[image[there]]]
-        surfaces, images = search(surfaces_of(template, sheet, surface, pairs, TRIAL), None, TRIAL.levels[0], TRIAL)
+        at = image[there]
+        seeds = Seeds(own[there], sheet.points[seen[at]], seen[at], ways[there], seen_ways[at])
+        surfaces, images = search(surfaces_of(template, sheet, seeds, TRIAL), None, TRIAL.levels[0], TRIAL)
         trials.append(images.energy / len(surfaces.scan) + 2.0 * float((~there).sum()))
     order = np.argsort(trials)
     best = matches[order[0]]
@@ -110,9 +113,20 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypothese
                            "ends of limbs", energies, bool(margin > 0.2))
 
 
+@lru_cache(maxsize=4)                # a folder of scans shares one template
+def _surface(template: Mesh) -> SurfaceGraph:
+    return SurfaceGraph(template)
+
+
+@lru_cache(maxsize=4)
+def _template_ends(template: Mesh, count: int, apart: float) -> tuple[np.ndarray, np.ndarray]:
+    """The ends of a template, and the ways from them to all of its vertices."""
+    return _ends(template.vertices, _surface(template).distances, count, apart)
+
+
 def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], count: int, apart: float
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Places farther from the rest than all around them, most pronounced first, and the ways between them."""
+    """Places (E,) farther from the rest than all around them, most pronounced first, and the ways (E, n) to all."""
     sample = farthest_points(points, 64)
     ways = distances(sample)
     there = np.isfinite(ways)
@@ -128,7 +142,7 @@ def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], cou
             chosen.append(top)
         todo = np.where(near, -1.0, todo)
     ends = np.array(chosen, dtype=np.int64)
-    return ends, distances(ends)[:, ends] if len(ends) else np.zeros((0, 0))
+    return ends, distances(ends) if len(ends) else np.zeros((0, len(points)))
 
 
 def matched_ends(template: np.ndarray, scan: np.ndarray, count: int) -> list[np.ndarray]:

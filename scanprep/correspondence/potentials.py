@@ -128,8 +128,10 @@ def edge_energy(scan: Places, template: Places, edges: np.ndarray, domains: np.n
         energy += 0.5 * robust((lean_l - at_j[e]) / 0.25, 3.0)
         energy += 0.5 * robust((n[k] @ n[l].T - bend[e]) / 0.375, 3.0)
         w = np.where(np.isfinite(nearer[e]), np.minimum(scan.sure[i], scan.sure[j]), 0.0)
-        for s in np.flatnonzero(w):
-            r = (d[l, s][None] - d[k, s][:, None] - nearer[e, s]) / (0.3 * length[e])
-            energy += w[s] / w.sum() * robust(r, 2.0)
+        if w.any():
+            seen = np.flatnonzero(w)
+            at_k, at_l = d[k][:, seen].T[:, :, None], d[l][:, seen].T[:, None]
+            r = (at_l - at_k - nearer[e, seen].astype(np.float32)[:, None, None]) / np.float32(0.3 * length[e])
+            energy += np.tensordot((w[seen] / w.sum()).astype(np.float32), robust(r, 2.0), 1)
         out[e] = energy
     return out

@@ -9,7 +9,6 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
 from ..geometry.farthest_points import farthest_points
-from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
 from ..ranges import Cell, Count, Settings
 from .belief_propagation import Beliefs, PairField, propagate
@@ -121,23 +120,35 @@ def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Corr
                            "correlated", energies, images.beliefs.converged)
 
 
-def surfaces_of(template: Mesh, sheet: Sheet, surface: SurfaceGraph, seeds: tuple[np.ndarray, np.ndarray],
-                config: CorrelatedConfig) -> Surfaces:
-    """Template and scan seen from seeds: vertices (S,) and where they are on the scan (S, 3)."""
+@dataclass(frozen=True, eq=False)
+class Seeds:
+    """Places known to belong together, and the ways from them (S, N) and (S, n), metres, to all of both surfaces.
+
+    Vertices (S,) of the template, places (S, 3) on the scan, and the points (S,) of the sheet nearest to these.
+    """
+
+    vertices: np.ndarray
+    places: np.ndarray
+    points: np.ndarray
+    on_template: np.ndarray
+    on_scan: np.ndarray
+
+
+def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedConfig) -> Surfaces:
+    """Template and scan seen from seeds."""
     size = float(np.sqrt(template.face_areas.sum()))
-    clicked = sheet.at(seeds[1])
-    on_scan, on_template = sheet.distances(clicked), surface.distances(seeds[0])
-    scale = _scale_between(on_template[:, seeds[0]], on_scan[:, clicked])
-    chosen = farthest_points(sheet.points, config.points)
-    off = np.linalg.norm(sheet.points[clicked] - seeds[1], axis=1)         # a click where there are no data
+    clicked, on_scan, on_template = seeds.points, seeds.on_scan, seeds.on_template
+    scale = _scale_between(on_template[:, seeds.vertices], on_scan[:, clicked])
+    chosen, edges = sheet.spread(config.points, 0.3 * size)
+    off = np.linalg.norm(sheet.points[clicked] - seeds.places, axis=1)     # a click where there are no data
     same = (sheet.piece[chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
     # a way that bridges a gap of the scan, or ends in one, is trusted less
     radius = 0.042 * size                                                  # over which directions are averaged
     scan = seen_from(sheet.points, sheet.normals, on_scan, chosen, radius, np.where(same, 1.0, 0.3))
     vertices = _spread_vertices(template, min(max(level.places for level in config.levels), len(template.vertices)))
     places = seen_from(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, radius,
-                       np.ones((len(vertices), len(seeds[0]))))
-    return Surfaces(size, scan, _neighbours(sheet, chosen, 0.3 * size), places, vertices, scale)
+                       np.ones((len(vertices), len(clicked))))
+    return Surfaces(size, scan, edges, places, vertices, scale)
 
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
@@ -154,15 +165,6 @@ def _scale_between(template: np.ndarray, scan: np.ndarray) -> float:
     far, near = template[a, b], scan[a, b]
     good = np.isfinite(far) & np.isfinite(near) & (far > 0) & (near > 0)
     return float(np.median(near[good] / far[good])) if good.any() else 1.0
-
-
-def _neighbours(sheet: Sheet, chosen: np.ndarray, limit: float) -> np.ndarray:
-    """Pairs (E, 2) of chosen points, each with the six nearest to it along the surface."""
-    between = sheet.distances(chosen, limit=limit)[:, chosen]
-    near = np.argsort(between, axis=1)[:, 1:7]
-    i, j = np.repeat(np.arange(len(chosen)), near.shape[1]), near.ravel()
-    linked = np.isfinite(between[i, j])
-    return np.unique(np.sort(np.stack([i[linked], j[linked]], axis=1), axis=1), axis=0)
 
 
 def _field(surfaces: Surfaces, domains: np.ndarray, unary: np.ndarray) -> PairField:

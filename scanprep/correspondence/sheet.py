@@ -6,7 +6,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from ..geometry.farthest_points import thin
+from ..geometry.farthest_points import farthest_points, thin
 from ..geometry.target import Target
 
 
@@ -33,6 +33,7 @@ class Sheet:
         _, self.piece = connected_components(self.surface, directed=False)
         self.graph = _joined(self.points, self.surface, self.piece)
         self.tree = cKDTree(self.points)
+        self._spread: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}
 
     def _edges(self) -> csr_array:
         reach = self.REACH * self.spacing
@@ -52,9 +53,27 @@ class Sheet:
         """(S, n) metres from points of the sheet (S,) to all; infinite where no way leads."""
         return dijkstra(self.graph, directed=False, indices=sources, limit=limit)
 
+    def spread(self, count: int, limit: float) -> tuple[np.ndarray, np.ndarray]:
+        """So many points (count,) far from each other, and pairs (E, 2) of them.
+
+        Each is in pairs with the six nearest to it along the surface, none farther than `limit` metres.
+        """
+        if (count, limit) not in self._spread:
+            chosen = farthest_points(self.points, count)
+            self._spread[count, limit] = chosen, _neighbours(self.distances(chosen, limit=limit)[:, chosen])
+        return self._spread[count, limit]
+
     def at(self, points: np.ndarray) -> np.ndarray:
         """The point of the sheet nearest to each of `points` (m, 3)."""
         return self.tree.query(points)[1]
+
+
+def _neighbours(between: np.ndarray) -> np.ndarray:
+    """Pairs (E, 2) of points with distances (n, n) between them, each with the six nearest to it."""
+    near = np.argsort(between, axis=1)[:, 1:7]
+    i, j = np.repeat(np.arange(len(between)), near.shape[1]), near.ravel()
+    linked = np.isfinite(between[i, j])
+    return np.unique(np.sort(np.stack([i[linked], j[linked]], axis=1), axis=1), axis=0)
 
 
 def _averaged(target: Target, keep: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,12 +11,12 @@ A step is added to the state, unless a `retract` says otherwise, as for rotation
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array
 
 from . import rotations, sparse
 
@@ -100,10 +100,14 @@ class Arrow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sparse:
-    """One problem with a sparse matrix (P, P); it and half the gradient (P,) are assembled when a step is wanted."""
+    """One problem with a sparse matrix (P, P); it and half the gradient (P,) are assembled when a step is wanted.
+
+    Which `terms` the energy is the sum of can be told.
+    """
 
     value: float
     assemble: Callable[[], tuple[np.ndarray, csc_array]]
+    terms: dict[str, float] = field(default_factory=dict)
 
     @property
     def energy(self) -> np.ndarray:
@@ -117,7 +121,9 @@ class Sparse:
         gradient, matrix = self._system
         diagonal = matrix.diagonal()
         ridge = damping[0] * diagonal + FLOOR * diagonal.max()
-        step = -sparse.factor(csc_array(matrix + diags_array(ridge)))(gradient)
+        damped = matrix.copy()
+        damped.setdiag(diagonal + ridge)
+        step = -sparse.factor(damped)(gradient)
         return step, _gain(gradient, step, ridge)[None]
 
 

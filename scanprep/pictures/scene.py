@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -82,11 +82,16 @@ def small_scene(panes: Sequence[Pane]) -> bytes:
 
 def worst_that_turn(paths: Sequence[Path]) -> list[bytes | None]:
     """The packed scenes of files, worst first, of as many as a page can carry; None where there is none, or no room."""
-    room, out = MOST_BYTES, list[bytes | None]()
+    return [*carried(paths[:MOST_TURN], MOST_BYTES), *(None for _ in paths[MOST_TURN:])]
+
+
+def carried(paths: Iterable[Path], room: int) -> list[bytes | None]:
+    """What files hold, as long as there is room for so many bytes; None where there is none, or no room."""
+    out = list[bytes | None]()
     for path in paths:
-        scene = path.read_bytes() if path.exists() and room > 0 and len(out) < MOST_TURN else None
-        room -= len(scene or b"")
-        out.append(scene if room >= 0 else None)
+        held = path.read_bytes() if path.exists() and room > 0 else None
+        room -= len(held or b"")
+        out.append(held if room >= 0 else None)
     return out
 
 

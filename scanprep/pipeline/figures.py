@@ -36,9 +36,10 @@ class ScanFigures:
     removed: float = 0.0    # share of the scan's points that were cleaned off before
     seconds: float = np.nan         # in `times.csv`, as it is the one figure that differs from run to run
     rolled: bool = False    # limbs are rolled otherwise than they were found first, as no person's lie so
+    doubts: tuple[Doubt, ...] = ()  # in `limbs.csv`: what no person can do, the gravest first
 
 
-_TABLED = [f for f in fields(ScanFigures) if f.name != "seconds"]
+_TABLED = [f for f in fields(ScanFigures) if f.name not in ("seconds", "doubts")]
 _READ: dict[str, Callable[[str], Any]] = {"str": str, "float": lambda text: np.nan if text == NONE else float(text),
                                           "int": int, "bool": "True".__eq__}
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 from scipy.sparse import eye_array
@@ -16,7 +17,7 @@ from ..geometry.mesh import Mesh
 from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around
 from ..pictures.page import Page, data_uri
-from ..pictures.scene import Pane, small_scene, worst_that_turn
+from ..pictures.scene import Pane, carried, small_scene, worst_that_turn
 from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
 from ..registration.nonrigid import Registration
@@ -25,6 +26,7 @@ from .figures import Limits, ScanFigures, Verdict, read_doubts, read_failures, r
 PICTURES, PAGE = "pictures", "report.html"
 WIDTH, HEIGHT, TALL = 150, 216, 300
 FEW = 6                     # scans that turn where fewer need a look
+MOST_CARRIED = 4_000_000    # bytes of pictures in the page itself, of the worst scans; the others stay files beside it
 FAR = 0.005                 # of the template's size: the dark end of the distances
 TURN = 20.0                 # degrees from the front
 BALL = 0.013                # of the template's size: radius of the balls that stand for points
@@ -46,9 +48,11 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page.section("Worst first", _explanation(limits, size))
     page.picture(_legend(size))
     scenes = worst_that_turn([folder / PICTURES / f"{verdict.name}.scene" for verdict in verdicts])
+    pictures = carried((folder / PICTURES / f"{verdict.name}.webp" for verdict in verdicts), MOST_CARRIED)
     look = max(FEW, sum(verdict.suspect or verdict.failed for verdict in verdicts))
-    for number, (verdict, scene) in enumerate(zip(verdicts, scenes, strict=True)):
-        page.markup(_card(page, folder, verdict, entries.get(verdict.name), scene if number < look else None))
+    for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
+        shown = _shown(page, folder, verdict.name, picture, scene if number < look else None)
+        page.markup(_card(verdict, entries.get(verdict.name), shown))
     if whole.skeleton is not None:
         page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
         parts = Solid(whole.template, part_colors(whole.skeleton.part_of_face))
@@ -119,26 +123,30 @@ def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
     return f'<div class="index">{"".join(parts)}</div>'
 
 
-def _card(page: Page, folder: Path, verdict: Verdict, entry: SetEntry | None, scene: bytes | None) -> str:
-    path = folder / PICTURES / f"{verdict.name}.webp"
+def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
     about = " · ".join(filter(None, [entry.subject if entry and entry.subject != verdict.name else "",
                                      entry.pose if entry else "", verdict.figures.init if verdict.figures else ""]))
     badness = "failed" if verdict.failed else f"{verdict.badness:.1f}"
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
-    shown = ""
-    if path.exists() and scene is not None:
-        shown = page.turning(scene, path.read_bytes(), height=TALL)
-    elif path.exists():
-        labels = "".join(f"<span>{escape(label)}</span>" for label in PANELS)
-        shown = (f'<div><img src="{data_uri(path.read_bytes())}" alt="{escape(verdict.name)}: {", ".join(PANELS)}" '
-                 f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'
-                 f'<div class="panels">{labels}</div></div>')
     if verdict.figures and verdict.figures.removed:
         about += f" · {100 * verdict.figures.removed:.0f}% of the points cleaned off"
     table = _figure_table(verdict.figures) if verdict.figures else ""
     return (f'<section class="scan {_mark(verdict)}" id="{_anchor(verdict)}"><h3><span class="dot"></span>'
             f"{escape(verdict.name)} <small>{badness}</small><small>{escape(about)}</small></h3>"
             f"<ul>{reasons}</ul>{shown}{table}</section>")
+
+
+def _shown(page: Page, folder: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
+    """A scan that turns, or its picture: the page carries that, or finds it in the folder when it is scrolled to."""
+    if picture is not None and scene is not None:
+        return page.turning(scene, picture, height=TALL)
+    if picture is None and not (folder / PICTURES / f"{name}.webp").exists():
+        return ""
+    source = data_uri(picture) if picture is not None else f"{PICTURES}/{quote(name)}.webp"
+    labels = "".join(f"<span>{escape(label)}</span>" for label in PANELS)
+    return (f'<div><img src="{source}" alt="{escape(name)}: {", ".join(PANELS)}" '
+            f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'
+            f'<div class="panels">{labels}</div></div>')
 
 
 def _figure_table(f: ScanFigures) -> str:

@@ -9,18 +9,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from ..batch.opening import workspace
 from ..batch.pool import Workers
 from ..batch.room import Room
 from ..batch.workspace import Task, Workspace
 from ..dataset import RegisteredSet, SetEntry, write_set
-from ..geometry.files import read_mesh, write_mesh
+from ..geometry.files import write_mesh
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
-from ..registration.limbs import limb_doubts
 from ..registration.person import PersonParts, person_parts
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
@@ -94,7 +91,6 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
                              scan_progress)
             failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
             registered = tables.write(failures)
-            _with_doubts(space, registered, parts)
             _with_skeleton(space, registered, config, skeleton_progress)
         finally:
             tables.write(failures)
@@ -154,6 +150,8 @@ class _Tables:
                       {"settings": asdict(self.work.settings)})
             write_landmarks(staged.folder / "landmarks.json", dict(self.work.landmarks))
             write_figures(staged.folder, figures.values())
+            if self.work.parts is not None:
+                write_doubts(staged.folder, {name: each.doubts for name, each in figures.items()})
             write_failures(staged.folder, failures)
         return RegisteredSet.load(self.space.folder)
 
@@ -171,17 +169,6 @@ class _Tables:
         return others
 
 
-def _with_doubts(space: Workspace, registered: RegisteredSet, parts: PersonParts | None) -> None:
-    """The table of what in the registrations no person can do, where the template is a person."""
-    if parts is None:
-        space.drop("limbs")
-        return
-    doubts = {name: limb_doubts(registered.template, parts, registered.vertices([name])[0])
-              for name in registered.names}
-    with space.staging("limbs") as staged:
-        write_doubts(staged.folder, doubts)
-
-
 def _with_skeleton(space: Workspace, registered: RegisteredSet, config: PrepareConfig, progress: Progress | None
                    ) -> None:
     """The skeleton of the subject with the most meshes, found anew when one of them has changed."""
@@ -196,7 +183,7 @@ def _with_skeleton(space: Workspace, registered: RegisteredSet, config: PrepareC
     meshes = [space.folder / entry.file for entry in registered.entries if entry.subject == most]
 
     def find(folder: Path) -> None:
-        poses = np.stack([read_mesh(mesh, unit="m").vertices for mesh in meshes])
-        find_skeleton(registered.template, poses, config.skeleton, progress=progress).save(folder / path.name)
+        find_skeleton(registered.template, registered.poses(most), config.skeleton,
+                      progress=progress).save(folder / path.name)
 
     space.step("skeleton", (registered.template, meshes, config.skeleton), find)

@@ -16,6 +16,7 @@ from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmar
 from ..geometry.mesh import Mesh
 from ..judgement import extent
 from ..ranges import FLAG, Settings
+from ..registration.limbs import limb_doubts
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
 from ..registration.person import PersonParts
 from ..registration.repair import repaired
@@ -93,9 +94,10 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             from .page import pictures_of
 
             picture, scene = pictures_of(template, scan, fit)
-    figures = figures_of(task.name, init, template, fit)
-    return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
-                          picture, scene)
+        doubts = () if parts is None else limb_doubts(template, parts, fit.mesh.vertices)
+    figures = replace(figures_of(task.name, init, template, fit), removed=removed, doubts=doubts,
+                      seconds=time.perf_counter() - start)
+    return RegisteredScan(fit.mesh.vertices, figures, picture, scene)
 
 
 def _check_unit(task: ScanTask, scan: Mesh | np.ndarray, template: Mesh) -> None:

@@ -22,7 +22,7 @@ class DeformationGraph:
     node_vertices: np.ndarray    # (M,) the vertex where each node sits
     carriers: np.ndarray         # (N, K) the nodes that carry each vertex
     weights: np.ndarray          # (N, K) their shares, each row summing to 1
-    edges: np.ndarray            # (E, 2) directed pairs of nodes, each pair in both directions
+    edges: np.ndarray            # (E, 2) directed pairs of nodes, each pair in both directions: the links, and back
     edge_area: np.ndarray        # (E,) square metres, the part of the surface that each edge stands for
 
     @property
@@ -34,6 +34,16 @@ class DeformationGraph:
     def edge_vectors(self) -> np.ndarray:
         """(E, 3) from the first to the second node at rest, metres."""
         return self.nodes[self.edges[:, 1]] - self.nodes[self.edges[:, 0]]
+
+    @property
+    def links(self) -> np.ndarray:
+        """(E / 2, 2) pairs of nodes that hold each other, each once."""
+        return self.edges[:len(self.edges) // 2]
+
+    @property
+    def link_area(self) -> np.ndarray:
+        """(E / 2,) square metres, that of both directions."""
+        return self.edge_area.reshape(2, -1).sum(axis=0)
 
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template

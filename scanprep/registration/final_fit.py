@@ -8,6 +8,7 @@ are as welcome as other poses, and where there are no data the template continue
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ from ..geometry.target import Target, orient
 from ..threads import search_threads
 from .matches import NORMALS, Pull, pull
 from .schedule import FinalFitConfig, FinalFitRound
+
+AT_ONCE = 2000                # points around which surfaces are fitted at once: their neighbours fit into the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +48,16 @@ def final_fit(template: Mesh, start: np.ndarray, target: Target,
     given = _prepared(template, start, target, landmarks, config or FinalFitConfig())
     x, before, stiff = start, start, np.ones(len(template.faces))
     for stage in given.config.rounds:
-        x, before = _laid_out(given, x, stage, stiff), x
-    repairs, quality = 0, _quality(given, x, stage)
+        x, before = _laid_out(given, x, _fields(given, x, stage), stage, stiff), x
+    repairs, fields = 0, _fields(given, x, stage)
+    quality = _quality(given, fields)
     while repairs < 12 and (bad := quality.inverted | quality.needles).any():
         near = np.zeros(len(x))
         near[template.faces[bad]] = 1
         stiff = np.where(near[template.faces].any(axis=1), 4 * stiff, stiff)
-        x, before = _laid_out(given, x, stage, stiff), x
-        repairs, quality = repairs + 1, _quality(given, x, stage)
+        x, before = _laid_out(given, x, fields, stage, stiff), x
+        repairs, fields = repairs + 1, _fields(given, x, stage)
+        quality = _quality(given, fields)
     return FinalFit(x, _data(given, x, stage.reach)[1], given.scan.noise, quality.strain, quality.roughness,
                     int(quality.inverted.sum()), int(quality.needles.sum()), len(given.config.rounds) + repairs,
                     float(np.linalg.norm(x - before, axis=1).mean()))
@@ -77,25 +82,35 @@ def smoothed_scan(target: Target, width: float, neighbours: int = 40) -> Smoothe
     """A scan with a quadratic surface fitted around every point; others count by a Gaussian of `width` metres."""
     P, n = target.points, target.normals
     apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=search_threads(len(P)))
-    agree = np.einsum("nkd,nd->nk", n[near], n)
-    w = np.exp(-0.5 * (apart / width) ** 2) * np.maximum(agree, 0)
+    some = (slice(first, first + AT_ONCE) for first in range(0, len(P), AT_ONCE))
+    fitted = [_fitted_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in some]
+    points, normals, rest = (np.concatenate(part) for part in zip(*fitted, strict=True))
+    spacing = np.median(apart[:, min(4, apart.shape[1] - 1)])
+    return SmoothedScan(points, normals, target.border, float(np.sqrt(np.median(rest))), float(spacing))
+
+
+def _fitted_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.ndarray, apart: np.ndarray,
+                     width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points and normals (m, 3) moved to the quadratic surface through their neighbours (m, k, 3).
+
+    And the mean square (m,), square metres, of what lies beside these surfaces.
+    """
+    w = np.exp(-0.5 * (apart / width) ** 2) * np.maximum(np.matmul(near_n, n[..., None])[..., 0], 0)
     side = np.cross(n, np.eye(3)[np.argmin(np.abs(n), axis=1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     axes = np.stack([side, np.cross(n, side), n], axis=1)
-    u, v, h = np.moveaxis(np.einsum("nad,nkd->nka", axes, P[near] - P[:, None]) / width, 2, 0)
-    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
-    weighed = basis * w[..., None]
-    normal = np.matmul(weighed.transpose(0, 2, 1), basis)
+    u, v, h = np.moveaxis(np.matmul((near - P[:, None]) / width, axes.transpose(0, 2, 1)), 2, 0)
+    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    weighed = basis * w[:, None]
+    normal = np.matmul(weighed, basis.transpose(0, 2, 1))
     # Few points say little about curvature: near borders the fit falls back to a plane.
     normal += np.diag([1e-9, 1e-2, 1e-2, 0.3, 0.3, 0.3])
-    fit = np.linalg.solve(normal, np.einsum("nkb,nk->nb", weighed, h)[..., None])[..., 0]
-    rest = np.einsum("nkb,nb->nk", basis, fit) - h
-    noise = width * np.sqrt(np.median(np.sum(w * rest**2, axis=1) / np.maximum(w.sum(axis=1), 1e-12)))
-    normals = n - fit[:, 1:2] * axes[:, 0] - fit[:, 2:3] * axes[:, 1]
+    fit = np.linalg.solve(normal, np.matmul(weighed, h[..., None]))
+    rest = np.matmul(fit.transpose(0, 2, 1), basis)[:, 0] - h
+    normals = n - fit[:, 1] * axes[:, 0] - fit[:, 2] * axes[:, 1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    spacing = np.median(apart[:, min(4, apart.shape[1] - 1)])
-    return SmoothedScan(P + width * np.clip(fit[:, :1], -1, 1) * n, normals, target.border, float(noise),
-                        float(spacing))
+    square = width**2 * np.sum(w * rest**2, axis=1) / np.maximum(w.sum(axis=1), 1e-12)
+    return P + width * np.clip(fit[:, 0], -1, 1) * n, normals, square
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +136,7 @@ def _prepared(template: Mesh, start: np.ndarray, target: Target, landmarks: tupl
     held = pull(N, np.arange(N), start, 1e-9 * areas)
     if landmarks is not None:
         held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))
-    return _Given(template, start, config, size, Triangles(template), areas, scan, held)
+    return _Given(template, start, config, size, triangles_of(template), areas, scan, held)
 
 
 def _fields(given: _Given, x: np.ndarray, stage: FinalFitRound) -> tuple[Field, Field]:
@@ -148,9 +163,9 @@ def _data(given: _Given, x: np.ndarray, reach: float) -> tuple[Pull, np.ndarray]
     return pull(len(x), v, scan.points[p], weights, scan.normals[p], given.config.slide), seen
 
 
-def _laid_out(given: _Given, x: np.ndarray, stage: FinalFitRound, stiff: np.ndarray) -> np.ndarray:
+def _laid_out(given: _Given, x: np.ndarray, fields: tuple[Field, Field], stage: FinalFitRound, stiff: np.ndarray
+              ) -> np.ndarray:
     """Vertices that come nearest to the smooth field of gradients and to what the data want of them."""
-    _, smooth = _fields(given, x, stage)
     wanted, seen = _data(given, x, stage.reach)
     # Rounds of smoothing would straighten a limb that nothing holds: there the start is all that is known.
     wanted = wanted + given.held + pull(len(x), np.arange(len(x)), given.start,
@@ -159,7 +174,7 @@ def _laid_out(given: _Given, x: np.ndarray, stage: FinalFitRound, stiff: np.ndar
     K = given.triangles.stiffness(weights)
     across = np.linalg.eigvalsh(wanted.A)[:, 2]
     nearly = Factored(csc_array(K + diags_array(across)))
-    force = given.triangles.force(weights, smooth.gradient) + wanted.b
+    force = given.triangles.force(weights, fields[1].gradient) + wanted.b
     force -= K @ x + np.einsum("nij,nj->ni", wanted.A, x)
     return x + conjugate_gradients(lambda d: K @ d + np.einsum("nij,nj->ni", wanted.A, d), force, nearly.solve)
 
@@ -173,38 +188,46 @@ class _Quality(NamedTuple):
     roughness: float
 
 
-def _quality(given: _Given, x: np.ndarray, stage: FinalFitRound) -> _Quality:
-    measured, smooth = _fields(given, x, stage)
+def _quality(given: _Given, fields: tuple[Field, Field]) -> _Quality:
+    measured, smooth = fields
     n = given.template.face_normals[..., None]
     inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
-    own = np.linalg.svd(measured.gradient, compute_uv=False)
-    relative = np.linalg.svd(measured.gradient @ np.linalg.inv(smooth.gradient), compute_uv=False)
-    strain, roughness = (float(np.sqrt(np.average((np.log(stretch)**2).mean(axis=1), weights=given.triangles.areas)))
-                         for stretch in (own, relative))
-    return _Quality(inverted, (relative[:, 0] > 4) | (relative[:, 2] < 1 / 4), strain, roughness)
+    relative = measured.gradient @ np.linalg.inv(smooth.gradient)
+    squared = np.maximum(np.linalg.eigvalsh(relative.transpose(0, 2, 1) @ relative), 1e-12)    # of the stretches
+    strain, roughness = (float(np.sqrt(np.average(square, weights=given.triangles.areas)))
+                         for square in ((measured.log_S**2).sum(axis=(1, 2)) / 3,
+                                        (0.25 * np.log(squared)**2).mean(axis=1)))
+    return _Quality(inverted, (squared[:, 2] > 4**2) | (squared[:, 0] < 1 / 4**2), strain, roughness)
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """The rotation R and the stretch S (F, 3, 3) of every triangle; its gradient is `R S`.
+    """The rotation R and the stretch S (F, 3, 3) of every triangle, and the logarithm of S; its gradient is `R S`.
 
     S is symmetric, in the template's axes; along the normal it is the mean stretch within the triangle.
     """
 
     R: np.ndarray
     S: np.ndarray
+    log_S: np.ndarray
 
-    @property
+    @cached_property
     def gradient(self) -> np.ndarray:
         """(F, 3, 3)"""
         return self.R @ self.S
+
+
+@lru_cache(maxsize=4)                # a folder of scans shares one template
+def triangles_of(template: Mesh) -> Triangles:
+    """The triangles of a template, made ready once."""
+    return Triangles(template)
 
 
 class Triangles:
     """The triangles of a template at rest, ready to measure gradients and to lay wanted ones out."""
 
     def __init__(self, template: Mesh) -> None:
-        c = template.corners
+        c, faces = template.corners, template.faces
         self.mesh = template
         self.areas = np.maximum(template.face_areas, 1e-3 * template.face_areas.mean())
         n = template.face_normals
@@ -212,36 +235,51 @@ class Triangles:
         self.hats = np.cross(n[:, None], e) / (2 * self.areas)[:, None, None]
         u = e[:, 2] / np.maximum(np.linalg.norm(e[:, 2], axis=1, keepdims=True), 1e-300)
         self.frames = np.stack([u, np.cross(n, u), n], axis=1)
-        self._stiffness = self.stiffness(self.areas)
+        self._collect = csc_array(coo_array((np.full(faces.size, 1 / 3), (faces.ravel(), np.arange(faces.size) // 3)),
+                                            shape=(len(template.vertices), len(faces))))
+        self._smoothing: dict[float, Factored] = {}
 
     def measured(self, x: np.ndarray) -> Field:
         """The rotations and stretches of vertices (N, 3)."""
-        flat = np.einsum("fad,fae,fke->fdk", x[self.mesh.faces], self.hats, self.frames[:, :2], optimize=True)
+        flat = np.matmul(x[self.mesh.faces].transpose(0, 2, 1), self._hats_in_plane)
         C = np.matmul(flat.transpose(0, 2, 1), flat)
         area = np.sqrt(np.maximum(C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] ** 2, 1e-12))
         trace = np.sqrt(C[:, 0, 0] + C[:, 1, 1] + 2 * area)
         U = (C + area[:, None, None] * np.eye(2)) / trace[:, None, None]
-        inverse = (np.eye(2) * np.einsum("fii->f", U)[:, None, None] - U) / area[:, None, None]
+        inverse = (np.eye(2) * trace[:, None, None] - U) / area[:, None, None]
         rotated = np.empty((len(U), 3, 3))
         rotated[:, :, :2] = flat @ inverse
         rotated[:, :, 2] = self.mesh.with_vertices(x).face_normals
-        full = np.zeros((len(U), 3, 3))
+        full, logarithm = np.zeros((2, len(U), 3, 3))
         full[:, :2, :2], full[:, 2, 2] = U, np.sqrt(area)
+        logarithm[:, :2, :2], logarithm[:, 2, 2] = _log_in_plane(U), 0.5 * np.log(area)
         B = self.frames
-        return Field(rotated @ B, B.transpose(0, 2, 1) @ full @ B)
+        back = B.transpose(0, 2, 1)
+        return Field(rotated @ B, back @ full @ B, back @ logarithm @ B)
 
     def smoothed(self, field: Field, length: float, weights: np.ndarray) -> Field:
-        """The field that varies little over `length` (metres), where triangles count by weights (F,)."""
+        """The field that varies little over `length` (metres), where triangles count by weights (F,).
+
+        A mean over the surroundings: what the triangles say is spread, and so are the weights by which it is divided.
+        """
         w = np.maximum(weights, 1e-6) * self.areas
-        entries = np.concatenate([field.R.reshape(-1, 9), _log_symmetric(field.S).reshape(-1, 9)], axis=1)
-        faces, N = self.mesh.faces, len(self.mesh.vertices)
-        mass = np.bincount(faces.ravel(), np.repeat(w / 3, 3), N)
-        collect = csc_array(coo_array((np.repeat(w / 3, 3), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))),
-                                      shape=(N, len(faces))))
-        even = Factored(csc_array(diags_array(mass) + length**2 * self._stiffness)).solve(collect @ entries)
-        of_faces = even[faces].mean(axis=1)
-        return Field(rotations.project(of_faces[:, :9].reshape(-1, 3, 3)),
-                     _exp_symmetric(of_faces[:, 9:].reshape(-1, 3, 3)))
+        entries = np.concatenate([field.R.reshape(-1, 9), field.log_S.reshape(-1, 9), np.ones((len(w), 1))], axis=1)
+        spread = self._smoother(length).solve(self._collect @ (w[:, None] * entries))
+        of_faces = (spread[:, :18] / spread[:, 18:])[self.mesh.faces].mean(axis=1)
+        logarithm = of_faces[:, 9:].reshape(-1, 3, 3)
+        return Field(rotations.project(of_faces[:, :9].reshape(-1, 3, 3)), _exp_symmetric(logarithm), logarithm)
+
+    def _smoother(self, length: float) -> Factored:
+        """What spreads over a length: the same matrix whatever the weights, factored once."""
+        if length not in self._smoothing:
+            mass = self._collect @ self.areas
+            self._smoothing[length] = Factored(csc_array(diags_array(mass) + length**2 * self.stiffness(self.areas)))
+        return self._smoothing[length]
+
+    @cached_property
+    def _hats_in_plane(self) -> np.ndarray:
+        """(F, 3, 2) the gradients of the corners' hats in the triangle's own axes."""
+        return np.matmul(self.hats, self.frames[:, :2].transpose(0, 2, 1))
 
     def stiffness(self, weights: np.ndarray) -> csc_array:
         """(N, N) with `x·Kx = Σ w |∇x|²` for weights (F,), square metres."""
@@ -259,9 +297,13 @@ class Triangles:
         return out
 
 
-def _log_symmetric(S: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh(S)
-    return (vectors * np.log(np.maximum(values, 1e-3))[:, None]) @ vectors.transpose(0, 2, 1)
+def _log_in_plane(U: np.ndarray) -> np.ndarray:
+    """The logarithms (n, 2, 2) of symmetric positive matrices: of their eigenvalues m ± d."""
+    m, half = 0.5 * (U[:, 0, 0] + U[:, 1, 1]), 0.5 * (U[:, 0, 0] - U[:, 1, 1])
+    d = np.hypot(half, U[:, 0, 1])
+    low, high = np.log(np.maximum(m - d, 1e-3)), np.log(np.maximum(m + d, 1e-3))
+    slope = np.where(d > 1e-9 * m, 0.5 * (high - low) / np.maximum(d, 1e-300), 1 / m)
+    return slope[:, None, None] * U + (0.5 * (low + high) - slope * m)[:, None, None] * np.eye(2)
 
 
 def _exp_symmetric(E: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -152,14 +152,29 @@ class NodePattern:
                                 return_inverse=True)
         self.nodes = M
         self.rows, self.columns = keys // M, keys % M
-        self._indptr = np.searchsorted(self.rows, np.arange(M + 1))
+        blocks = bsr_array((np.arange(len(keys) * UNKNOWNS**2).reshape(-1, UNKNOWNS, UNKNOWNS), self.columns,
+                            np.searchsorted(self.rows, np.arange(M + 1))), shape=(M * UNKNOWNS, M * UNKNOWNS))
+        self._entries = csc_array(blocks)            # of every entry its place in the blocks
         self.vertex_slots = where[:len(of_vertices)].reshape(-1, K * K)
-        self.edge_slots = where[len(of_vertices):len(of_vertices) + len(of_edges)]
+        edge_slots = where[len(of_vertices):len(of_vertices) + len(of_edges)].reshape(4, -1)
+        self._gather = {count: (gatherer(edge_slots[:, :count].reshape(-1), len(keys)),
+                                gatherer(graph.edges[:count].T.reshape(-1), M))
+                        for count in (len(graph.edges), len(graph.edges) // 2)}
+
+    def of_edges(self, blocks: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Blocks (P, 7, 7) and half the gradient (M, 7) of all nodes from those of edges, or of their first half.
+
+        Of every edge the blocks (4, E, 7, 7) join the first node with itself, with the second, the second with the
+        first and with itself; the forces (2, E, 7) are on the first and the second.
+        """
+        to_blocks, to_nodes = self._gather[blocks.shape[1]]
+        return (summed(to_blocks, blocks.reshape(-1, UNKNOWNS, UNKNOWNS)),
+                summed(to_nodes, forces.reshape(-1, UNKNOWNS)))
 
     def matrix(self, blocks: np.ndarray) -> csc_array:
         """The sparse symmetric matrix of all blocks (P, 7, 7)."""
-        size = self.nodes * UNKNOWNS
-        return csc_array(bsr_array((blocks, self.columns, self._indptr), shape=(size, size)))
+        entries = self._entries
+        return csc_array((blocks.reshape(-1)[entries.data], entries.indices, entries.indptr), shape=entries.shape)
 
 
 @lru_cache(maxsize=4)
@@ -177,17 +192,16 @@ class Term(NamedTuple):
     normal: Callable[[NodePattern], tuple[np.ndarray, np.ndarray]]
 
 
-def _edge_term(graph: DeformationGraph, r: np.ndarray, Ji: np.ndarray, Jj: np.ndarray, w: np.ndarray) -> Term:
-    """`Σ w |r|²` over the edges of a graph, for residuals r (E, d) with weights w (E,).
+def _edge_term(r: np.ndarray, w: np.ndarray, jacobians: Callable[[], tuple[np.ndarray, np.ndarray]]) -> Term:
+    """`Σ w |r|²` over the edges of a graph, or their first half, for residuals r (E, d) with weights w (E,).
 
-    Ji, Jj (E, d, 7) are their derivatives by the unknowns of the first and the second node.
+    The Jacobians (E, d, 7) are by the unknowns of the first and of the second node.
     """
     def normal(pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = jacobians()
         wi, wj = (w[:, None, None] * J.transpose(0, 2, 1) for J in (Ji, Jj))
-        blocks = np.concatenate([wi @ Ji, wi @ Jj, wj @ Ji, wj @ Jj])
-        force = np.concatenate([wi @ r[..., None], wj @ r[..., None]])[..., 0]
-        return (summed(pattern.edge_slots, blocks, len(pattern.rows)),
-                summed(graph.edges.T.reshape(-1), force, pattern.nodes))
+        return pattern.of_edges(np.stack([wi @ Ji, wi @ Jj, wj @ Ji, wj @ Jj]),
+                                np.stack([wi @ r[..., None], wj @ r[..., None]])[..., 0])
 
     return Term(float(np.sum(w[:, None] * r**2)), normal)
 
@@ -211,9 +225,9 @@ def data_term(graph: DeformationGraph, motion: NodeMotion, wanted: Pull) -> Term
         flat = J.reshape(n, 3, K * UNKNOWNS)
         blocks = np.matmul(flat.transpose(0, 2, 1), np.matmul(A, flat)).reshape(n, K, UNKNOWNS, K, UNKNOWNS)
         force = np.matmul(flat.transpose(0, 2, 1), (Ax - b)[..., None]).reshape(n * K, UNKNOWNS)
-        return (summed(pattern.vertex_slots[active].reshape(-1),
-                       blocks.transpose(0, 1, 3, 2, 4).reshape(n * K * K, UNKNOWNS, UNKNOWNS), len(pattern.rows)),
-                summed(carriers.reshape(-1), force, pattern.nodes))
+        return (summed(gatherer(pattern.vertex_slots[active].reshape(-1), len(pattern.rows)),
+                       blocks.transpose(0, 1, 3, 2, 4).reshape(n * K * K, UNKNOWNS, UNKNOWNS)),
+                summed(gatherer(carriers.reshape(-1), pattern.nodes), force))
 
     return Term(float(np.sum(x * (Ax - 2 * b)) + wanted.c), normal)
 
@@ -226,31 +240,42 @@ def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) 
     i, j = graph.edges.T
     rest = graph.edge_vectors
     y = np.matmul(motion.linear[i], rest[..., None])[..., 0]
-    Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
-    Ji[..., :3], Ji[..., 3], Ji[..., 4:], Jj[..., 4:] = -rotations.hat(y), y, np.eye(3), -np.eye(3)
     squared = np.sum(rest**2, axis=1)
     squared = np.maximum(squared, 1e-6 * squared.mean())           # nodes may coincide where sheets touch
-    return _edge_term(graph, y - (motion.positions[j] - motion.positions[i]), Ji, Jj,
-                      stiffness**2 * graph.edge_area / squared)
+
+    def jacobians() -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
+        Ji[..., :3], Ji[..., 3], Ji[..., 4:], Jj[..., 4:] = -rotations.hat(y), y, np.eye(3), -np.eye(3)
+        return Ji, Jj
+
+    return _edge_term(y - (motion.positions[j] - motion.positions[i]), stiffness**2 * graph.edge_area / squared,
+                      jacobians)
 
 
 def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
     """Neighbours want to rotate alike: one radian between them costs as much as `stiffness` metres from the data."""
-    i, j = graph.edges.T
+    i, j = graph.links.T
     r = rotations.log(motion.R[j] @ motion.R[i].transpose(0, 2, 1))
-    inverse = rotations.inverse_right_jacobian(r)
-    Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
-    Ji[..., :3], Jj[..., :3] = -inverse, inverse.transpose(0, 2, 1)
-    return _edge_term(graph, r, Ji, Jj, stiffness**2 * graph.edge_area)
+
+    def jacobians() -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
+        inverse = rotations.inverse_right_jacobian(r)
+        Ji[..., :3], Jj[..., :3] = -inverse, inverse.transpose(0, 2, 1)
+        return Ji, Jj
+
+    return _edge_term(r, stiffness**2 * graph.link_area, jacobians)
 
 
 def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
     """Neighbours want to grow alike: a factor of e between them costs as much as `stiffness` metres from the data."""
-    i, j = graph.edges.T
-    Ji, Jj = np.zeros((2, len(i), 1, UNKNOWNS))
-    Ji[..., 3], Jj[..., 3] = -1, 1
-    return _edge_term(graph, (motion.log_scale[j] - motion.log_scale[i])[:, None], Ji, Jj,
-                      stiffness**2 * graph.edge_area)
+    i, j = graph.links.T
+
+    def jacobians() -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = np.zeros((2, len(i), 1, UNKNOWNS))
+        Ji[..., 3], Jj[..., 3] = -1, 1
+        return Ji, Jj
+
+    return _edge_term((motion.log_scale[j] - motion.log_scale[i])[:, None], stiffness**2 * graph.link_area, jacobians)
 
 
 class Stiffness(NamedTuple):
@@ -297,20 +322,21 @@ class GraphFit:
         pattern = node_pattern(self.graph)
 
         def equations(at: NodeMotion) -> Sparse:
-            now = terms(self.graph, at, wanted, stiffness).values()
+            now = terms(self.graph, at, wanted, stiffness)
 
             def assemble() -> tuple[np.ndarray, csc_array]:
-                blocks, half = (np.sum(parts, axis=0) for parts in zip(*(t.normal(pattern) for t in now), strict=True))
+                normals = (term.normal(pattern) for term in now.values())
+                blocks, half = (reduce(np.add, parts) for parts in zip(*normals, strict=True))
                 if not stiffness.growth:
                     blocks[:, 3], blocks[:, :, 3], half[:, 3] = 0, 0, 0               # the log-scale
                 return half.reshape(-1), pattern.matrix(blocks)
 
-            return Sparse(sum(term.value for term in now), assemble)
+            values = {name: term.value for name, term in now.items()}
+            return Sparse(sum(values.values()), assemble, values)
 
         found = levenberg_marquardt(equations, self.motion, steps, tolerance=1e-3, damping=1e-5,
                                     retract=lambda at, step: at.moved(step.reshape(-1, UNKNOWNS)))
-        now = {name: term.value for name, term in terms(self.graph, found.x, wanted, stiffness).items()}
-        return replace(self, x=deform(self.graph, found.x), motion=found.x, energies=now,
+        return replace(self, x=deform(self.graph, found.x), motion=found.x, energies=found.equations.terms,
                        iterations=self.iterations + found.iterations)
 
 
@@ -320,8 +346,12 @@ def start_fit(template: Mesh, T: np.ndarray, nodes: int) -> GraphFit:
     return GraphFit(template.vertices @ T[:3, :3].T + T[:3, 3], graph, start_motion(graph, T))
 
 
-def summed(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """(count, ...) the sums of the values (n, ...) of each index (n,)."""
+def gatherer(index: np.ndarray, count: int) -> csr_array:
+    """The matrix (count, n) that sums the values of each index (n,)."""
     n = len(index)
-    add = csr_array(coo_array((np.ones(n), (index, np.arange(n))), shape=(count, n)))
-    return (add @ values.reshape(n, math.prod(values.shape[1:]))).reshape(count, *values.shape[1:])
+    return csr_array(coo_array((np.ones(n), (index, np.arange(n))), shape=(count, n)))
+
+
+def summed(gather: csr_array, values: np.ndarray) -> np.ndarray:
+    """(count, ...) what a `gatherer` makes of values (n, ...)."""
+    return (gather @ values.reshape(len(values), math.prod(values.shape[1:]))).reshape(-1, *values.shape[1:])

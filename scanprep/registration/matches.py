@@ -260,17 +260,17 @@ class Described:
 
 def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Target, reach: float, slide: float,
                     like: Likeness, descriptors: np.ndarray | None = None) -> Pull:
-    """What matches want of the vertices of a deformed template: some of them to the scan, and the scan to all of them.
+    """What matches want of some vertices, `sample` (n,), of a deformed template: of them to the scan, and back.
 
-    `sample` (n,) are the vertices that look for a match. Either direction weighs as much as an area, square metres.
+    Either direction weighs as much as an area, square metres.
     The weight of a match falls to zero at a distance of `reach`, metres; its force along the surface is a share,
     `slide`, of that across it. `descriptors` (N, q) are those of the vertices.
     """
     target = orient(target, deformed, max(like.normals, 1e-6))
     x, N = deformed.vertices, len(deformed.vertices)
-    mine = Described(x, deformed.vertex_normals, descriptors)
+    mine = Described(x, deformed.vertex_normals, descriptors).of(sample)
     theirs = Described(target.points, target.normals, target.descriptors)
-    p, apart = mine.of(sample).matched(theirs, reach, like)
+    p, apart = mine.matched(theirs, reach, like)
     good = (p >= 0) & ~target.border[p]
     v, p = sample[good], p[good]
     weights = area / len(sample) * tukey(apart[good], reach)
@@ -279,7 +279,7 @@ def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Tar
     chosen, apart = theirs.matched(mine, reach, like)
     p = np.flatnonzero(chosen >= 0)
     weights = area / len(target.points) * tukey(apart[p], reach)
-    return wanted + pull(N, chosen[p], target.points[p], weights, target.normals[p], slide)
+    return wanted + pull(N, sample[chosen[p]], target.points[p], weights, target.normals[p], slide)
 
 
 def tukey(distances: np.ndarray, reach: float) -> np.ndarray:

@@ -1,12 +1,12 @@
 """A registration in which limbs came to lie as no person's do, with other rolls of these limbs.
 
-The last stages are followed to the end from each, and what leaves the least to doubt is kept, if it lies on the scan
-and stretches no more than what was there.
+Each is followed for a few rounds. The one that leaves the least to doubt then is followed to the end, and kept if it
+lies on the scan and stretches no more than what was there.
 """
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
@@ -19,15 +19,16 @@ from ..threads import one_thread
 from .deformation_graph import DeformationGraph, build_graph
 from .graph_fit import GraphFit, NodeMotion, deform, followed
 from .limbs import Doubt, frames, limb_doubts, limb_measures
-from .matches import Landmarks, prepare
-from .nonrigid import Registration, finished, measured, principal_stretches
+from .matches import Inputs, Landmarks, prepare
+from .nonrigid import Registration, finished, measured, principal_stretches, uncovered_share
 from .person import PersonParts
 from .rolls import other_rolls
-from .schedule import RegistrationConfig
+from .schedule import GraphStage, RegistrationConfig
 
 LESS_DOUBTED = 0.1                     # 1 is a doubt where it begins
 LESS_COVERED = 0.001                   # share of the scan
 EASED = 1                              # links over which a roll sets in at a joint
+GLANCE = 3                             # rounds of a stage that show what becomes of a roll
 
 
 @one_thread()
@@ -54,31 +55,53 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     config = config or RegistrationConfig()
     stages = tuple(stage for stage in config.graph if stage.positions == 1 and not stage.paths and stage.reach)
     x = fit.mesh.vertices
-    if parts is None or not config.rolls or not stages or not (doubted := _doubted(template, parts, x)):
+    if parts is None or not config.rolls or not stages:
         return fit
-    tries = other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)
-    given, graph = prepare(template, scan, landmarks, correspondences), build_graph(template, stages[0].nodes)
-    start, best = motion_of(graph, x), fit
+    doubted = limb_measures(template, parts, x).doubted(parts.skeleton)
+    if not doubted:
+        return fit
+    # the last stages match by positions alone: no path to landmarks or hints is needed
+    given = replace(prepare(template, scan), landmarks=landmarks, hints=correspondences)
+    coarse = tuple(stage for stage in stages if stage.nodes == stages[0].nodes)
+    graph, told = build_graph(template, coarse[0].nodes), progress or _silent
+    tries = [np.zeros(len(parts.R_template_rest)),
+             *other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)]
+    start, looks = motion_of(graph, x), list[_Look]()
     for number, angles in enumerate(tries):
         motion = rolled(graph, start, template, parts, x, angles)
-        begun = GraphFit(deform(graph, motion), graph, motion, iterations=best.iterations)
-        trial = measured(given, finished(given, followed(given, begun, stages, config.ends, _silent), config), scan)
-        if better(template, parts, trial, best):
-            best = replace(trial, rolled=True)
-        if progress:
-            progress(number + 1, len(tries))
-        if best is not fit and not _doubted(template, parts, best.mesh.vertices):
-            break
-    return best
+        begun = GraphFit(deform(graph, motion), graph, motion, iterations=fit.iterations)
+        looks.append(_look(given, parts, begun, coarse, scan))
+        told(number + 1, len(tries) + 1)
+    best = min(looks[1:], key=lambda look: (look.gravity, look.uncovered), default=looks[0])
+    if best.gravity + LESS_DOUBTED < looks[0].gravity:
+        end = followed(given, best.fit, stages[len(coarse) - 1:], config.ends, lambda steps: None)
+        trial = measured(given, finished(given, end, config), scan)
+        if better(template, parts, trial, fit):
+            fit = replace(trial, rolled=True)
+    told(len(tries) + 1, len(tries) + 1)
+    return fit
 
 
-def _doubted(template: Mesh, parts: PersonParts, x: np.ndarray) -> list[int]:
-    """The parts of vertices (N, 3) that lie as no person's do, the gravest first."""
-    return limb_measures(template, parts, x).doubted(parts.skeleton)
+def _silent(done: int, total: int) -> None:
+    """Nobody wants to know."""
 
 
-def _silent(steps: int) -> None:
-    """Steps within a try are not told."""
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What becomes of some rolls in a few rounds: how much is to be doubted, and the share of the scan off them."""
+
+    fit: GraphFit
+    gravity: float
+    uncovered: float
+
+
+def _look(given: Inputs, parts: PersonParts, begun: GraphFit, stages: tuple[GraphStage, ...],
+          scan: Mesh | np.ndarray) -> _Look:
+    """A beginning after some stages, each cut short."""
+    short = tuple(replace(stage, rounds=min(stage.rounds, GLANCE)) for stage in stages)
+    fit = followed(given, begun, short, 0, lambda steps: None)
+    return _Look(fit, gravity(limb_doubts(given.template, parts, fit.x)),
+                 uncovered_share(scan, given.template.with_vertices(fit.x), 0.01 * given.size))
 
 
 def better(template: Mesh, parts: PersonParts, trial: Registration, fit: Registration) -> bool:

@@ -116,11 +116,11 @@ class RegistrationConfig(Settings):
     """
 
     graph: tuple[GraphStage, ...] = (
-        GraphStage(300, 0.7, 0.07, 2.0, 0.1, 1.0, 1.0, rounds=4, positions=0.0, paths=0.3, hints=1.0),
-        GraphStage(300, 0.5, 0.05, 2.0, 0.1, 0.3, 0.3, rounds=5, positions=0.3, paths=0.3, hints=1.0),
-        GraphStage(300, 0.3, 0.03, 0.7, 0.05, 0.2, 0.1, rounds=4, paths=0.2, hints=0.5),
-        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.15, 0.05, rounds=5, paths=0.1, hints=0.2),
-        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=4, paths=0.05, hints=0.1),
+        GraphStage(150, 0.7, 0.07, 2.0, 0.1, 1.0, 1.0, rounds=4, positions=0.0, paths=0.3, hints=1.0),
+        GraphStage(150, 0.5, 0.05, 2.0, 0.1, 0.3, 0.3, rounds=5, positions=0.3, paths=0.3, hints=1.0),
+        GraphStage(150, 0.3, 0.03, 0.7, 0.05, 0.2, 0.1, rounds=4, paths=0.2, hints=0.5),
+        GraphStage(150, 0.2, 0.02, 0.7, 0.01, 0.15, 0.05, rounds=5, paths=0.1, hints=0.2),
+        GraphStage(150, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=4, paths=0.05, hints=0.1),
         GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=4),
         GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06, 0.0, rounds=4),
         GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=5, ends=True),
