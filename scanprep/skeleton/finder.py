@@ -233,12 +233,20 @@ def _of_count(best: _Restart, surface: PosedSurface, config: SkeletonConfig) -> 
 
 
 def _borders_untied(surface: PosedSurface, config: SkeletonConfig, label: np.ndarray, links: np.ndarray) -> np.ndarray:
-    """Labels of the same tree after the borders of both sides moved each by itself: no body is quite symmetric."""
-    free = PartSearch(surface, replace(config, patches=2))
-    moved = free.alternate(label, rounds=12, core=True)
-    touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
-    same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
-    return moved if same else label
+    """Labels after borders and core motions alternated on both sides by themselves, as long as the tree stays: no body
+    is quite symmetric.
+    """
+    free, links = PartSearch(surface, replace(config, patches=2)), np.sort(links, axis=1)
+    for _ in range(12):
+        moved = free.alternate(label, rounds=1, core=True)
+        touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
+        if moved.max() != label.max() or not touching.issuperset(map(tuple, links.tolist())):
+            break
+        changed = surface.face_weights[moved != label].sum()
+        label = moved
+        if changed < 5e-4:                                           # of the surface
+            break
+    return label
 
 
 def _assembled(template: Mesh, label: np.ndarray, links: np.ndarray, joints: np.ndarray) -> Skeleton:
