@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from scanprep.batch.pool import SideBySide
 from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
@@ -245,15 +246,16 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
     template, skeleton = parts.template, parts.skeleton
     system = GradientSystem(template, config.smoothness)
 
-    def deformation(y: np.ndarray, _: Work) -> np.ndarray:
+    def deformation(y: np.ndarray) -> np.ndarray:
         pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
         posed = parts.posed(space.gradients(pose))
         return shape_gradients(system, posed, parts.local_edges(y, pose)).astype(np.float32)
 
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
-    for i, y in enumerate(shapes):
-        S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1 / len(shapes),
-                         partial(deformation, y))
+    with SideBySide(deformation, list(shapes)) as found:
+        for i, y in enumerate(shapes):
+            S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1 / len(shapes),
+                             lambda _, number=i: found(number))                # type: ignore[misc]
     return S
 
 
