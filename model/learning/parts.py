@@ -92,7 +92,7 @@ def _tried(finder: SkeletonFinder, poses: np.ndarray, parts: int | None) -> tupl
         if parts is None:
             raise
         return None
-    return found, _left_out_error(poses[:, finder.copy.kept], found, finder.copy.mesh)
+    return found, _left_out_error(finder.copy.transfer(poses), found, finder.coarse.template)
 
 
 def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh) -> float:

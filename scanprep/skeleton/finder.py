@@ -9,7 +9,7 @@ import numpy as np
 
 from ..batch.room import Step, once
 from ..geometry.mesh import Mesh, check_template
-from .coarse import coarse_copy
+from .coarse import coarse_copy, parts_of_source
 from .joints import (
     LOOP_SEPARATION,
     Loop,
@@ -65,9 +65,9 @@ class SkeletonFinder:
         poses = _checked_poses(template, poses)
         self.config, self.copy = config, coarse_copy(template)
         self.whole = self.coarse = _Body(template, poses, find_symmetry(template, poses))
-        if self.copy.mesh is not template:
-            few = poses[:, self.copy.kept]
-            self.coarse = _Body(self.copy.mesh, few, find_symmetry(self.copy.mesh, few))
+        if len(self.copy.template.vertices) < len(template.vertices):
+            few = self.copy.transfer(poses)
+            self.coarse = _Body(self.copy.template, few, find_symmetry(self.copy.template, few))
         kinds = self.whole.symmetry, self.coarse.symmetry
         holds = all(symmetry.holds for symmetry in kinds)
         tied = holds if config.symmetric is None else config.symmetric
@@ -101,7 +101,7 @@ class SkeletonFinder:
         body, links = self.whole, np.stack([coarse.parents, np.arange(len(coarse.parents))], axis=1)[1:]
         if self.coarse.template is body.template:
             return coarse
-        label = self.copy.back(coarse.part_of_vertex(self.coarse.template))
+        label = parts_of_source(self.copy, coarse.part_of_vertex(self.coarse.template))
         label = _borders_untied(body.surface, self.config, label, links)
         joints = coarse.joints.copy()
         joints[1:] = place_joints(body.surface, label, body.surface.core_motions(label), links)

@@ -60,16 +60,17 @@ def main() -> None:
             continue
         train, held = scape_fold(int(fold), len(data.poses))
         whole = Skeleton.load(path)
-        skeleton = Skeleton(whole.part_of_face[copy.face], whole.parents, whole.joints).with_root_centred(copy.mesh)
-        parts = BlendedTemplate(copy.mesh, skeleton, rigid_weights(skeleton))
+        skeleton = Skeleton(whole.part_of_face[copy.face_map], whole.parents, whole.joints)
+        skeleton = skeleton.with_root_centred(copy.template)
+        parts = BlendedTemplate(copy.template, skeleton, rigid_weights(skeleton))
         for name, config in SETTINGS.items():
-            bodies = data.poses[:, copy.kept]
+            bodies = copy.transfer(data.poses)
             row = {"fold": int(fold), "skeleton": finder, "parts": len(skeleton.parents), "setting": name,
                    **run(config, parts, bodies[train], bodies[held])}
             rows.append(row)
             print(row, flush=True)
-            write_report(args.output, {"protocol": f"SCAPE-5fold on {len(copy.kept)} vertices", "machine": machine(),
-                                       "rows": rows})
+            write_report(args.output, {"protocol": f"SCAPE-5fold on {len(copy.vertex_map)} vertices",
+                                       "machine": machine(), "rows": rows})
 
 
 if __name__ == "__main__":
