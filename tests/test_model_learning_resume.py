@@ -165,7 +165,7 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
     killed(parts, "_left_out_error", 0, given("b.npz"))                           # after the last
     killed(parts, "_tried", 1, given("b.npz"))                                    # before more parts are tried
     tried, real = [], parts._tried
-    monkeypatch.setattr(parts, "_tried", lambda *given: tried.append(given[2]) or real(*given))
+    monkeypatch.setattr(parts, "_tried", lambda *given: tried.append(given[1]) or real(*given))
     monkeypatch.setattr(finder, "_searched", lambda search: pytest.fail("searched again"))
     assert run(learn, "scape learn", given("b.npz")) == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()

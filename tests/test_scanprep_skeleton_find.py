@@ -2,17 +2,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, check_template
-from scanprep.skeleton import finder
-from scanprep.skeleton.coarse import coarse_copy, parts_of_source
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
@@ -196,31 +191,6 @@ def test_noise_leaves_the_parts(figure: Figure, poses: np.ndarray) -> None:
     part = match(figure, skeleton := find_skeleton(figure.template, noisy))
     assert len(skeleton.parents) == len(BOXES)
     assert np.linalg.norm(skeleton.joints[part[1:]] - JOINTS[1:], axis=1).max() < 0.01
-
-
-def test_a_coarse_copy_has_the_same_parts(figure: Figure, poses: np.ndarray, found: Skeleton,
-                                          monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finder, "coarse_copy", partial(coarse_copy, count=600))
-    skeleton = find_skeleton(figure.template, poses, FEW)
-    part, before = match(figure, skeleton), match(figure, found)
-    assert [skeleton.parents[part[j]] for j in range(1, len(BOXES))] == [part[p] for p in PARENTS[1:]]
-    assert np.allclose(skeleton.joints[part[1:]], found.joints[before[1:]], atol=1e-4)
-
-
-def test_the_way_back_from_a_coarse_copy_keeps_to_the_surface(figure: Figure) -> None:
-    """What one of its vertices stands for is in one piece, and holds that vertex."""
-    copy, mesh = coarse_copy(figure.template, 300), figure.template
-    check_template(copy.template)
-    inside = copy.owner[mesh.edges[:, 0]] == copy.owner[mesh.edges[:, 1]]
-    a, b = mesh.edges[inside].T
-    n, few = len(mesh.vertices), len(copy.vertex_map)
-    assert connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)[0] == few < 320
-    assert np.array_equal(copy.owner[copy.vertex_map], np.arange(few))
-    halves = copy.template.vertices[:, 0] > 0
-    part = parts_of_source(copy, halves.astype(int))
-    assert set(part[(halves[copy.owner[mesh.faces]]).all(axis=1)]) == {1}
-    assert set(part[(~halves[copy.owner[mesh.faces]]).all(axis=1)]) == {0}
-    assert np.array_equal(coarse_copy(mesh, n).template.vertices, mesh.vertices)
 
 
 def test_progress_ends_at_its_total(figure: Figure, poses: np.ndarray) -> None:

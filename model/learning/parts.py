@@ -4,10 +4,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.batch.room import Step, once
+from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.coarse import VERTICES
 from scanprep.skeleton.finder import SkeletonFinder
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
@@ -19,6 +20,7 @@ from .scape import Progress, Work, learn_pose
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
 MORE, TRIES = 4, 3                   # parts more each time, and the largest number of times
+VERTICES = 2500                      # of the coarse copies on which the models are learned that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +37,8 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     """A skeleton with as many parts as help to predict poses that were left out.
 
     The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
-    one, and a model of it gains from more parts than that: so finer skeletons are sought on a coarse copy of the
-    bodies, a model is learned with each, and they are kept while the error of left-out poses falls. The best is carried
-    over to the bodies as they are.
+    one, and a model of it gains from more parts than that: so finer skeletons are sought from the same restarts, a
+    model is learned with each on a coarse copy of the bodies, and they are kept while the error of left-out poses falls.
 
     Parameters
     ----------
@@ -52,17 +53,19 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     Raises
     ------
     ValueError
-        As `find_skeleton`.
+        As `find_skeleton`; a part that is too small for the coarse copies.
     """
     tell = progress or (lambda done, total: None)
     poses = np.asarray(poses, dtype=np.float64)
     settings = SkeletonConfig()
     whole = 1 + settings.restarts + TRIES
     finder = SkeletonFinder(template, poses, settings, lambda done, total: tell(done, whole), step)
+    vertices, coarse = coarse_copy(template, VERTICES)
 
     def tried(parts: int | None) -> tuple[Skeleton, float] | None:
         name = "best parts" if parts is None else f"{parts} parts"
-        return step(name, (template, poses, settings, parts, QUICK, VERTICES), lambda: _tried(finder, poses, parts))
+        return step(name, (template, poses, settings, parts, QUICK, VERTICES),
+                    lambda: _tried(finder, parts, coarse, poses[:, vertices]))
 
     first = tried(None)
     assert first is not None, "what goes wrong without a count of parts is raised"
@@ -79,20 +82,46 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
         if errors[wanted] > (1 - 0.03) * errors[len(best.parents)]:
             break
         best = finer[0]
-    chosen = finder.whole_skeleton(best)
     tell(whole, whole)
-    return ChosenSkeleton(chosen, errors)
+    return ChosenSkeleton(best, errors)
 
 
-def _tried(finder: SkeletonFinder, poses: np.ndarray, parts: int | None) -> tuple[Skeleton, float] | None:
-    """A skeleton on the coarse copy and its error; None where there is no tree of so many parts."""
+def _tried(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray
+           ) -> tuple[Skeleton, float] | None:
+    """A skeleton and its error on coarse bodies (M, n, 3); None where there is no tree of so many parts, or parts are
+    too small to compare.
+    """
     try:
-        found = finder.coarse_skeleton(parts)[0]
+        found = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
+        return found, _left_out_error(poses, coarse_skeleton(found, finder.template, coarse), coarse)
     except ValueError:
         if parts is None:
             raise
         return None
-    return found, _left_out_error(finder.copy.transfer(poses), found, finder.coarse.template)
+
+
+def coarse_copy(template: Mesh, count: int) -> tuple[np.ndarray, Mesh]:
+    """About `count` of the template's vertices (n,), and triangles over them alone."""
+    if len(template.vertices) <= count:
+        return np.arange(len(template.vertices)), template
+    small = decimate(template, 2 * count)
+    vertex = cKDTree(template.vertices).query(small.vertices)[1]
+    kept, faces = np.unique(vertex[small.faces], return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return kept, Mesh(template.vertices[kept], faces[distinct])
+
+
+def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleton:
+    """The skeleton on a coarse copy: every triangle has the part of the nearest one."""
+    near = cKDTree(template.corners.mean(axis=1)).query(coarse.corners.mean(axis=1))[1]
+    part, joints = skeleton.part_of_face[near], skeleton.joints.copy()
+    lost = np.setdiff1d(np.arange(len(skeleton.parents)), part)
+    if len(lost):
+        raise ValueError(f"vertices: {len(coarse.vertices)} are too few, part {skeleton.names[lost[0]]} is lost")
+    unplaced = Skeleton(part, skeleton.parents, joints)
+    joints[0] = coarse.vertices[unplaced.part_of_vertex(coarse) == 0].mean(axis=0)
+    return Skeleton(part, skeleton.parents, joints)
 
 
 def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh) -> float:

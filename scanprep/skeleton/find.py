@@ -83,10 +83,10 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     """
     config = config or SkeletonConfig()
     finder = SkeletonFinder(template, poses, config, progress, step)
-    coarse, symmetric = finder.coarse_skeleton(config.parts)
-    found = SkeletonSearch(finder.whole_skeleton(coarse), tuple(_opened(loop, coarse) for loop in finder.runs[0].loops),
-                           finder.whole.symmetry, symmetric, tuple(run.energy for run in finder.runs),
-                           tuple(len(run.links) + 1 for run in finder.runs))
+    best = finder.runs[0]
+    skeleton, symmetric = finder.skeleton(best, config.parts)
+    found = SkeletonSearch(skeleton, tuple(_opened(loop, skeleton) for loop in best.loops), finder.symmetry, symmetric,
+                           tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
     if progress is not None:
         progress(config.restarts + 1, config.restarts + 1)
     return found

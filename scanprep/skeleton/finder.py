@@ -1,15 +1,15 @@
-"""The search for a skeleton, begun anew several times on a coarse copy of the body, and its best result."""
+"""The search for a skeleton, begun anew several times, and its best result."""
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
+from ..batch.pool import SideBySide
 from ..batch.room import Step, once
 from ..geometry.mesh import Mesh, check_template
-from .coarse import coarse_copy, parts_of_source
 from .joints import (
     LOOP_SEPARATION,
     Loop,
@@ -32,29 +32,11 @@ from .tree import Skeleton, reorder
 Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
 
 
-@dataclass(frozen=True, eq=False)
-class _Body:
-    """A template in its poses (M, N, 3), metres, and its best mirror symmetry."""
-
-    template: Mesh
-    poses: np.ndarray
-    symmetry: Symmetry
-
-    @cached_property
-    def surface(self) -> PosedSurface:
-        return PosedSurface(self.template, self.poses)
-
-    def both_ways(self) -> _Body:
-        """With every pose also mirrored."""
-        mirrored = mirrored_poses(self.template, self.poses, self.symmetry)
-        return _Body(self.template, np.concatenate([self.poses, mirrored]), self.symmetry)
-
-
 class SkeletonFinder:
-    """The search, begun anew several times on a coarse copy of the body: skeletons of any number of parts follow.
+    """The search, begun anew several times: skeletons of any number of parts follow from the same restarts.
 
     Arguments and errors are those of `find_skeleton`; the number of parts of the settings does not matter. `runs` are
-    the restarts, the best first.
+    the restarts, the best first, `first` the one that was begun first.
 
     [Articulated]
     """
@@ -63,49 +45,32 @@ class SkeletonFinder:
                  progress: Callable[[int, int], None] | None = None, step: Step = once) -> None:
         check_template(template)
         poses = _checked_poses(template, poses)
-        self.config, self.copy = config, coarse_copy(template)
-        self.whole = self.coarse = _Body(template, poses, find_symmetry(template, poses))
-        if len(self.copy.template.vertices) < len(template.vertices):
-            few = self.copy.transfer(poses)
-            self.coarse = _Body(self.copy.template, few, find_symmetry(self.copy.template, few))
-        kinds = self.whole.symmetry, self.coarse.symmetry
-        holds = all(symmetry.holds for symmetry in kinds)
-        tied = holds if config.symmetric is None else config.symmetric
-        if tied and not all(symmetry.two_sided for symmetry in kinds):
+        self.template, self.config, self.symmetry = template, config, find_symmetry(template, poses)
+        tied = self.symmetry.holds if config.symmetric is None else config.symmetric
+        if tied and not self.symmetry.two_sided:
             raise ValueError("symmetric: this template has no two sides")
-        tell = _progress(progress, config.restarts)
+        tell, self.surface = _progress(progress, config.restarts), PosedSurface(template, poses)
         # a restart knows nothing of the count of parts or of the other restarts
-        kept = partial(step, inputs=(self.coarse.template, self.coarse.poses,
-                                     replace(config, parts=None, restarts=1)))
-        symmetry = self.coarse.symmetry if tied else None
-        self.runs = _restarts(self.coarse.surface, config, symmetry, tell, kept)    # [Articulated] E- and M-steps
-        if tied and holds and _held_back(self.runs[0]):              # few poses: a limb bends on one side alone
-            self.whole, self.coarse = self.whole.both_ways(), self.coarse.both_ways()
-            self.runs = _restarts(self.coarse.surface, config, symmetry, tell, kept, "mirrored")
+        kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
+        symmetry = self.symmetry if tied else None
+        runs = _restarts(self.surface, config, symmetry, tell, kept)                # [Articulated] E- and M-steps
+        if tied and self.symmetry.holds and _held_back(_best(runs)):     # few poses: a limb bends on one side alone
+            both = np.concatenate([poses, mirrored_poses(template, poses, self.symmetry)])
+            self.surface = PosedSurface(template, both)
+            runs = _restarts(self.surface, config, symmetry, tell, kept, "mirrored")
+        self.first, self.runs = runs[0], sorted(runs, key=lambda run: run.score)
 
-    def coarse_skeleton(self, parts: int | None) -> tuple[Skeleton, bool]:
-        """The skeleton on the coarse copy, with so many parts if told, and whether left and right are alike."""
-        body, config = self.coarse, replace(self.config, parts=parts)
-        label, links, tied = _of_count(self.runs[0], body.surface, config)
+    def skeleton(self, run: Restart, parts: int | None) -> tuple[Skeleton, bool]:
+        """The skeleton that a restart leads to, of so many parts if told, and whether left and right are alike."""
+        surface, config = self.surface, replace(self.config, parts=parts)
+        label, links, tied = _of_count(run, surface, config)
         if tied:
-            label = _borders_untied(body.surface, config, label, links)
-        joints = place_joints(body.surface, label, body.surface.core_motions(label), links)     # [Articulated] joints
-        skeleton = _assembled(body.template, label, links, joints)
+            label = _borders_untied(surface, config, label, links)
+        joints = place_joints(surface, label, surface.core_motions(label), links)   # [Articulated] joints
+        skeleton = _assembled(self.template, label, links, joints)
         if tied:
-            skeleton = replace(skeleton, names=name_parts(body.template, skeleton, body.symmetry))
+            skeleton = replace(skeleton, names=name_parts(self.template, skeleton, self.symmetry))
         return skeleton, tied
-
-    def whole_skeleton(self, coarse: Skeleton) -> Skeleton:
-        """A skeleton of the coarse copy on the body itself, with borders and joints where the whole surface wants them.
-        """
-        body, links = self.whole, np.stack([coarse.parents, np.arange(len(coarse.parents))], axis=1)[1:]
-        if self.coarse.template is body.template:
-            return coarse
-        label = parts_of_source(self.copy, coarse.part_of_vertex(self.coarse.template))
-        label = _borders_untied(body.surface, self.config, label, links)
-        joints = coarse.joints.copy()
-        joints[1:] = place_joints(body.surface, label, body.surface.core_motions(label), links)
-        return Skeleton(label, coarse.parents, joints, coarse.names).with_root_centred(body.template)
 
 
 def _checked_poses(template: Mesh, poses: np.ndarray) -> np.ndarray:
@@ -135,7 +100,7 @@ def _progress(progress: Callable[[int, int], None] | None, restarts: int) -> Cal
 
 
 @dataclass(frozen=True, eq=False)
-class _Restart:
+class Restart:
     """One beginning of the search and where it ended."""
 
     label: np.ndarray  # (F,) int: parts
@@ -147,18 +112,24 @@ class _Restart:
 
 
 def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None, tell: Callable[..., None],
-              kept: Callable[..., Tree], poses: str = "") -> list[_Restart]:
-    """All restarts, the best first; `poses` says which, for what is kept."""
+              kept: Callable[..., Tree], poses: str = "") -> list[Restart]:
+    """All restarts; `poses` says which, for what is kept."""
     rng = np.random.default_rng(config.seed)
+    searches = [PartSearch(surface, config, symmetry, rng) for _ in range(config.restarts)]
     runs = []
-    for number in range(config.restarts):
-        search = PartSearch(surface, config, symmetry, rng)
-        label, links, loops = kept(f"{poses or ('free' if symmetry is None else 'symmetric')} restart {number}",
-                                   make=partial(_searched, search))
-        search.forget()
-        runs.append(_Restart(label, links, loops, search.energy(label) / surface.area, _score(search, label), search))
-        tell()
-    return sorted(runs, key=lambda run: run.score)
+    with SideBySide(_searched, searches) as found:
+        for number, search in enumerate(searches):
+            label, links, loops = kept(f"{poses or ('free' if symmetry is None else 'symmetric')} restart {number}",
+                                       make=partial(found, number))
+            search.forget()
+            runs.append(Restart(label, links, loops, search.energy(label) / surface.area, _score(search, label),
+                                search))
+            tell()
+    return runs
+
+
+def _best(runs: list[Restart]) -> Restart:
+    return min(runs, key=lambda run: run.score)
 
 
 def _searched(search: PartSearch) -> Tree:
@@ -209,13 +180,13 @@ def _settled(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[
     return (moved, tree) if moved.max() == label.max() and len(tree) == len(links) else (label, links)
 
 
-def _held_back(run: _Restart) -> bool:
+def _held_back(run: Restart) -> bool:
     """Whether parts that need not be symmetric would fit far better, beginning with those found."""
     free = PartSearch(run.search.surface, replace(run.search.config, patches=2))
     return free.energy(free.alternate(run.label, rounds=10)) < 0.85 * run.search.energy(run.label)
 
 
-def _of_count(best: _Restart, surface: PosedSurface, config: SkeletonConfig) -> tuple[np.ndarray, np.ndarray, bool]:
+def _of_count(best: Restart, surface: PosedSurface, config: SkeletonConfig) -> tuple[np.ndarray, np.ndarray, bool]:
     """Labels and links of exactly as many parts as asked for, and whether they are symmetric.
 
     A count that no symmetric tree has is reached with one part that is not.
@@ -233,20 +204,12 @@ def _of_count(best: _Restart, surface: PosedSurface, config: SkeletonConfig) -> 
 
 
 def _borders_untied(surface: PosedSurface, config: SkeletonConfig, label: np.ndarray, links: np.ndarray) -> np.ndarray:
-    """Labels after borders and core motions alternated on both sides by themselves, as long as the tree stays: no body
-    is quite symmetric.
-    """
-    free, links = PartSearch(surface, replace(config, patches=2)), np.sort(links, axis=1)
-    for _ in range(12):
-        moved = free.alternate(label, rounds=1, core=True)
-        touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
-        if moved.max() != label.max() or not touching.issuperset(map(tuple, links.tolist())):
-            break
-        changed = surface.face_weights[moved != label].sum()
-        label = moved
-        if changed < 5e-4:                                           # of the surface
-            break
-    return label
+    """Labels of the same tree after the borders of both sides moved each by itself: no body is quite symmetric."""
+    free = PartSearch(surface, replace(config, patches=2))
+    moved = free.alternate(label, rounds=12, core=True)
+    touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
+    same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
+    return moved if same else label
 
 
 def _assembled(template: Mesh, label: np.ndarray, links: np.ndarray, joints: np.ndarray) -> Skeleton:

@@ -17,8 +17,8 @@ from protocols import load_real, machine, scape_fold, write_report
 from model import LearnConfig
 from model.blending import BlendedTemplate, rigid_weights
 from model.fitting import PoseFitter
+from model.learning.parts import coarse_copy, coarse_skeleton
 from model.learning.scape import Work, learn_pose
-from scanprep.skeleton.coarse import VERTICES, coarse_copy
 from scanprep.skeleton.tree import Skeleton
 
 SETTINGS = {
@@ -49,28 +49,26 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("regressors.json"))
     parser.add_argument("--skeletons", type=Path, required=True)
     parser.add_argument("--folds", type=int, nargs="*", default=range(5))
-    parser.add_argument("--vertices", type=int, default=VERTICES)
+    parser.add_argument("--vertices", type=int, default=2500)
     args = parser.parse_args()
     data = load_real()
-    copy = coarse_copy(data.template, args.vertices)
+    vertices, coarse = coarse_copy(data.template, args.vertices)
     rows = []
     for path in sorted(args.skeletons.glob("*.json")):
         finder, fold = path.stem.split(".")[-1][:-1], path.stem[-1]
         if finder not in ("chosen", "rigid") or int(fold) not in args.folds:
             continue
         train, held = scape_fold(int(fold), len(data.poses))
-        whole = Skeleton.load(path)
-        skeleton = Skeleton(whole.part_of_face[copy.face_map], whole.parents, whole.joints)
-        skeleton = skeleton.with_root_centred(copy.template)
-        parts = BlendedTemplate(copy.template, skeleton, rigid_weights(skeleton))
+        skeleton = coarse_skeleton(Skeleton.load(path), data.template, coarse)
+        parts = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton))
         for name, config in SETTINGS.items():
-            bodies = copy.transfer(data.poses)
+            bodies = data.poses[:, vertices]
             row = {"fold": int(fold), "skeleton": finder, "parts": len(skeleton.parents), "setting": name,
                    **run(config, parts, bodies[train], bodies[held])}
             rows.append(row)
             print(row, flush=True)
-            write_report(args.output, {"protocol": f"SCAPE-5fold on {len(copy.vertex_map)} vertices",
-                                       "machine": machine(), "rows": rows})
+            write_report(args.output, {"protocol": f"SCAPE-5fold on {len(vertices)} vertices", "machine": machine(),
+                                       "rows": rows})
 
 
 if __name__ == "__main__":
