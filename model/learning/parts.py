@@ -38,7 +38,8 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
 
     The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
     one, and a model of it gains from more parts than that: so finer skeletons are sought from the same restarts, a
-    model is learned with each on a coarse copy of the bodies, and they are kept while the error of left-out poses falls.
+    model is learned with each on a coarse copy of the bodies, and they are kept while the error of left-out poses
+    falls.
 
     Parameters
     ----------
