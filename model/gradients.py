@@ -113,7 +113,8 @@ class ShapeSolver:
 
     # Conjugate gradients do not pay. Preconditioned with one factor for all, carried over to each person by Q, and
     # with twelve people at once, they take 9 steps and two thirds of the time to agree to 1e-11 where people stand in
-    # about one pose, but 45 steps in mixed poses, and more time than factoring.
+    # about one pose, but 45 steps in mixed poses, and more time than factoring. Of that, cholespy's search for an order
+    # of elimination is three quarters, for every person anew; SuperLU in a given order takes 0.43 s against 0.56.
 
     def __init__(self, system: GradientSystem, posed: np.ndarray) -> None:
         self.system, self.posed = system, posed
