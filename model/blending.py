@@ -66,9 +66,16 @@ class BlendedTemplate:
         """(F, 2, 3) edges of the template, metres."""
         return edges(self.template.vertices, self.template.faces)
 
+    @cached_property
+    def _kinds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (K, J) that differ, and which of them every triangle (F,) has: whole parts turn alike."""
+        kinds, which = np.unique(self.weights, axis=0, return_inverse=True)
+        return kinds, which.ravel()
+
     def rotations(self, pose: np.ndarray) -> np.ndarray:
         """(F, 3, 3) rotation, or mixture of rotations, of every triangle at one pose (J, 3)."""
-        return np.tensordot(self.weights, self.skeleton.part_rotations(pose), axes=1)
+        kinds, which = self._kinds
+        return np.tensordot(kinds, self.skeleton.part_rotations(pose), axes=1)[which]
 
     def posed(self, Q: np.ndarray) -> np.ndarray:
         """`Q v̂` (..., F, 2, 3) for Q (..., F, 3, 3)."""
@@ -83,7 +90,9 @@ class BlendedTemplate:
         """
         if pose.ndim == 3:
             return np.stack([self.local_edges(y, p) for y, p in zip(vertices, pose, strict=True)])
-        return edges(vertices, self.template.faces) @ np.swapaxes(np.linalg.inv(self.rotations(pose)), -1, -2)
+        kinds, which = self._kinds
+        back = np.linalg.inv(np.tensordot(kinds, self.skeleton.part_rotations(pose), axes=1))
+        return edges(vertices, self.template.faces) @ np.swapaxes(back, -1, -2)[which]
 
     def stitched(self, Q: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Vertices (N, 3) for Q, or S Q, (F, 3, 3) at one pose, the root's joint in the origin.

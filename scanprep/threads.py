@@ -19,6 +19,7 @@ Who sets OMP_NUM_THREADS, OPENBLAS_NUM_THREADS or MKL_NUM_THREADS gets that many
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import threading
 from collections.abc import Iterator
@@ -30,6 +31,7 @@ LIBIGL = "IGL_NUM_THREADS"
 _guard = threading.Lock()
 _before: list[tuple[Any, int]] = []  # libraries, and the threads they had
 _users = 0
+_in_worker = False
 
 
 def asked() -> int | None:
@@ -73,11 +75,18 @@ def search_threads(points: int) -> int:
     return asked() or _cores()
 
 
+def helpers(at_most: int) -> int:
+    """Processes that a computation may take beside this one's: as many as there are cores; none in a worker process."""
+    alone = _in_worker or multiprocessing.current_process().daemon
+    return 0 if alone or _cores() == 1 else min(_cores(), at_most)
+
+
 def begin_worker() -> None:
     """To be called first in every worker process: one thread for all that it does, or the user's own number."""
+    global _in_worker
     from threadpoolctl import threadpool_limits
 
-    number = asked() or 1
+    _in_worker, number = True, asked() or 1
     for name in (*VARIABLES, LIBIGL):
         os.environ.setdefault(name, str(number))
     threadpool_limits(number)

@@ -28,6 +28,7 @@ def nothing_asked(monkeypatch):
     """Two threads, as a library that nobody has told anything would take."""
     for name in (*VARIABLES, threads.LIBIGL):
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(threads, "_in_worker", False)
     with threadpool_limits(2):
         assert pools() == {2}
         yield

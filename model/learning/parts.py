@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scanprep.batch.room import Step, once
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.finder import SkeletonFinder
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -37,8 +37,9 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     """A skeleton with as many parts as help to predict poses that were left out.
 
     The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
-    one, and a model of it gains from more parts than that: so finer skeletons are sought, a model is learned with each
-    on a coarse copy of the bodies, and they are kept while the error of left-out poses falls.
+    one, and a model of it gains from more parts than that: so finer skeletons are sought from the same restarts, a
+    model is learned with each on a coarse copy of the bodies, and they are kept while the error of left-out poses
+    falls.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     progress : callable, optional
         Called with the skeletons done and their largest number.
     step : callable, optional
-        Keeps every skeleton and its error, as `scanprep.batch.room.Step`.
+        Keeps every restart, skeleton and error, as `scanprep.batch.room.Step`.
 
     Raises
     ------
@@ -57,40 +58,47 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     """
     tell = progress or (lambda done, total: None)
     poses = np.asarray(poses, dtype=np.float64)
+    settings = SkeletonConfig()
+    whole = 1 + settings.restarts + TRIES
+    finder = SkeletonFinder(template, poses, settings, lambda done, total: tell(done, whole), step)
     vertices, coarse = coarse_copy(template, VERTICES)
 
-    def tried(settings: SkeletonConfig) -> tuple[Skeleton, float] | None:
-        """A skeleton and its error; None where there is no tree of so many parts, or parts are too small to compare."""
-        try:
-            found = find_skeleton(template, poses, settings, step=step)
-            return found, _left_out_error(poses[:, vertices], coarse_skeleton(found, template, coarse), coarse)
-        except ValueError:
-            if settings.parts is None:
-                raise
-            return None
+    def tried(parts: int | None) -> tuple[Skeleton, float] | None:
+        name = "best parts" if parts is None else f"{parts} parts"
+        return step(name, (template, poses, settings, parts, QUICK, VERTICES),
+                    lambda: _tried(finder, parts, coarse, poses[:, vertices]))
 
-    def kept(settings: SkeletonConfig) -> tuple[Skeleton, float] | None:
-        name = "best parts" if settings.parts is None else f"{settings.parts} parts"
-        return step(name, (template, poses, settings, QUICK, VERTICES), lambda: tried(settings))
-
-    first = kept(SkeletonConfig())
+    first = tried(None)
     assert first is not None, "what goes wrong without a count of parts is raised"
     best, least = first
     errors = {len(best.parents): least}
-    tell(1, 1 + TRIES)
-    for done in range(TRIES):
+    for done in range(1, 1 + TRIES):
         wanted = len(best.parents) + MORE
-        finer = kept(SkeletonConfig(parts=wanted, restarts=1))
+        finer = tried(wanted)
+        tell(settings.restarts + done, whole)
         if finer is None:
             break
         errors[wanted] = finer[1]
-        tell(2 + done, 1 + TRIES)
         # share of the left-out error that more parts must save to be kept
         if errors[wanted] > (1 - 0.03) * errors[len(best.parents)]:
             break
         best = finer[0]
-    tell(1 + TRIES, 1 + TRIES)
+    tell(whole, whole)
     return ChosenSkeleton(best, errors)
+
+
+def _tried(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray
+           ) -> tuple[Skeleton, float] | None:
+    """A skeleton and its error on coarse bodies (M, n, 3); None where there is no tree of so many parts, or parts are
+    too small to compare.
+    """
+    try:
+        found = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
+        return found, _left_out_error(poses, coarse_skeleton(found, finder.template, coarse), coarse)
+    except ValueError:
+        if parts is None:
+            raise
+        return None
 
 
 def coarse_copy(template: Mesh, count: int) -> tuple[np.ndarray, Mesh]:

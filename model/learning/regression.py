@@ -14,7 +14,6 @@ from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift, RadialLift
 from ..pose_space import PoseSpace, faces_of_part, kept_directions, nearest_joints
 from .config import LearnConfig
 
-Judge = Callable[[np.ndarray], float]
 RADII = (0.5, 0.7, 1.0)              # radians: standard deviations of the bells, of which the best is chosen
 TUBE = 2e-4                          # metres: smaller errors of an edge cost nothing to support-vector regression
 
@@ -39,19 +38,15 @@ class Design:
 
     def fit(self, poses: np.ndarray, Q: np.ndarray) -> PoseSpace:
         """Q (M, F, 3, 3), seen at poses (M, J, 3), as a function of the features. [SCAPE] Eq. 4"""
-        delta = self.features.evaluate(poses)
-        v_hat = self.template.corners[:, 1:] - self.template.corners[:, :1]
+        seen = self.seen(poses)
+        return seen.fit(seen.sums(Q))
 
-        def solve(used: np.ndarray, faces: np.ndarray) -> np.ndarray:
-            X, flat = delta[:, used[1:]], Q[:, faces].reshape(len(delta), -1)
-            centre, mean = X.mean(axis=0), flat.mean(axis=0)
-            if self.regressor == "svr":
-                slope, mean = _support_vectors(X - centre, Q[:, faces], v_hat[faces], self.ridge)
-            else:
-                slope = ridge_operator(X - centre, self.ridge) @ flat
-            return np.concatenate([(mean - centre @ slope)[None], slope])
-
-        return self.space(solve)
+    def seen(self, poses: np.ndarray) -> SeenPoses:
+        """The poses (M, J, 3) as least squares sees them; support vectors see every pose by itself."""
+        delta, features = self.features.evaluate(poses), self.features
+        bases = [np.eye(len(delta)) if self.regressor == "svr" else np.linalg.qr(delta[:, features.of_part(p)])[0]
+                 for p in range(len(features.starts))]
+        return SeenPoses(self, poses, delta, bases)
 
     def space(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> PoseSpace:
         """The pose space with the coefficients (n, 9f) that `solve` finds for each group, from its features (n,), the
@@ -70,11 +65,64 @@ class Design:
         return PoseSpace(features, coefficients)
 
 
-def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, config: LearnConfig,
-                  judge: Judge, start: Design | None = None) -> Design:
-    """The features, pruning and penalty that predict left-out poses best, one sought after the other, of poses
-    (M, J, 3) and Q (M, F, 3, 3). The judge gives the error in metres of predictions of Q, each made without its own
-    pose. The choices begin with those of `start`, or with the middle of what there is. [SCAPE] Eq. 4
+@dataclass(frozen=True, eq=False)
+class SeenPoses:
+    """Poses (M, J, 3) with their features (M, A), and for every part an orthonormal basis (M, r) of what its features
+    are in the poses.
+
+    Least squares asks nothing more of Q than its sums over the poses along that basis, which are far fewer than poses.
+    Where Q is itself a linear function of edges, those of the edges are enough.
+    """
+
+    design: Design
+    poses: np.ndarray
+    delta: np.ndarray
+    bases: list[np.ndarray]
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Sums (r, F, ...) of values (M, F, ...) along the basis of the part of every triangle."""
+        out = np.zeros((max(basis.shape[1] for basis in self.bases), *values.shape[1:]))
+        for basis, faces in zip(self.bases, faces_of_part(self.design.features.skeleton), strict=True):
+            along = basis.T @ values[:, faces].reshape(len(values), -1)
+            out[:basis.shape[1], faces] = along.reshape(-1, len(faces), *values.shape[2:])
+        return out
+
+    def of_space(self, space: PoseSpace) -> np.ndarray:
+        """The sums (r, F, 3, 3) of what a pose space says of the poses."""
+        delta = space.features.evaluate(self.poses)
+        out = np.zeros((max(basis.shape[1] for basis in self.bases), len(self.design.template.faces), 3, 3))
+        for p, (basis, faces) in enumerate(zip(self.bases, space.faces_of_part, strict=True)):
+            along = basis.T @ delta[:, space.features.of_part(p)]
+            out[:basis.shape[1], faces] = np.tensordot(along, space.coefficients[p].astype(np.float64), axes=1)
+        return out
+
+    def fit(self, sums: np.ndarray) -> PoseSpace:
+        """Q as a function of the features, from its sums (r, F, 3, 3). [SCAPE] Eq. 4"""
+        design, M = self.design, len(self.poses)
+        v_hat = design.template.corners[:, 1:] - design.template.corners[:, :1]
+
+        def solve(used: np.ndarray, faces: np.ndarray) -> np.ndarray:
+            basis = self.bases[design.features.part[used[0]]]
+            ones, X, Q = basis.sum(axis=0), basis.T @ self.delta[:, used[1:]], sums[:basis.shape[1], faces]
+            centre, flat = ones @ X / M, Q.reshape(len(Q), -1)
+            X, mean = X - np.outer(ones, centre), ones @ flat / M
+            if design.regressor == "svr":
+                slope, mean = _support_vectors(X, Q, v_hat[faces], design.ridge)
+            else:
+                slope = ridge_operator(X, M * design.ridge) @ flat
+            return np.concatenate([(mean - centre @ slope)[None], slope])
+
+        return design.space(solve)
+
+
+Judge = Callable[[Design], float]
+
+
+def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: LearnConfig, judge: Judge,
+                  start: Design | None = None) -> Design:
+    """The features, pruning and penalty that predict left-out poses of (M, J, 3) best, one sought after the other. The
+    judge gives the error of a design in metres. The choices begin with those of `start`, or with the middle of what
+    there is. [SCAPE] Eq. 4
     """
     choices = {"pruning": config.prunings, "radius": RADII if config.features == "radial" else (float("nan"),),
                "ridge": config.ridges}
@@ -83,7 +131,7 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
         at = {name: getattr(start, name) for name in choices}
     def tried(**chosen: float) -> Design:
         design = make_design(template, skeleton, poses, config, **{**at, **chosen})
-        return replace(design, left_out_error=judge(_left_out(design, poses, Q)))
+        return replace(design, left_out_error=judge(design))
 
     best = tried()
     for name, values in choices.items():
@@ -150,24 +198,52 @@ def _groups(template: Mesh, features: PoseFeatures) -> list[tuple[int, np.ndarra
     return groups
 
 
-def ridge_operator(centred: np.ndarray, ridge: float) -> np.ndarray:
+def ridge_operator(centred: np.ndarray, penalty: float) -> np.ndarray:
     """(n, M) matrix that gives the slopes of a ridge regression on centred features (M, n)."""
     M, n = centred.shape
     if n <= M:
-        return np.linalg.solve(centred.T @ centred + (M * ridge + 1e-12) * np.eye(n), centred.T)
-    return centred.T @ np.linalg.inv(centred @ centred.T + (M * ridge + 1e-12) * np.eye(M))
+        return np.linalg.solve(centred.T @ centred + (penalty + 1e-12) * np.eye(n), centred.T)
+    return centred.T @ np.linalg.inv(centred @ centred.T + (penalty + 1e-12) * np.eye(M))
 
 
-def _left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """Q (M, F, 3, 3) of every pose as ridge regression on the other poses predicts it, in closed form."""
+def _left_out_operator(design: Design, delta: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """(M, M) from what is regressed on features `used` of the poses' (M, A) to how far each pose is off where ridge
+    regression on the others predicts it, in closed form.
+    """
+    X = delta[:, used] - delta[:, used].mean(axis=0)
+    hat = X @ ridge_operator(X, len(X) * design.ridge) + 1 / len(X)
+    return (np.eye(len(X)) - hat) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
+
+
+def left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """Q (M, F, 3, 3) of every pose as ridge regression on the other poses predicts it."""
     delta, out = design.features.evaluate(poses), np.empty_like(Q)
     for _, used, faces in design.groups:
-        X = delta[:, used] - delta[:, used].mean(axis=0)
-        hat = X @ ridge_operator(X, design.ridge) + 1 / len(X)
-        target = Q[:, faces].reshape(len(X), -1)
-        off = (target - hat @ target) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
-        out[:, faces] = (target - off).reshape(len(X), len(faces), 3, 3)
+        target = Q[:, faces].reshape(len(Q), -1)
+        predicted = target - _left_out_operator(design, delta, used) @ target
+        out[:, faces] = predicted.reshape(len(Q), len(faces), 3, 3)
     return out
+
+
+def by_edges(template: Mesh, poses: np.ndarray, Q: np.ndarray) -> Judge:
+    """The root mean square error of the edges of left-out poses, metres, of poses (M, J, 3) and Q (M, F, 3, 3).
+
+    Off by L T, the edges T (M, 6f) of a group of triangles count as trace(L T Tᵀ Lᵀ): their products are summed once.
+    """
+    v_hat, products = np.swapaxes(template.corners[:, 1:] - template.corners[:, :1], -1, -2), list[np.ndarray]()
+
+    def error(design: Design) -> float:
+        if not products:                                            # groups are the same in all designs of a skeleton
+            for _, _, faces in design.groups:
+                edges = (Q[:, faces] @ v_hat[faces]).reshape(len(Q), -1)
+                products.append(edges @ edges.T)
+        delta, total = design.features.evaluate(poses), 0.0
+        for (_, used, _), product in zip(design.groups, products, strict=True):
+            off = _left_out_operator(design, delta, used)
+            total += float(((off @ product) * off).sum())
+        return float(np.sqrt(max(total, 0.0) / (len(Q) * 2 * len(template.faces))))
+
+    return error
 
 
 def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: float

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from scanprep.batch.pool import SideBySide
 from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
@@ -30,7 +31,7 @@ from ..priors import STIFF, stiff_joints
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
-from .regression import Design, choose_design, compress
+from .regression import Design, Judge, by_edges, choose_design, compress, left_out
 
 Progress = Callable[[int, int], None]
 T = TypeVar("T")
@@ -150,26 +151,27 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
 def _learned(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, inputs: object, work: Work
              ) -> LearnedPose:
     share = 1 / (1 + config.refinements)
-    learned = work.step("first fit", inputs, share, lambda _: _first(parts, bodies, config))
+    system = GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
+    learned = work.step("first fit", inputs, share, lambda _: _first(parts, system, bodies, config))
     for k in range(config.refinements):
         learned = work.step(f"refinement {k}", inputs, share,
-                            partial(_refined, parts, bodies, config, learned, k == 0))
+                            partial(_refined, parts, system, bodies, config, learned, k == 0))
     tolerance = config.detail * parts.template.mean_edge
     return learned if not tolerance else replace(
         learned, space=compress(learned.space, learned.poses, parts.template, tolerance))
 
 
-def _first(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig) -> LearnedPose:
+def _first(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig) -> LearnedPose:
     """Q of every body from the rotations of Procrustes, regressed on the joint twists."""
     skeleton = parts.skeleton
     poses = skeleton.pose_of(skeleton.fit_rotations(parts.template, bodies))                     # R, then Δr
-    Q = pose_gradients(_system(parts, config), parts.local_edges(bodies, poses))                # [SCAPE] Eq. 5
-    design = choose_design(parts.template, skeleton, poses, Q, config, _by_edges(parts, Q))
+    Q = pose_gradients(system, parts.local_edges(bodies, poses))                                # [SCAPE] Eq. 5
+    design = choose_design(parts.template, skeleton, poses, config, by_edges(parts.template, poses, Q))
     return LearnedPose(design.fit(poses, Q), poses, design)                                     # [SCAPE] Eq. 4
 
 
-def _refined(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, learned: LearnedPose, choosing: bool,
-             work: Work) -> LearnedPose:
+def _refined(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig,
+             learned: LearnedPose, choosing: bool, work: Work) -> LearnedPose:
     """The part rotations fitted anew, and Q regressed again on what the stitched model leaves.
 
     Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So what the stitched model
@@ -177,22 +179,24 @@ def _refined(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, le
     majorise and minimise, which lowers the error of the stitched edges step by step. What Q depends on is chosen first
     by the edges of left-out poses, and after the first fit of the rotations once more by their stitched vertices.
     """
-    space, design, system = learned.space, learned.design, _system(parts, config)
-    poses = fit_poses(parts.subject(space), bodies, learned.poses, work)
+    space, design, subject = learned.space, learned.design, parts.subject(learned.space)
+    poses = fit_poses(subject, bodies, learned.poses, work)
     # corrections of the regression after each fit of the part rotations
     for number in range(3):
-        left = bodies - parts.subject(space).vertices(poses)
-        Q = space.gradients(poses)
-        Q += pose_gradients(system, parts.v_hat + parts.local_edges(left, poses)) - np.eye(3)   # [SCAPE] Eq. 5
+        subject = parts.subject(space) if number else subject
+        left = parts.local_edges(bodies - subject.vertices(poses), poses)
         if choosing and number == 0:
-            design = choose_design(parts.template, parts.skeleton, poses, Q, config, _by_vertices(parts, bodies, poses),
-                                   design)
-        space = design.fit(poses, Q)                                                            # [SCAPE] Eq. 4
+            Q = space.gradients(poses) + _correction(parts, system, left)
+            design = choose_design(parts.template, parts.skeleton, poses, config,
+                                   _by_vertices(parts, bodies, poses, Q), design)
+        seen = design.seen(poses)
+        space = seen.fit(seen.of_space(space) + _correction(parts, system, seen.sums(left)))    # [SCAPE] Eq. 4
     return LearnedPose(space, poses, design)
 
 
-def _system(parts: BlendedTemplate, config: LearnConfig) -> GradientSystem:
-    return GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
+def _correction(parts: BlendedTemplate, system: GradientSystem, left: np.ndarray) -> np.ndarray:
+    """What edges (n, F, 2, 3) that the model leaves add to Q (n, F, 3, 3), which is linear in them. [SCAPE] Eq. 5"""
+    return pose_gradients(system, parts.v_hat + left) - np.eye(3)
 
 
 def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Work, config: FitConfig | None = None
@@ -206,23 +210,12 @@ def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Wor
     return np.stack(fitted)
 
 
-def _by_edges(parts: BlendedTemplate, Q: np.ndarray) -> Callable[[np.ndarray], float]:
-    """A judge of predictions of Q (M, F, 3, 3): the root mean square error of an edge."""
-    v_hat = np.swapaxes(parts.v_hat, -1, -2)
-
-    def error(predicted: np.ndarray) -> float:
-        return float(np.sqrt(np.mean([(((q - p) @ v_hat) ** 2).sum(axis=1).mean()
-                                      for q, p in zip(Q, predicted, strict=True)])))
-
-    return error
-
-
-def _by_vertices(parts: BlendedTemplate, bodies: np.ndarray, poses: np.ndarray) -> Callable[[np.ndarray], float]:
-    """A judge of predictions of Q (M, F, 3, 3): the mean distance of the stitched vertices, well placed."""
-    def error(predicted: np.ndarray) -> float:
+def _by_vertices(parts: BlendedTemplate, bodies: np.ndarray, poses: np.ndarray, Q: np.ndarray) -> Judge:
+    """The mean distance of the stitched vertices of left-out poses, well placed, metres, of Q (M, F, 3, 3)."""
+    def error(design: Design) -> float:
         far = []
-        for body, pose, Q in zip(bodies, poses, predicted, strict=True):
-            off = parts.stitched(Q, pose) - body
+        for body, pose, predicted in zip(bodies, poses, left_out(design, poses, Q), strict=True):
+            off = parts.stitched(predicted, pose) - body
             far.append(np.linalg.norm(off - off.mean(axis=0), axis=1).mean())
         return float(np.mean(far))
 
@@ -253,15 +246,16 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
     template, skeleton = parts.template, parts.skeleton
     system = GradientSystem(template, config.smoothness)
 
-    def deformation(y: np.ndarray, _: Work) -> np.ndarray:
+    def deformation(y: np.ndarray) -> np.ndarray:
         pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
         posed = parts.posed(space.gradients(pose))
         return shape_gradients(system, posed, parts.local_edges(y, pose)).astype(np.float32)
 
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
-    for i, y in enumerate(shapes):
-        S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1 / len(shapes),
-                         partial(deformation, y))
+    with SideBySide(deformation, list(shapes)) as found:
+        for i, y in enumerate(shapes):
+            S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1 / len(shapes),
+                             lambda _, number=i: found(number))                # type: ignore[misc]
     return S
 
 

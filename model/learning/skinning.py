@@ -236,7 +236,7 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
         target, scale = unposed[:, mine].reshape(M, -1), freedom[joint[used]]
         centre, middle = delta[:, used].mean(axis=0) * scale, target.mean(axis=0)
         X = delta[:, used] * scale - centre
-        solver = ridge_operator(X, ridge)
+        solver = ridge_operator(X, M * ridge)
         slope, hat = solver @ target, X @ solver + 1 / M
         left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         total += float((left**2).sum())

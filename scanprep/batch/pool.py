@@ -6,13 +6,16 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Generic, TypeVar, cast
 
 from ..ranges import FLAG, Processes, Settings
-from ..threads import begin_worker
+from ..threads import begin_worker, helpers
 from .room import Failure, Job, Progress, attempt
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,58 @@ def _run_in_processes(work: Any, jobs: Sequence[Job], count: int) -> Iterator[tu
                 yield group[0], Failure(f"{group[0].name}: the process at work on it died: {death}")
 
 
+class SideBySide(Generic[T, R]):
+    """What a function makes of items that are asked for one after the other, worked out in processes ahead of that.
+
+    The first is done in this process. The others are too where that takes less than it would to start processes and to
+    fetch the results, where there is one core, and where a process dies, say for want of memory. The results are the
+    same. A context manager: leaving it ends the processes.
+    """
+
+    WORTH = 10.0                    # seconds of work left for which processes are started
+    AT_MOST = 4                     # processes: each holds what the function needs, and what it makes
+
+    def __init__(self, function: Callable[[T], R], items: Sequence[T]) -> None:
+        self._function, self._items = function, items
+        self._pool: Any = None
+        self._futures: dict[int, Any] = {}
+        self._helpers = helpers(self.AT_MOST)
+
+    def __enter__(self) -> SideBySide[T, R]:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(kill_workers=True)
+        self._pool, self._futures = None, {}
+
+    def __call__(self, number: int) -> R:
+        """The result of one item; a few that come after it are begun."""
+        if self._pool is None:
+            return self._here(number)
+        from loky.process_executor import BrokenProcessPool
+
+        try:
+            for ahead in range(number, min(number + 2 * self._helpers, len(self._items))):
+                if ahead not in self._futures:
+                    self._futures[ahead] = self._pool.submit(_call, self._items[ahead])
+            return cast(R, self._futures.pop(number).result())
+        except BrokenProcessPool:
+            self.__exit__()
+            self._helpers = 0
+            return self._here(number)
+
+    def _here(self, number: int) -> R:
+        begun = time.perf_counter()
+        result = self._function(self._items[number])
+        left = (time.perf_counter() - begun) * (len(self._items) - number - 1)
+        if self._helpers and left > self.WORTH:
+            from loky import ProcessPoolExecutor
+
+            self._pool = ProcessPoolExecutor(self._helpers, initializer=_begin, initargs=(self._function, os.getpid()))
+        return result
+
+
 class _Died(Exception):
     """A process ended without an answer."""
 
@@ -104,3 +159,7 @@ def _watch(parent: int) -> None:
 
 def _do(job: Job) -> Any:
     return attempt(_work, job)
+
+
+def _call(item: Any) -> Any:
+    return _work(item)
