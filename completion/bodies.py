@@ -2,13 +2,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
+from model.bilinear import PosedPoints
 from model.body import BodyModel
 from model.human_poses import human_poses
-from model.linear import Subject
+from model.linear import PointOperator, Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
@@ -17,6 +21,18 @@ from .energy import MovingPoints, moving_points
 
 Follow = Callable[[np.ndarray], MovingPoints]
 PEOPLE = 150                         # poses that people take, beside those a body was seen in
+
+
+class NearPoints(Protocol):
+    """Surface points (L,) of a body near some unknowns, as a function of them."""
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """(L, 3) metres, of unknowns (P,)."""
+        ...
+
+    def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        ...
 
 
 class FixedBody:
@@ -42,12 +58,17 @@ class FixedBody:
         people = human_poses(self.template, self.skeleton, PEOPLE, np.random.default_rng(0))
         return self.pose_examples if people is None else np.concatenate([self.pose_examples, people])
 
+    @cached_property
+    def _known_rotations(self) -> np.ndarray:
+        """(M, J, 3, 3) of the joints in the known poses."""
+        return rotations.exp(self.known_poses)
+
     def joints_from_known(self, pose: np.ndarray) -> np.ndarray:
         """(J,) radians by which each joint of a pose (J, 3) is turned from the nearest known one; 0 for the root."""
         if not len(self.known_poses):
             return np.zeros(len(pose))
-        turns = np.swapaxes(rotations.exp(self.known_poses), -1, -2) @ rotations.exp(pose)
-        away = np.linalg.norm(rotations.log(turns), axis=-1).min(axis=0)
+        trace = np.einsum("mjab,jab->mj", self._known_rotations, rotations.exp(pose)).max(axis=0)   # 1 + 2 cos
+        away = np.arccos(np.clip((trace - 1) / 2, -1, 1))
         away[0] = 0
         return away
 
@@ -64,6 +85,16 @@ class FixedBody:
     def held(self, x: np.ndarray) -> FixedBody:
         """The body with the shape it has at x (P,), as one of known shape."""
         return self
+
+    def some(self, ids: np.ndarray) -> FixedBody:
+        """The body of which there are only these vertices (L,): places and points are of them, by number."""
+        return self._of(replace(self.subject, operator=self.subject.points(ids)))
+
+    def _of(self, subject: Subject) -> FixedBody:
+        """The body of a subject in the same poses."""
+        out = FixedBody(subject)
+        out.known_poses, out._known_rotations = self.known_poses, self._known_rotations
+        return out
 
     def in_metres(self, x: np.ndarray) -> tuple[np.ndarray, float]:
         """Unknowns (P,) of the body at its own size, and what the scan has to be multiplied with for it."""
@@ -83,6 +114,10 @@ class FixedBody:
             return moving_points(*operator.jacobian(pose, trans))
 
         return move
+
+    def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
+        """As `follow`, for one body at a time."""
+        return PosedPoints(self.subject.points(vertex_ids))
 
 
 class ShapedBody(FixedBody):
@@ -110,7 +145,11 @@ class ShapedBody(FixedBody):
 
     def held(self, x: np.ndarray) -> FixedBody:
         """The body with the shape it has at x (P,), as one of known shape."""
-        return FixedBody(self.model.subject(self.split(x)[2]))
+        betas = self.split(x)[2]
+        return self._of(self.subject if np.array_equal(betas, self._at) else self.model.subject(betas))
+
+    def some(self, ids: np.ndarray) -> FixedBody:
+        return RoughBody(self, ids)
 
     def vertices(self, x: np.ndarray) -> np.ndarray:
         """The predicted mesh (N, 3) of unknowns (P,)."""
@@ -121,6 +160,20 @@ class ShapedBody(FixedBody):
 
     def follow(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> Follow:
         """Surface points as a function of the unknowns (B, P), valid near x (P,)."""
+        near = self._carried(vertex_ids, x, weights)
+
+        def move(x: np.ndarray) -> MovingPoints:
+            pose, trans, betas = self.split(x)
+            positions, d_pose = near.operator.jacobian(pose, trans)
+            shift = near.gap + np.einsum("ldk,...k->...ld", near.D, betas - near.at)
+            return moving_points(positions + shift, d_pose, near.D)
+
+        return move
+
+    def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
+        return self._carried(vertex_ids, x)
+
+    def _carried(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
         pose, trans, betas = self.split(x)
         if np.linalg.norm(betas - self._at) > self.renew:
             self._at = betas.copy()
@@ -132,15 +185,63 @@ class ShapedBody(FixedBody):
         D = D.reshape(*vertex_ids.shape, *D.shape[1:])
         if weights is not None:
             D, y = np.einsum("lk,lkdb->ldb", weights, D), np.einsum("lk,lkd->ld", weights, y)
-        gap = y - operator.evaluate(pose, trans) - D @ (betas - at)
+        return CarriedPoints(operator, at, D, y - operator.evaluate(pose, trans) - D @ (betas - at))
 
-        def move(x: np.ndarray) -> MovingPoints:
-            pose, trans, betas = self.split(x)
-            positions, d_pose = operator.jacobian(pose, trans)
-            shift = gap + np.einsum("ldk,...k->...ld", D, betas - at)
-            return moving_points(positions + shift, d_pose, D)
 
-        return move
+@dataclass(frozen=True, eq=False)
+class CarriedPoints:
+    """Points of an operator (L,) at betas `at` (K,), moved by D (L, 3, K) with the betas, and by a gap (L, 3)."""
+
+    operator: PointOperator
+    at: np.ndarray
+    D: np.ndarray
+    gap: np.ndarray | float
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """(L, 3) metres, of unknowns (P,)."""
+        pose, trans, betas = self._split(x)
+        return self.operator.evaluate(pose, trans) + self.gap + self.D @ (betas - self.at)
+
+    def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        pose, trans, betas = self._split(x)
+        y, by_pose = self.operator.columns(pose, trans)
+        by_place = np.broadcast_to(np.eye(3)[:, None], (3, *y.shape))
+        return (y + self.gap + self.D @ (betas - self.at),
+                np.concatenate([by_pose, by_place, np.moveaxis(self.D, -1, 0)]))
+
+    def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        n = 3 * len(self.operator.skeleton.parents)
+        return x[:n].reshape(-1, 3), x[n:n + 3], x[n + 3:]
+
+
+class RoughBody(ShapedBody):
+    """Some vertices of a body of unknown shape, for a search: betas move them as at rest, carried as bones carry skin.
+
+    It is never stitched again, and good to a centimetre or so.
+    """
+
+    def __init__(self, whole: ShapedBody, ids: np.ndarray) -> None:
+        self.__dict__.update(whole.__dict__, known_poses=whole.known_poses, _known_rotations=whole._known_rotations)
+        self.ids, self._mean = ids, whole.held(np.zeros(self.n_angles + 3 + self.n_betas)).subject
+        self.subject = replace(self._mean, operator=self._mean.points(ids))
+        rest = Anchor(self.model, np.zeros((len(self.skeleton.parents), 3)))
+        self._rest = rest.some(ids)
+        if whole._anchor is None:
+            whole._anchor = rest                     # near enough where the joints turn little
+
+    def held(self, x: np.ndarray) -> FixedBody:
+        betas = self.split(x)[2]
+        return self._of(self.model.subject(betas) if betas.any() else self._mean).some(self.ids)
+
+    def vertices(self, x: np.ndarray) -> np.ndarray:
+        pose, trans, betas = self.split(x)
+        return self.subject.vertices(pose, trans) + self._rest.shifted(pose, betas)
+
+    def _carried(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
+        assert weights is None, "single vertices only"
+        D = self._rest.carried(vertex_ids, self.split(x)[0])
+        return CarriedPoints(self.subject.points(vertex_ids), np.zeros(self.n_betas), D, 0.0)
 
 
 class Anchor:
@@ -165,15 +266,29 @@ class Anchor:
         R = self.skeleton.part_rotations(pose)
         return float(np.linalg.norm(rotations.log(np.swapaxes(self.R, 1, 2) @ R), axis=1).max())
 
+    def some(self, ids: np.ndarray) -> Anchor:
+        """That of some vertices (L,) alone."""
+        out = copy(self)
+        out.part, out.local = self.part[ids], self.local[ids]
+        return out
+
     def carried(self, ids: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(L, 3, K) of some vertices at a pose (J, 3)."""
+        return self._carried(self.local[ids], self.part[ids], self.joints, pose)
+
+    def shifted(self, pose: np.ndarray, betas: np.ndarray) -> np.ndarray:
+        """(L, 3) metres by which betas (K,) move the vertices at a pose (J, 3)."""
+        return self._carried((self.local @ betas)[..., None], self.part, (self.joints @ betas)[..., None], pose)[..., 0]
+
+    def _carried(self, local: np.ndarray, part: np.ndarray, at_joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """What vertices have in the frames of their parts (L, 3, k), on that of the joints (J, 3, k), at a pose."""
         parents = self.skeleton.parents
         turn = self.skeleton.part_rotations(pose) @ np.swapaxes(self.R, 1, 2)
-        joints = self.joints.copy()
+        joints = at_joints.copy()
         for j in range(1, len(parents)):
             p = parents[j]
-            joints[j] = joints[p] + turn[p] @ (self.joints[j] - self.joints[p])
-        return turn[self.part[ids]] @ self.local[ids] + joints[self.part[ids]]
+            joints[j] = joints[p] + turn[p] @ (at_joints[j] - at_joints[p])
+        return turn[part] @ local + joints[part]
 
 
 def as_body(body: BodyModel | Subject) -> FixedBody:

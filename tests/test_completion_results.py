@@ -110,9 +110,10 @@ def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide
         return Solved(np.array([len(reaches) - 1]), True, len(some), {})
 
     monkeypatch.setattr("completion.partial.fit._in_rounds", rounds)
-    fit = SimpleNamespace(config=CompletionConfig(), misfit=lambda x: (wide, narrow)[x[0]])
-    solved = solve_jointly(fit, np.zeros(1), lambda done: None)
-    assert solved.x[0] == kept and reaches[0] > reaches[1] and solved.rounds > CompletionConfig().rounds
+    fit = SimpleNamespace(config=CompletionConfig(), misfit=lambda x: (None, wide, narrow)[x[0]])
+    solved = solve_jointly(fit, fit, np.zeros(1), lambda done: None)
+    assert solved.x[0] == 1 + kept and reaches[0] == reaches[1] > reaches[2]
+    assert solved.rounds > CompletionConfig().rounds
 
 
 def test_a_joint_held_as_in_no_known_pose_is_named_and_a_known_way_is_not():

@@ -23,7 +23,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .fit import EVIDENCE, FINAL_REACH, REACH, SETTLED, ScanFit, Solved
+from .fit import EVIDENCE, FINAL_REACH, REACH, SETTLED, ScanFit, Skin, Solved
 from .free_surface import FreeSurface
 from .settings import CompletionConfig
 
@@ -157,7 +157,8 @@ def damped_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.nda
     return np.linalg.solve(normal.reshape(3 * J, 3 * J), side.ravel()).reshape(J, 3)
 
 
-def solve_in_turns(model: ScapeModel, fit: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
+def solve_in_turns(model: ScapeModel, fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int], None]
+                   ) -> Solved:
     """As `solve_jointly`: in a round the points closest to Y[Z] become markers, then R, Y and betas are found in turns.
 
     [SCAPE] §7
@@ -189,7 +190,7 @@ def nearest_markers(fit: ScanFit, mesh: Mesh, reach: float) -> Markers:
     [SCAPE] §7
     """
     config = fit.config
-    ids, points, _, weights = fit.matches(mesh, fit.thin, reach)
+    ids, points, _, weights = fit.matches(Skin(mesh.vertices, mesh.vertex_normals), fit.thin, reach)
     one = EVIDENCE / config.scan_sd**2 / len(fit.thin.points)
     w_Z = config.surface_weight * len(fit.cloud.points) / len(fit.thin.points)
     marked = np.full(len(fit.vertices), config.landmark_sd**-2)

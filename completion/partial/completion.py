@@ -142,11 +142,12 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     given = in_metres(person, scan, landmarks, masked, config)
     sized = ScaledBody(person) if config.free_scale else person
     fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
-    starts = first_starts(fit) if start is None else going_on(fit, start.pose, start.trans, start.betas)   # [SCAPE] §7
+    few = fit.few()
+    starts = going_on(fit, start.pose, start.trans, start.betas) if start else first_starts(fit, few)   # [SCAPE] §7
     tell(1, total)
-    x, rival = with_limbs(fit, best_starts(fit, starts))
+    x, rival = with_limbs(fit, few, best_starts(few, starts))
     tell(2, total)
-    solved = solve(fit, x, lambda done: tell(2 + done, total))            # [SCAPE] Eq. 10, Eq. 11
+    solved = solve(fit, few, x, lambda done: tell(2 + done, total))       # [SCAPE] Eq. 10, Eq. 11
     x, factor = fit.body.in_metres(solved.x)
     given, open_error = given.scaled(factor), factor * posterior_error(fit.body, solved.x, fit.precision(solved.x))
     predicted = person.template.with_vertices(person.vertices(x))

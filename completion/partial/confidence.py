@@ -29,9 +29,9 @@ def posterior_error(body: FixedBody, x: np.ndarray, precision: np.ndarray) -> np
     """
     ridge = 1e-9 * np.diag(precision).max()
     root = np.linalg.inv(np.linalg.cholesky(precision + ridge * np.eye(len(x))))      # rootᵀ root is the covariance
-    jacobian = body.follow(np.arange(len(body.template.vertices)), x)(x[None]).jacobian[0]
-    N, _, P = jacobian.shape
-    return np.linalg.norm((jacobian.reshape(-1, P) @ root.T).reshape(N, -1), axis=1)
+    ids = np.arange(len(body.template.vertices))
+    spread = root @ body.near(ids, x).columns(x)[1].reshape(len(x), -1)
+    return np.sqrt(np.einsum("pi,pi->i", spread, spread).reshape(-1, 3).sum(axis=1))
 
 
 def distance_to_seen(mesh: Mesh, seen: np.ndarray) -> np.ndarray:

@@ -4,11 +4,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from model.priors import LEAST_POSES, GaussianPrior, JointLimits, gaussian_prior
-from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
+from scanprep.geometry.least_squares import Deferred, Residual, levenberg_marquardt, normal_equations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
 
@@ -16,6 +17,7 @@ from .. import energy
 from ..bodies import FixedBody
 from .free_space import Clothing, Contact, Outside, Violation, find_cameras, free_space_violation
 from .masks import part_vertices
+from .pull import Pull
 from .scan import ScanPoints, spread
 from .settings import CompletionConfig
 from .upright import TILT, Upright
@@ -25,9 +27,10 @@ Terms = dict[str, Residual]
 LIKELY = 0.04                        # metres: matches closer than this are mostly right
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 REACH, WIDE_REACH, FINAL_REACH = 0.2, 0.08, 0.03    # metres: limits on the distance of matches, from first to last
+FINE = 2                             # rounds at the wide reach that take all vertices, at least
 NARROWING, SETTLING = 3, 6           # rounds from the wide to the final reach; that a reach is held at most
 CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
-QUICK = 3000                         # vertices that a quick look takes
+FEW, QUICK = 3000, 1500              # vertices that a search takes, and a quick look
 BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
 MIN_COSINE = 0.6                     # between the normals of a match
 # Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
@@ -37,27 +40,49 @@ STRANGE, ODD = np.radians(45), 0.05  # from the nearest known joint on: strange;
 UNDER_CLOTHES = 0.1                  # weight of a match of skin below what a depth camera saw, against skin above it
 
 
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """Places and normals (n, 3) of vertices of a body."""
+
+    places: np.ndarray
+    normals: np.ndarray
+
+    @cached_property
+    def tree(self) -> OrientedPoints:
+        """To find the vertex that is nearest to a point."""
+        return OrientedPoints(self.places, self.normals)
+
+
 class ScanFit:
     """One scan and one body, with what stays the same between the stages.
 
-    `vertices` (L,) int; `points` (L, 3), metres, the landmarks.
+    `vertices` (L,) int; `points` (L, 3), metres, the landmarks. Of a body of few vertices, see `few`, these have their
+    numbers, `ids` (n,) are those of the template.
     """
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: np.ndarray,
                  config: CompletionConfig) -> None:
         self.body, self.config = body, config
-        self.vertices, self.points = vertices, points
+        self.points = points
         self.prior: GaussianPrior = gaussian_prior(body.pose_mean, body.pose_covariance)
         known = config.joint_limits and len(body.pose_examples) >= LEAST_POSES
         self.limits = JointLimits.from_poses(body.pose_examples, 1.0, BEYOND) if known else None
-        self.spread = spread(body.template.vertices, config.model_points)
-        self.ignored = part_vertices(body.template, body.skeleton, config.ignored_parts)
-        self.matched = self.spread[~self.ignored[self.spread]]
-        self.part = body.skeleton.part_of_vertex(body.template)
         self.upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
-        self.contact = Contact(body.skeleton, self.part[self.spread])
         self.rng = np.random.default_rng(config.seed)
+        self._is_of(np.arange(len(body.template.vertices)), vertices, config.model_points)
         self._take(cloud)
+
+    def _is_of(self, ids: np.ndarray, landmarks: np.ndarray, count: int) -> None:
+        """All that belongs to the vertices (n,) of the body; `landmarks` (L,) and `ids` in the template."""
+        template, skeleton = self.body.template, self.body.skeleton
+        self.ids, self.vertices = ids, np.searchsorted(ids, landmarks)
+        self.spread = spread(template.vertices[ids], count)
+        self.ignored = part_vertices(template, skeleton, self.config.ignored_parts)[ids]
+        self.matched = self.spread[~self.ignored[self.spread]]
+        self.part = skeleton.part_of_vertex(template)[ids]
+        self.contact = Contact(skeleton, self.part[self.spread])
+        self.gaps = 0.0                              # metres between vertices, where the skin is between those of few
+        self._skin: tuple[np.ndarray, Skin] | None = None
 
     def _take(self, cloud: ScanPoints) -> None:
         """All that belongs to the scan."""
@@ -80,7 +105,18 @@ class ScanFit:
     def held(self, x: np.ndarray) -> ScanFit:
         """The same scan with the body that has the shape of unknowns (P,), as one of known shape."""
         out = copy(self)
-        out.body = self.body.held(x)
+        out.body, out._skin = self.body.held(x), None
+        return out
+
+    def few(self) -> ScanFit:
+        """The same with few vertices of the body, whose normals rotate with their parts: for a search."""
+        out, template, skeleton = copy(self), self.body.template, self.body.skeleton
+        rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
+        ids = np.unique(np.concatenate([spread(template.vertices, FEW), self.vertices, *rings]))
+        out.body = self.body.some(ids)
+        out._is_of(ids, self.vertices, self.config.model_points // 2)
+        out.gaps = float(np.sqrt(template.face_areas.sum() / len(ids)))
+        out.thin = self.cloud.thinned(self.config.scan_points // 2)
         return out
 
     @property
@@ -94,18 +130,26 @@ class ScanFit:
         """The predicted mesh of unknowns (P,)."""
         return self.body.template.with_vertices(self.body.vertices(x))
 
+    def skin(self, x: np.ndarray) -> Skin:
+        """The vertices of unknowns (P,); the last ones are kept."""
+        if self._skin is None or not np.array_equal(x, self._skin[0]):
+            places = self.body.vertices(x)
+            if len(places) == len(self.body.template.vertices):
+                normals = self.body.template.with_vertices(places).vertex_normals
+            else:
+                normals = self._turned_normals(np.arange(len(places)), self.body.split(x)[0])
+            self._skin = x.copy(), Skin(places, normals)
+        return self._skin[1]
+
     def unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
         """(n,) bool: points of the scan with nothing of the body near."""
-        mesh = self.mesh(x)
-        found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
-                                                                         MIN_COSINE)
-        return ~found.valid
+        return ~self.skin(x).tree.match(scan.points, scan.normals, 0.05, MIN_COSINE).valid
 
     def beyond(self, x: np.ndarray) -> np.ndarray:
         """(N,) bool: vertices beyond the border of the picture, of which nothing can be known; none without one."""
         person = self.cloud.person
         return np.zeros(len(self.part), dtype=bool) if person is None else \
-            ~person.picture.project(self.mesh(x).vertices)[2]
+            ~person.picture.project(self.body.vertices(x))[2]
 
     def without_ignored(self, cloud: ScanPoints, predicted: Mesh) -> ScanPoints:
         """A scan without its points on parts of the body that are not to be matched."""
@@ -116,16 +160,17 @@ class ScanFit:
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
         """How badly a body explains scan and landmarks, for the choice between starts."""
-        config = self.config
-        mesh = self.mesh(x)
-        found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(self.thin.points, self.thin.normals, cap,
-                                                                         MIN_COSINE)
-        counted = np.minimum(found.distances, cap)**2 * ~(found.valid & self.ignored[found.index])
-        apart = counted.mean()
-        for weight, ids, found_out in self.objections(mesh):
+        config, skin = self.config, self.skin(x)
+        found = skin.tree.match(self.thin.points, self.thin.normals, cap, MIN_COSINE)
+        off = self.thin.points - skin.places[found.index]
+        along = np.einsum("nd,nd->n", off, skin.normals[found.index])
+        beside = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0))
+        squared = np.where(found.valid, along**2 + np.maximum(beside - self.gaps, 0)**2, cap**2)
+        apart = (np.minimum(squared, cap**2) * ~(found.valid & self.ignored[found.index])).mean()
+        for weight, ids, found_out in self.objections(skin):
             apart += weight * (np.minimum(found_out.excess, cap)**2).sum() / len(ids)
-        off = ((mesh.vertices[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
-        return float(EVIDENCE * apart / config.scan_sd**2 + off) + self.unlikely(x) + float(self.strange(x).sum())
+        marked = ((skin.places[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
+        return float(EVIDENCE * apart / config.scan_sd**2 + marked) + self.unlikely(x) + float(self.strange(x).sum())
 
     def strange(self, x: np.ndarray) -> np.ndarray:
         """Energy (J,) of joints of unknowns (P,) that are held as in no known pose; for choices, not for steps."""
@@ -134,7 +179,7 @@ class ScanFit:
 
     def quick_misfits(self, x: np.ndarray, cap: float = 0.1) -> np.ndarray:
         """How badly bodies (n, P) explain the scan, on few vertices whose normals rotate with their parts."""
-        ids, few = spread(self.body.template.vertices, QUICK), slice(None, None, 3)
+        ids, few = spread(self.body.template.vertices[self.ids], QUICK), slice(None, None, 3)
         contact = Contact(self.body.skeleton, self.part[ids[few]])
         pose, trans, _ = self.body.split(x)
         places, normals = self.posed_points(ids, pose, trans)
@@ -144,18 +189,20 @@ class ScanFit:
             apart = (np.minimum(found.distances, cap)**2).mean()
             depth = contact.violation(y[few], n[few]).excess
             apart += self.config.contact_weight * (np.minimum(depth, cap)**2).mean()
-            if self.cameras:
-                excess = free_space_violation(self.cameras, y[few]).excess
-                apart += self.config.free_space_weight * (np.minimum(excess, cap)**2).mean()
+            if self.outside is not None:
+                apart += self.config.free_space_weight * (np.minimum(self.outside.at(y[few]), cap)**2).mean()
             out[i] = EVIDENCE * apart / self.config.scan_sd**2 + self.unlikely(x[i])
         return out
 
     def posed_points(self, ids: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None
                      ) -> tuple[np.ndarray, np.ndarray]:
         """Some vertices (B, L, 3) in poses (B, J, 3), and normals that rotate with their parts."""
-        R = self.body.skeleton.part_rotations(poses)[:, self.part[ids]]
-        normals = (R @ self.body.template.vertex_normals[ids][:, :, None])[..., 0]
-        return self.body.subject.points(ids).evaluate(poses, trans), normals
+        return self.body.subject.points(ids).evaluate(poses, trans), self._turned_normals(ids, poses)
+
+    def _turned_normals(self, ids: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """(..., L, 3) the normals of some vertices on the template, rotated with their parts in poses (..., J, 3)."""
+        R = self.body.skeleton.part_rotations(poses)[..., self.part[ids], :, :]
+        return (R @ self.body.template.vertex_normals[self.ids[ids], :, None])[..., 0]
 
     def unlikely(self, x: np.ndarray) -> float:
         """Energy of the pose of unknowns (P,) before anything is measured."""
@@ -172,54 +219,42 @@ class ScanFit:
                                                                             self.upright.nearest(x), TILT)}
         return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits, **stands}
 
-    def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, dict[str, float]]:
-        """One matching and the best unknowns (P,) for it, and the energies there."""
+    def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, Matched]:
+        """Better unknowns (P,) for one matching, and that matching."""
         held = np.full(len(x), self.config.twist_weight)
         held[:3] = held[self.body.n_angles:] = 0
-        data, betas = self.terms(x, scan, reach), self.body.n_angles + 3
+        matched, betas = self.matched_at(x, scan, reach), self.body.n_angles + 3
         stiff = max(1.0, reach / LIKELY)             # far matches are often wrong, and shape gives way before pose does
 
-        def terms(at: np.ndarray) -> Terms:
-            return {**data(at), "shape_prior": energy.shape_prior(at, betas, stiff),
-                    "twists": energy.stay_near(at, x, held)}                                      # [SCAPE] Eq. 11
+        def equations(at: np.ndarray) -> Deferred:
+            return matched.equations(at, energy.shape_prior(at, betas, stiff), energy.stay_near(at, x, held))
 
-        best = levenberg_marquardt(lambda at: normal_equations([*terms(at).values()]), x[None], 2, 1e-3).x
-        return best[0], {name: float(term.energy[0]) for name, term in terms(best).items()}
+        return levenberg_marquardt(equations, x[None], 2, 1e-3).x[0], matched            # [SCAPE] Eq. 11
 
     def precision(self, x: np.ndarray) -> np.ndarray:
         """(P, P) how sharply scan, landmarks and priors together determine unknowns (P,): the Gauss-Newton matrix."""
-        terms = self.terms(x, self.thin, FINAL_REACH)(x[None])
-        return normal_equations([*terms.values(), energy.shape_prior(x[None], self.body.n_angles + 3)]).hessian[0]
+        shape = energy.shape_prior(x[None], self.body.n_angles + 3)
+        return self.matched_at(x, self.thin, FINAL_REACH).equations(x[None], shape).dense.hessian[0]
 
-    def terms(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Callable[[np.ndarray], Terms]:
-        """The energies of unknowns (B, P) near x (P,) for the matches at x, without what is known of shapes."""
-        mesh = self.mesh(x)
-        ids, target, normal, weights = self.matches(mesh, scan, reach)
-        out_ids, out_target, out_normal, out_weights = self.violations(mesh)
-        follow = self.body.follow(np.concatenate([self.vertices, ids, out_ids]), x)
-        count, end = len(self.vertices), len(self.vertices) + len(ids)
-        landmark_weights = np.full(count, self.config.landmark_sd**-2)
+    def matched_at(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Matched:
+        """What draws the body near unknowns x (P,): landmarks, matches, and places where nothing can be."""
+        skin, free = self.skin(x), np.full(len(self.vertices), self.config.landmark_sd**-2)
+        ids, target, normal, weights = self.matches(skin, scan, reach)
+        out_ids, out_target, out_normal, out_weights = self.violations(skin)
+        points = self.body.near(np.concatenate([self.vertices, ids, out_ids]), x)
+        pull = Pull(points, np.concatenate([self.points, target, out_target]),
+                    np.concatenate([np.zeros_like(self.points), normal, out_normal]),
+                    np.concatenate([free, 0.1 * weights, 0 * out_weights]),
+                    np.concatenate([0 * free, weights, out_weights]))
+        return Matched(pull, len(free), len(ids), self.prior_terms)
 
-        def terms(at: np.ndarray) -> Terms:
-            points = follow(at)
-            marked, free, out = points[:count], points[count:end], points[end:]
-            return {"landmarks": energy.point_to_point(marked, self.points, landmark_weights),
-                    **self.prior_terms(at),
-                    "scan_planes": energy.point_to_plane(free, target, normal, weights),
-                    "scan_points": energy.point_to_point(free, target, 0.1 * weights),
-                    "violations": energy.point_to_plane(out, out_target, out_normal, out_weights)}
-
-        return terms
-
-    def matches(self, mesh: Mesh, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
+    def matches(self, skin: Skin, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
         """Vertices, scan points, their normals and weights, by closest points both ways."""
-        config = self.config
-        there = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, reach,
-                                                                         MIN_COSINE)
-        mine = self.matched
-        back = self.tree.match(mesh.vertices[mine], mesh.vertex_normals[mine], reach, MIN_COSINE)
+        config, mine = self.config, self.matched
+        there = skin.tree.match(scan.points, scan.normals, reach, MIN_COSINE)
+        back = self.tree.match(skin.places[mine], skin.normals[mine], reach, MIN_COSINE)
         hit = back.index
-        off = mesh.vertices[mine] - self.cloud.points[hit]
+        off = skin.places[mine] - self.cloud.points[hit]
         along = np.einsum("nd,nd->n", off, self.cloud.normals[hit])
         beside = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0))
         inner = back.valid & ~self.cloud.border[hit] & (beside < 2 * self.cloud.spacing + 0.3 * np.abs(along))
@@ -231,23 +266,23 @@ class ScanFit:
         share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(mine))])
         weights = EVIDENCE / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
         if self.cloud.person is not None:
-            under = np.einsum("nd,nd->n", normal, mesh.vertices[ids] - target) < 0
+            under = np.einsum("nd,nd->n", normal, skin.places[ids] - target) < 0
             weights = np.where(under, UNDER_CLOTHES, 1.0) * weights
         if self.clothing is None:
             return ids, target, normal, weights
-        under, over, away = self.clothing.below(mesh.vertices[mine], mesh.vertex_normals[mine])
+        under, over, away = self.clothing.below(skin.places[mine], skin.normals[mine])
         loose = np.full(under.sum(), EVIDENCE / config.clothing_sd**2 / len(mine))
         return (np.concatenate([ids, mine[under]]), np.concatenate([target, over[under]]),
                 np.concatenate([normal, away[under]]), np.concatenate([weights, loose]))
 
-    def violations(self, mesh: Mesh) -> tuple[np.ndarray, ...]:
+    def violations(self, skin: Skin) -> tuple[np.ndarray, ...]:
         """Vertices that are where nothing can be, points and normals of the planes they should reach, weights.
 
         A camera would have seen them, they stick out of clothing, or another part of the body is there.
         """
         share = EVIDENCE / self.config.scan_sd**2
         ids, targets, normals, weights = [], [], [], []
-        for weight, mine, found in self.objections(mesh):
+        for weight, mine, found in self.objections(skin):
             out = found.excess > 0
             ids.append(mine[out])
             targets.append(found.target[out])
@@ -255,9 +290,9 @@ class ScanFit:
             weights.append(weight * share / len(mine) * energy.geman_mcclure(found.excess[out], 0.1))
         return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
 
-    def objections(self, mesh: Mesh) -> list[tuple[float, np.ndarray, Violation]]:
+    def objections(self, skin: Skin) -> list[tuple[float, np.ndarray, Violation]]:
         """What says that vertices cannot be where they are: its weight, and the vertices."""
-        config, places, normals = self.config, mesh.vertices, mesh.vertex_normals
+        config, places, normals = self.config, skin.places, skin.normals
         mine = self.matched
         found = [(config.contact_weight, self.spread, self.contact.violation(places[self.spread],
                                                                              normals[self.spread]))]
@@ -266,6 +301,33 @@ class ScanFit:
         if self.clothing is not None:
             found.append((1.0, mine, self.clothing.violation(places[mine], normals[mine])))
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """What draws a body near some unknowns: landmarks first, matches of the scan, then places where nothing can be.
+
+    `landmarks`, `free`: how many points are of the first, and of the second; `known` tells what is known beforehand of
+    unknowns (B, P).
+    """
+
+    pull: Pull
+    landmarks: int
+    free: int
+    known: Callable[[np.ndarray], Terms]
+
+    def equations(self, x: np.ndarray, *more: Residual) -> Deferred:
+        """At unknowns (1, P), with what else is known of them."""
+        return self.pull.equations(x, normal_equations([*self.known(x).values(), *more]))
+
+    def energies(self, x: np.ndarray) -> dict[str, float]:
+        """Each term at unknowns (P,)."""
+        to_point, to_plane = self.pull.energies(x)
+        end = self.landmarks + self.free
+        return {"landmarks": float(to_point[:self.landmarks].sum()),
+                "scan_planes": float(to_plane[self.landmarks:end].sum()),
+                "scan_points": float(to_point[self.landmarks:end].sum()), "violations": float(to_plane[end:].sum()),
+                **{name: float(term.energy[0]) for name, term in self.known(x[None]).items()}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +340,8 @@ class Solved:
     energies: dict[str, float]
 
 
-def solve_jointly(fit: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
-    """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach.
+def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
+    """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach, `few` vertices first.
 
     A model of many scans follows a scan closely, and matches that are farther off than it ever is are wrong. One of
     few scans does not, and drops the limbs that it follows badly. So the rounds settle at a wide reach first, then at
@@ -287,22 +349,22 @@ def solve_jointly(fit: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> S
 
     [SCAPE] Eq. 10
     """
-    rounds = fit.config.rounds
-    wide = _in_rounds(fit, x, np.geomspace(REACH, WIDE_REACH, rounds), lambda i: tell(min(i, rounds)))
+    reaches = np.geomspace(REACH, WIDE_REACH, fit.config.rounds)
+    rough = _in_rounds(few, x, reaches, tell)
+    wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(FINE), lambda i: None)
     narrow = _in_rounds(fit, wide.x, np.geomspace(WIDE_REACH, FINAL_REACH, NARROWING), lambda i: None)
     best = wide if fit.misfit(wide.x) < CLEARLY * fit.misfit(narrow.x) else narrow
-    return replace(best, rounds=wide.rounds + narrow.rounds)
+    return replace(best, rounds=rough.rounds + wide.rounds + narrow.rounds)
 
 
 def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None]) -> Solved:
     """Unknowns from x (P,) on when matches reach so far, metres, round by round, and the last until they settle."""
-    shift, place = np.inf, fit.mesh(x).vertices
-    energies: dict[str, float] = {}
+    shift, place, rounds = np.inf, fit.body.vertices(x), len(reaches)
     for i, reach in enumerate([*reaches, *reaches[-1:].repeat(SETTLING)]):
-        x, energies = fit.step(x, fit.thin, reach)
-        before, place = place, fit.mesh(x).vertices
+        x, matched = fit.step(x, fit.thin, reach)
+        before, place = place, fit.body.vertices(x)
         shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
-        tell(i + 1)
-        if i >= len(reaches) and shift < SETTLED:
+        tell(min(i + 1, rounds))
+        if i + 1 >= rounds and shift < SETTLED:
             break
-    return Solved(x, bool(shift < 2 * SETTLED), i + 1, energies)
+    return Solved(x, bool(shift < 2 * SETTLED), i + 1, matched.energies(x))

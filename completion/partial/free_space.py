@@ -147,19 +147,23 @@ class Contact:
     """Some vertices of a body by the part (n,) of each: no part may enter another that is not next to it."""
 
     def __init__(self, skeleton: Skeleton, part: np.ndarray) -> None:
-        J = len(skeleton.parents)
-        near = np.eye(J, dtype=bool)
-        child = np.arange(1, J)
-        near[child, skeleton.parents[child]] = near[skeleton.parents[child], child] = True
-        self._mine = [np.flatnonzero(part == p) for p in range(J)]
-        self._others = [np.flatnonzero(~near[p][part]) for p in range(J)]
+        apart = ~np.eye(len(skeleton.parents), dtype=bool)
+        child = np.arange(1, len(skeleton.parents))
+        apart[child, skeleton.parents[child]] = apart[skeleton.parents[child], child] = False
+        self._order = np.argsort(part, kind="stable")
+        used, self._starts = np.unique(part[self._order], return_index=True)
+        self._mine, self._apart = np.split(self._order, self._starts[1:]), apart[np.ix_(used, used)]
 
     def violation(self, places: np.ndarray, normals: np.ndarray) -> Violation:
         """How deep vertices (n, 3) with normals (n, 3) stand inside another part."""
         depth, way = np.zeros(len(places)), np.zeros_like(places)
-        for p in range(len(self._mine)):
-            mine, others = self._mine[p], self._others[p]
-            if not len(mine) or not len(others):
+        low, high = (of.reduceat(places[self._order], self._starts) for of in (np.minimum, np.maximum))
+        near = self._apart & (low[:, None] < high + INSIDE).all(axis=2) & (high[:, None] > low - INSIDE).all(axis=2)
+        for p in np.flatnonzero(near.any(axis=1)):
+            mine, others = self._mine[p], np.concatenate([self._mine[q] for q in np.flatnonzero(near[p])])
+            there = places[others]
+            others = others[((there > low[p] - INSIDE) & (there < high[p] + INSIDE)).all(axis=1)]
+            if not len(others):
                 continue
             far, hit = cKDTree(places[others]).query(places[mine], distance_upper_bound=INSIDE)
             found = np.isfinite(far)

@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from model.priors import GaussianPrior
-from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from ..bodies import FixedBody
@@ -27,26 +26,28 @@ KEPT = 24                            # draws around which the next are made
 CELL = 0.03                          # metres: of the table of the inside of a body
 EXPLAINED = 0.04                     # metres of the body within which a point of the scan needs no limb
 FOLLOWED, APART = 4, 0.1             # draws that are followed, and by how many metres they differ at the limb's end
-AMISS = 12.0                         # energy of what is wrong with a limb from which on it is sought
+AMISS = 30.0                         # energy of what is wrong with a limb from which on it is sought
 GRAVE = 100.0                        # energy from which on the whole body may be wrong
 RIVAL = 1.1                          # times the least misfit that of another body may have to be nearly as good
 BETTER, SHARE = 5.0, 0.01            # by how much, and what share of it, the misfit must fall for a limb to be moved
 ROUNDS = 2                           # times that all limbs that are amiss are gone through
 
 
-def with_limbs(fit: ScanFit, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Unknowns (P,) of the best of starts (n, P), best first, when limbs were moved to where they explain the scan.
 
     Those after the first have their turn while something grave is amiss: a body that faces the wrong way keeps limbs
     that explain nothing wherever they are moved. In clothes front and back are so much alike that without landmarks
     the second is always tried. Returns also another body (P,) that explains the scan nearly as well; None without one.
     """
-    ends = [reinitialise_limbs(fit, starts[0])]
+    ends = [reinitialise_limbs(few, starts[0])]
     for x in starts[1:]:
         both = len(ends) == 1 and fit.cloud.person is not None and not len(fit.vertices)
-        if not both and not limbs_amiss(fit, min(ends, key=fit.misfit), GRAVE):
+        if not both and not limbs_amiss(few, min(ends, key=few.misfit), GRAVE):
             break
-        ends.append(reinitialise_limbs(fit, x))
+        ends.append(reinitialise_limbs(few, x))
+    if len(ends) == 1:
+        return ends[0], None
     misfits = np.array([fit.misfit(x) for x in ends])
     first, *others = np.argsort(misfits)
     rival = next((ends[i] for i in others if misfits[i] < RIVAL * misfits[first]), None)
@@ -54,39 +55,49 @@ def with_limbs(fit: ScanFit, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
-    """Unknowns (P,) with limbs moved elsewhere where that explains the scan better; the shape is held."""
+    """Unknowns (P,) with limbs moved elsewhere where that explains the scan better; the shape is held.
+
+    The worst has its turn first. Once one was moved the others are looked at anew: what they could have explained may
+    be explained, and what stood in their way gone.
+    """
     if not limbs_amiss(fit, x):
         return x
     free, held = fit.body.n_angles + 3, fit.held(x)
     moved = approach(held, x[:free], REACHES)
-    for _ in range(ROUNDS):
-        before = moved
-        for limb in limbs_amiss(held, moved):
-            moved = _reinitialised(held, moved, limb)
-        if moved is before:
+    tried: list[list[int]] = []                      # as the body is now
+    for _ in range(ROUNDS * len(limbs(fit.body.skeleton))):
+        limb = next((limb for limb in limbs_amiss(held, moved) if limb not in tried), None)
+        if limb is None:
             break
+        before, moved = moved, _reinitialised(held, moved, limb)
+        tried = [limb] if moved is not before else [*tried, limb]
     return np.concatenate([moved, x[free:]])
 
 
 def limbs_amiss(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[int]]:
     """The limbs, runs of parts, that stand where nothing can be or could explain what nothing does; worst first."""
-    found = {tuple(limb): amiss(fit, x, limb) for limb in limbs(fit.body.skeleton)}
-    return [list(limb) for limb in sorted(found, key=lambda limb: -found[limb]) if found[limb] > least]
+    wrong = np.zeros(len(fit.ids))
+    for weight, ids, found in fit.objections(fit.skin(x)):
+        wrong[ids] += weight * np.minimum(found.excess, CAP)**2 / len(ids)
+    lost, strange = fit.thin.points[fit.unexplained(x, fit.thin)], fit.strange(x)
+    found_amiss = {tuple(limb): amiss(fit, x, limb, wrong, lost) + float(strange[limb].sum())
+                   for limb in limbs(fit.body.skeleton)}
+    return [list(limb) for limb in sorted(found_amiss, key=lambda limb: -found_amiss[limb])
+            if found_amiss[limb] > least]
 
 
-def amiss(fit: ScanFit, x: np.ndarray, limb: list[int]) -> float:
-    """Energy of what is wrong with a limb, of how strangely it is held, and of what it could explain."""
-    mesh, J = fit.mesh(x), len(fit.body.skeleton.parents)
-    mine = np.isin(np.arange(J), limb)[fit.part]
-    wrong = sum(float(weight * (np.minimum(found.excess, CAP)**2 * mine[ids]).sum() / len(ids))
-                for weight, ids, found in fit.objections(mesh))
-    lost = fit.thin.points[fit.unexplained(x, fit.thin)]
-    joint = fit.body.skeleton.joints[limb[0]]         # of the template, to know how far the limb reaches
-    reach = np.linalg.norm(fit.body.template.vertices[mine] - joint, axis=1).max() + CAP
-    hangs = mesh.vertices[fit.body.skeleton.ring(fit.body.template, limb[0])].mean(axis=0)
-    near = np.linalg.norm(lost - hangs, axis=1) < reach
-    apart = EVIDENCE / fit.config.scan_sd**2 * (wrong + (EXPLAINED**2 * near.sum()) / len(fit.thin.points))
-    return apart + float(fit.strange(x)[limb].sum())
+def amiss(fit: ScanFit, x: np.ndarray, limb: list[int], wrong: np.ndarray, lost: np.ndarray) -> float:
+    """Energy of what is wrong with a limb, and of what it could explain.
+
+    `wrong` (n,), of each vertex; `lost` (m, 3), metres, points of the scan with nothing near.
+    """
+    template, skeleton, mine = fit.body.template, fit.body.skeleton, np.isin(fit.part, limb)
+    joint = skeleton.joints[limb[0]]                  # of the template, to know how far the limb reaches
+    reach = np.linalg.norm(template.vertices[fit.ids[mine]] - joint, axis=1).max() + CAP
+    ring = np.searchsorted(fit.ids, skeleton.ring(template, limb[0]))
+    near = np.linalg.norm(lost - fit.skin(x).places[ring].mean(axis=0), axis=1) < reach
+    share = EXPLAINED**2 * near.sum() / len(fit.thin.points)
+    return float(EVIDENCE / fit.config.scan_sd**2 * (wrong[mine].sum() + share))
 
 
 def _reinitialised(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
@@ -125,13 +136,13 @@ class LimbSearch:
     @staticmethod
     def around(fit: ScanFit, x: np.ndarray, limb: list[int]) -> LimbSearch:
         """The search for a limb of unknowns (P,)."""
-        mesh, mine = fit.mesh(x), np.isin(fit.part, limb)
+        skin, mine = fit.skin(x), np.isin(fit.part, limb)
         ids = np.flatnonzero(mine)
-        ids = ids[spread(fit.body.template.vertices[ids], SKIN)]
-        away = cKDTree(mesh.vertices[~mine]).query(fit.coarse.points)[0] > EXPLAINED
+        ids = ids[spread(fit.body.template.vertices[fit.ids[ids]], SKIN)]
+        away = cKDTree(skin.places[~mine]).query(fit.coarse.points)[0] > EXPLAINED
         return LimbSearch(fit, limb, ids, np.flatnonzero(fit.part[ids] == limb[-1]), fit.part[ids] != limb[0],
-                          fit.coarse.some(away).thinned(SCAN).points, float(away.mean()), InsideBody.of(mesh, ~mine),
-                          fit.outside)
+                          fit.coarse.some(away).thinned(SCAN).points, float(away.mean()),
+                          InsideBody.of(skin.places[~mine], skin.normals[~mine]), fit.outside)
 
     def best(self, drawn: np.ndarray) -> np.ndarray:
         """Those few of unknowns (n, P) that explain most and differ, each after draws closer and closer around it."""
@@ -161,10 +172,19 @@ class LimbSearch:
         if self.free is not None:
             cost += config.free_space_weight * share * (np.minimum(self.free.at(places), cap)**2).mean(axis=1)
         if len(self.wanted):
-            apart = np.stack([cKDTree(one).query(self.wanted)[0] for one in places])
-            cost += self.lacking * (np.minimum(apart, cap)**2).mean(axis=1)
+            cost += self.lacking * np.minimum(nearest_squared(places, self.wanted), cap**2).mean(axis=1)
         unlikely = sum(term.energy for term in fit.prior_terms(drawn).values())
         return places, EVIDENCE / config.scan_sd**2 * cost + unlikely
+
+
+def nearest_squared(places: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n, m) square metres from points (m, 3) to the nearest of the places (L, 3) of each of n, within a millimetre."""
+    middle = points.mean(axis=0)
+    to, out = (points - middle).astype(np.float32).T, np.empty((len(places), len(points)), dtype=np.float32)
+    for i, one in enumerate((places - middle).astype(np.float32)):
+        # |a - b|² = |b|² + (|a|² - 2 a·b)
+        out[i] = ((one**2).sum(axis=1)[:, None] - 2 * one @ to).min(axis=0)
+    return np.maximum(out + (to**2).sum(axis=0), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +195,8 @@ class InsideBody:
     deep: np.ndarray                 # (a, b, c), metres
 
     @staticmethod
-    def of(mesh: Mesh, some: np.ndarray) -> InsideBody:
-        """The table for some of the vertices (N,) of a mesh."""
-        vertices, normals = mesh.vertices[some], mesh.vertex_normals[some]
+    def of(vertices: np.ndarray, normals: np.ndarray) -> InsideBody:
+        """The table for vertices (n, 3), metres, with their normals (n, 3)."""
         low = vertices.min(axis=0)
         axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, vertices.max(axis=0), strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

@@ -1,7 +1,7 @@
 """A scan whose unit nobody knows: one factor is found together with pose, place and shape."""
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -12,7 +12,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
 
 from .. import energy
-from ..bodies import FixedBody, Follow
+from ..bodies import FixedBody, Follow, NearPoints
 from ..energy import MovingPoints
 from .scan import spread
 from .settings import CompletionConfig
@@ -44,7 +44,10 @@ class ScaledBody(FixedBody):
     def held(self, x: np.ndarray) -> FixedBody:
         """The body with the shape and size it has at x (P,), as one of known shape."""
         subject = self.inner.held(x[:-1]).subject
-        return FixedBody(replace(subject, operator=subject.operator.scaled(float(np.exp(-LOOSE * x[-1])))))
+        return self._of(replace(subject, operator=subject.operator.scaled(float(np.exp(-LOOSE * x[-1])))))
+
+    def some(self, ids: np.ndarray) -> FixedBody:
+        return ScaledBody(self.inner.some(ids))
 
     def vertices(self, x: np.ndarray) -> np.ndarray:
         """The predicted mesh (N, 3) of unknowns (P,)."""
@@ -66,12 +69,31 @@ class ScaledBody(FixedBody):
 
         return move
 
+    def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
+        return _OneByOne(self.follow(vertex_ids, x))
+
     def in_metres(self, x: np.ndarray) -> tuple[np.ndarray, float]:
         """Unknowns (P-1,) of the body at its own size, and what the scan has to be multiplied with for it."""
         factor = float(np.exp(LOOSE * x[-1]))
         out, place = x[:-1].copy(), slice(self.n_angles, self.n_angles + 3)
         out[place] = factor * (self.subject.origin + x[place]) - self.subject.origin
         return out, factor
+
+
+@dataclass(frozen=True, eq=False)
+class _OneByOne:
+    """Points that follow many unknowns, for one at a time."""
+
+    follow: Follow
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """(L, 3) metres, of unknowns (P,)."""
+        return self.follow(x[None]).positions[0]
+
+    def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        found = self.follow(x[None])
+        return found.positions[0], np.moveaxis(found.jacobian[0], -1, 0)
 
 
 def rough_scale(body: FixedBody, points: np.ndarray) -> float:

@@ -34,15 +34,18 @@ POOL = 200                           # best placements that are kept
 BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
 
 
-def first_starts(fit: ScanFit) -> np.ndarray:
-    """Bodies (n, P) to start from: those that meet the landmarks, or, without any, typical poses on the scan."""
+def first_starts(fit: ScanFit, few: ScanFit) -> np.ndarray:
+    """Bodies (n, P) to start from: those that meet the landmarks, or, without any, typical poses on the scan.
+
+    The same with `few` vertices judges them.
+    """
     if not len(fit.vertices):
-        return from_nothing(fit)
-    marked = from_landmarks(fit, fit.vertices, fit.points, fit.config.landmark_sd)
+        return from_nothing(few)
+    marked = from_landmarks(fit, few, fit.vertices, fit.points, fit.config.landmark_sd)
     if not fit.config.correspondences:
         return marked
     pairs = find_correspondences(fit.body.template, fit.cloud.points, (fit.vertices, fit.points))
-    more = from_landmarks(fit, pairs.template_vertices, pairs.scan_points, PAIRS_SD)
+    more = from_landmarks(fit, few, pairs.template_vertices, pairs.scan_points, PAIRS_SD)
     return np.concatenate([more, marked])
 
 
@@ -54,16 +57,21 @@ def going_on(fit: ScanFit, pose: np.ndarray, trans: np.ndarray, betas: np.ndarra
     return x
 
 
-def from_landmarks(fit: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: float) -> np.ndarray:
-    """The likeliest bodies (n, P) that meet landmarks (L,), (L, 3) to within sd metres, distinct and best first."""
-    body = fit.body
-    follow = body.follow(vertices, np.zeros(body.n_angles + 3 + body.n_betas))
+def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: float) -> np.ndarray:
+    """The likeliest bodies (n, P) of the mean shape that meet landmarks (L,), (L, 3) to within sd metres, best first.
+
+    They are distinct.
+    """
+    mean = np.zeros(fit.body.n_angles + 3 + fit.body.n_betas)
+    body = fit.body.held(mean)
+    follow = body.follow(vertices, mean)
     x, _ = search(body, follow, points, sd, fit.prior, AXES)
-    x = x[distinct(places_of(fit, x), CANDIDATES)]
+    x = x[distinct(body.subject.points(few.ids[few.spread]).evaluate(*body.split(x)[:2]), CANDIDATES)]
     drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, fit.config.random_starts, fit.rng)
                                 for start in x)])
-    drawn = drawn[np.argsort(fit.quick_misfits(drawn))]
-    return drawn[distinct(places_of(fit, drawn), CANDIDATES)]
+    drawn = np.hstack([drawn, np.zeros((len(drawn), fit.body.n_betas))])
+    drawn = drawn[np.argsort(few.quick_misfits(drawn))]
+    return drawn[distinct(places_of(few, drawn), CANDIDATES)]
 
 
 def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
@@ -107,7 +115,7 @@ def places_of(fit: ScanFit, x: np.ndarray) -> np.ndarray:
 def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
     """Unknowns (P,) after a few rounds on few points."""
     for reach in reaches:
-        x = fit.step(x, fit.coarse, reach)[0]
+        x, _ = fit.step(x, fit.coarse, reach)
     return x
 
 
@@ -151,7 +159,7 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body, config = fit.body, fit.config
     poses, turns, lift = starting_poses(fit), *placed_turns(fit.upright)
-    scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices, VERTICES)
+    scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.posed_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)

@@ -1,7 +1,7 @@
 """One frame: the body near where it is expected, drawn to the points; and the shape from several frames at once."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ import numpy as np
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import (
     Arrow,
+    Deferred,
     Dense,
     by_rotations,
     levenberg_marquardt,
@@ -21,7 +22,7 @@ from scanprep.geometry.surface import Surface
 
 from .. import energy
 from ..bodies import FixedBody, ShapedBody
-from ..partial.fit import ScanFit, Terms
+from ..partial.fit import Matched, ScanFit
 from ..partial.limbs import reinitialise_limbs
 from ..partial.scan import ScanPoints
 from ..partial.starts import approach, best_starts, first_starts
@@ -66,32 +67,34 @@ class FrameFit:
         held = 0 * self.inertia if expected is None else self.inertia / 10.0
         goal, place, n = x if expected is None else expected, self.body.vertices(x), self.body.n_angles
 
-        def data(terms: Callable[[np.ndarray], Terms], at: np.ndarray) -> Dense:
-            return by_rotations(normal_equations([*terms(at).values()]), at, n)
-
         for i in range(self.config.rounds):
-            terms = fit.terms(x, fit.thin, _reach(i))
+            matched = fit.matched_at(x, fit.thin, _reach(i))
 
-            def equations(at: np.ndarray, terms: Callable[[np.ndarray], Terms] = terms) -> Dense:
-                cost, gradient, hessian = data(terms, at)
-                off = step_between(goal, at, n)
-                return Dense(cost + (off**2) @ held, gradient + held * off, hessian + np.diag(held))
+            def equations(at: np.ndarray, matched: Matched = matched) -> Deferred:
+                now, off = matched.equations(at), step_between(goal, at, n)
+
+                def assemble() -> Dense:
+                    cost, gradient, hessian = by_rotations(now.dense, at, n)
+                    return Dense(cost + (off**2) @ held, gradient + held * off, hessian + np.diag(held))
+
+                return Deferred(now.energy + (off**2) @ held, assemble)
 
             best = levenberg_marquardt(equations, x[None], 1, 1e-3, retract=retract_pose(n)).x
             x, before, place = best[0], place, self.body.vertices(best[0])
             if i >= 2 and np.sqrt(((place - before)**2).sum(axis=1).mean()) < SETTLED:
                 break
-        _, gradient, precision = data(terms, best)
+        _, gradient, precision = by_rotations(matched.equations(best).dense, best, n)
         distance = Surface(self.body.template.with_vertices(place)).closest(fit.cloud.points).distances
         return Refined(x, gradient[0], precision[0], float(distance.mean()), float((distance < NEAR).mean()))
 
     def again(self, fit: ScanFit, starts: Sequence[np.ndarray], scratch: bool) -> Refined:
         """A lost frame anew from far starts (P,), or from scratch as well, whichever explains it best."""
+        few = fit.few()
         if scratch:
-            starts = [*starts, best_starts(fit, first_starts(fit))[0]]
-        ends = [approach(fit, _laid(self.body, x, fit.cloud)) for x in starts]
-        best = ends[int(np.argmin([fit.misfit(x) for x in ends]))]
-        return self.refine(fit, reinitialise_limbs(fit, best) if scratch else best)
+            starts = [*starts, best_starts(few, first_starts(fit, few))[0]]
+        ends = [approach(few, _laid(self.body, x, fit.cloud)) for x in starts]
+        best = ends[int(np.argmin([few.misfit(x) for x in ends]))]
+        return self.refine(fit, reinitialise_limbs(few, best) if scratch else best)
 
 
 def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, betas: np.ndarray,
@@ -103,8 +106,8 @@ def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, 
         one.body = copy(body)            # keeps what it has worked out for the pose of its own frame
     rows = np.concatenate([x, np.tile(betas, (len(x), 1))], axis=1)
     for i in range(4):  # matchings of the frames that tell the shape
-        frames = [one.terms(row, one.thin, _reach(i))(row[None]) for one, row in zip(fits, rows, strict=True)]
-        each = [normal_equations([*terms.values()]) for terms in frames]
+        each = [one.matched_at(row, one.thin, _reach(i)).equations(row[None]).dense
+                for one, row in zip(fits, rows, strict=True)]
         together = Dense(*(np.concatenate(part) for part in zip(*each, strict=True)))
         shape = normal_equations([energy.shape_prior(rows[:1, x.shape[1]:], 0)])
         # vectors are added: as rotations four rounds end 0.3505 sd from the true betas of the test, not 0.3496

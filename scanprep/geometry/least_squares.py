@@ -3,6 +3,7 @@
 The caller gives the normal equations at a state; their structure solves for the step:
 
 - `Dense`: B independent problems with P unknowns each, every one with its own damping;
+- `Deferred`: one such problem whose matrix is assembled where a step is taken, not where one is only tried;
 - `Arrow`: many frames with unknowns of their own, coupled by those they share alone;
 - `Sparse`: one large problem with a sparse matrix.
 
@@ -61,6 +62,22 @@ class Dense(NamedTuple):
         step = -np.linalg.solve(self.hessian + ridge[:, :, None] * np.eye(ridge.shape[1]),
                                 self.gradient[..., None])[..., 0]
         return step, _gain(self.gradient, step, ridge)
+
+
+@dataclass(frozen=True, eq=False)
+class Deferred:
+    """One dense problem, a batch of its own: its energy (1,), and its equations when a step is wanted."""
+
+    energy: np.ndarray
+    assemble: Callable[[], Dense]
+
+    @cached_property
+    def dense(self) -> Dense:
+        """The equations."""
+        return self.assemble()
+
+    def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.dense.step(damping)
 
 
 class Arrow(NamedTuple):

@@ -1,0 +1,84 @@
+"""The fast ways of a completion against the plain ones: weighed points, few vertices, distances by one product."""
+import numpy as np
+import pytest
+from completion_bodies import worm_with_prior
+from scipy.spatial import cKDTree
+
+from completion import energy
+from completion.bodies import FixedBody, ShapedBody
+from completion.partial.limbs import nearest_squared
+from completion.partial.pull import Pull
+from scanprep.geometry.least_squares import levenberg_marquardt, normal_equations
+
+RNG = np.random.default_rng(3)
+IDS = np.array([3, 90, 91, 200, 310, 395])
+TARGETS, NORMALS = RNG.normal(0, 0.3, (6, 3)), RNG.normal(size=(6, 3))
+NORMALS /= np.linalg.norm(NORMALS, axis=1)[:, None]
+TO_POINT, TO_PLANE = np.array([1.0, 0, 0.3, 2, 0, 1]), np.array([0.0, 1, 3, 0.5, 2, 0])
+MODEL = worm_with_prior()
+BODIES = {"known": FixedBody(MODEL.subject(None)), "shaped": ShapedBody(MODEL)}
+
+
+def unknowns(body):
+    return RNG.normal(0, 0.2, body.n_angles + 3 + body.n_betas)
+
+
+@pytest.mark.parametrize("body", BODIES.values(), ids=BODIES)
+def test_one_residual_of_three_rows_is_that_of_place_and_plane(body):
+    x = unknowns(body)
+    points = body.follow(IDS, x)(x[None])
+    plain = normal_equations([energy.point_to_point(points, TARGETS, TO_POINT),
+                              energy.point_to_plane(points, TARGETS, NORMALS, TO_PLANE)])
+    pull = Pull(body.near(IDS, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
+    nothing = normal_equations([energy.stay_near(x[None], x, np.zeros(len(x)))])
+    for ours, theirs in zip(pull.equations(x[None], nothing).dense, plain, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    assert sum(part.sum() for part in pull.energies(x)) == pytest.approx(plain.energy[0])
+
+
+def test_a_matrix_is_assembled_only_where_a_step_is_taken():
+    body = BODIES["known"]
+    x, asked = unknowns(body), []
+    near = body.near(IDS, x)
+
+    class Counted:
+        positions = staticmethod(near.positions)
+
+        @staticmethod
+        def columns(x):
+            asked.append(x)
+            return near.columns(x)
+
+    pull = Pull(Counted, TARGETS, NORMALS, TO_POINT, TO_PLANE)
+    held = np.ones(len(x))
+    found = levenberg_marquardt(lambda at: pull.equations(at, normal_equations([energy.stay_near(at, x, held)])),
+                                x[None], 1)
+    assert found.iterations == len(asked) == 1 and found.x.shape == x[None].shape
+
+
+def test_few_vertices_of_a_body_are_those_of_the_whole():
+    x = unknowns(BODIES["known"])
+    few = BODIES["known"].some(IDS)
+    np.testing.assert_allclose(few.vertices(x), BODIES["known"].vertices(x)[IDS], atol=1e-12)
+    np.testing.assert_allclose(few.near(np.array([1, 4]), x).positions(x), few.vertices(x)[[1, 4]], atol=1e-12)
+
+
+def test_few_vertices_of_an_unknown_shape_are_rough_and_their_own_derivative():
+    whole = BODIES["shaped"]
+    few, x = whole.some(IDS), unknowns(whole)
+    rest = np.r_[np.zeros(whole.n_angles + 3), x[whole.n_angles + 3:]]
+    np.testing.assert_allclose(few.vertices(rest), whole.vertices(rest)[IDS], atol=1e-9)     # at rest it is exact
+    y, columns = few.near(np.arange(6), x).columns(x)
+    np.testing.assert_allclose(y, few.vertices(x), atol=1e-12)
+    ahead = x.copy()
+    ahead[-1] += 1e-4
+    np.testing.assert_allclose(columns[-1], (few.vertices(ahead) - few.vertices(x)) / 1e-4, atol=1e-8)
+    assert np.linalg.norm(few.vertices(x) - whole.vertices(x)[IDS], axis=1).max() < 0.02
+    held = few.held(x)
+    np.testing.assert_allclose(held.vertices(x[:held.n_angles + 3]), whole.vertices(x)[IDS], atol=1e-9)
+
+
+def test_nearest_places_as_a_tree_finds_them():
+    places, points = RNG.normal(0, 0.5, (5, 40, 3)) + 2, RNG.normal(0, 0.5, (30, 3)) + 2
+    there = np.stack([cKDTree(one).query(points)[0] for one in places])
+    np.testing.assert_allclose(np.sqrt(nearest_squared(places, points)), there, atol=1e-3)
