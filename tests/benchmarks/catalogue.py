@@ -57,13 +57,15 @@ BENCHMARKS = (
               quick="threads.py --busy 1 --threads own 2", alone=True),
     Benchmark("folder", "A folder of scans", "folder.py SCRATCH", scans.as_they_are,
               "Ten landmarks a scan. The largest memory is that of the one process, and of the largest worker.",
-              quick="folder.py SCRATCH --scans 8", alone=True),
+              quick="folder.py SCRATCH --scans 4 12 --workers 2 --different 4", alone=True),
     Benchmark("mosh_speed", "How long `scape mosh` takes", "mosh_speed.py C3D -m MEN", mocap.speed,
-              "Whole commands with all files and pages, on one thread; a synthetic person walks for a minute, without "
-              "faults and with them. The paper: 7 minutes for a person, 1 s for the poses and 2 s for the soft tissue "
-              "of a frame.", quick="mosh_speed.py C3D -m MEN --kinds walk --files 85_02", alone=True),
+              "Whole commands with all files and pages, on one thread; a synthetic person walks for a minute, "
+              "without faults and with them. The paper: 7 minutes for a person, 1 s for the poses and 2 s for the "
+              "soft tissue of a frame.",
+              quick="mosh_speed.py C3D -m MEN --files 85_02", alone=True),
     Benchmark("mosh_memory", "Memory of `scape mosh` on ten minutes", "mosh_speed.py --minutes 10 --kinds walk",
-              mocap.speed, "72,000 frames of 41 markers.", quick="", alone=True),
+              mocap.speed,
+              "72,000 frames of 41 markers."),
     Benchmark("viewer_speed", "Sliders of a model in the browser", "viewer_speed.py -m MEN", completion.viewer_speed,
               "From a slider in the page to the new vertices there, without drawing. Chromium with software "
               "rendering.", alone=True),
@@ -74,8 +76,7 @@ BENCHMARKS = (
               "more parts help at all, and the radial features, on folds 1 and 3. A pose fit has three numbers a "
               "part, so some of the gain of more parts is freedom of the fit. Where we lose: deep squats and seated "
               "poses.",
-              quick="scape_5fold.py --keep FOLD_0 --folds 0 2 --kinds LBS 'LBS + linear correctives' 'SCAPE, linear' "
-                    "BlendSCAPE"),
+              quick="scape_5fold.py --keep FOLD_0 --folds 0 --kinds LBS 'LBS + linear correctives' 'SCAPE, linear'"),
     Benchmark("mixed", "Learning from a random mix of synthetic people", "mixed.py", models.mixed,
               "30 people in 3 poses each against one person in many poses and others in one, as many meshes, with "
               "the true skeleton. Where we lose: time.",
@@ -83,7 +84,7 @@ BENCHMARKS = (
     Benchmark("skeleton", "Skeletons", "skeleton.py", scans.skeletons,
               "Real poses have no truth: agreement is the adjusted Rand index of triangles. py-dem-bones is told the "
               "number of parts and finds no joints. Where we lose: to it in time.",
-              quick="skeleton.py --only embedded real --seeds 3"),
+              quick="skeleton.py --only embedded real --seeds 2"),
 
     Benchmark("registration_10", "Registration, ten landmarks", "registration.py --set held --marks 10",
               scans.registration,
@@ -94,25 +95,25 @@ BENCHMARKS = (
     Benchmark("registration_4", "Registration, four landmarks", "registration.py --set held --marks 4",
               scans.registration,
               "Hands and toes. Where we lose: the deep squat of pose 7, which is told.",
-              quick="registration.py --set held --marks 4 --poses 2,7,32,52,67 --men 2,97,172"),
+              quick="registration.py --set held --marks 4 --poses 2,7,32 --men 2,97"),
     Benchmark("registration_0", "Registration without landmarks", "registration.py --set held --marks 0",
               scans.registration,
               "As `scape prep run` does without landmark files. Where we lose: pose 7.",
-              quick="registration.py --set held --marks 0 --poses 2,7,32,52,67 --men 2,97,172"),
+              quick="registration.py --set held --marks 0 --poses 2,7,32 --men 2,97"),
     Benchmark("registration_front", "Registration, one view from the front",
               "registration.py --set held --marks 10 --front", scans.registration,
               "Ten landmarks, of which some lie where there are no data.",
-              quick="registration.py --set held --marks 10 --front --poses 2,32,67 --men 2,97"),
+              quick="registration.py --set held --marks 10 --front --poses 2,32 --men 2"),
     Benchmark("registration_published", "The registration that SCAPE used, ten landmarks",
               "registration.py --set held --marks 10 --poses 22,2,32 --men 2 --published", scans.registration,
               "Rigid links between neighbours, matches point to point [Hahnel].",
-              quick="registration.py --set held --marks 10 --poses 22,2 --men 2 --published"),
+              quick="registration.py --set held --marks 10 --poses 2 --men 2 --published"),
     Benchmark("peers", "Other registration tools on the same scans", "peers.py", scans.peers,
               "What each tool was given stands in the head of the script; a tool that is not installed is missing. "
               "Coherent point drift takes no landmarks and begins from the template placed by them. Parameters of "
               "functional maps and of drift were tried on one other scan, a handful each: their authors may do "
               "better. Where we lose: time, to accelerated drift.",
-              quick="peers.py --bodies pose2,pose67,man52"),
+              quick="peers.py --bodies pose2,man52"),
     Benchmark("rolled_limbs", "Limbs rolled on purpose", "rolled_limbs.py --set held", scans.rolled_limbs,
               "Skin of a limb rolled about its bone on the true surface of a held-out pose. Counted is a doubt that "
               "the pose itself did not raise. Where we lose: half a right angle."),
@@ -128,7 +129,7 @@ BENCHMARKS = (
               scans.predicted_landmarks,
               "What `scape pick` offers when hands and toes were clicked, without error, on a virtual scan. Where we "
               "lose: pose 7, where it means nothing, and men of another shape than the template.",
-              quick="predicted_landmarks.py --poses 2,7,32,43,59,67 --men 2,52,97"),
+              quick="predicted_landmarks.py --poses 2,32,43,67 --men 2,52"),
     Benchmark("fronts", "The front of a body in pictures", "fronts.py", scans.fronts,
               "Against the level direction square to hips, shoulders and waist. The last column numbers the poses "
               "that are beyond 60 degrees."),
@@ -136,12 +137,12 @@ BENCHMARKS = (
               "Mean curvature of the template and of the true posed surface at the places of its vertices, tuning "
               "poses. Ours lie some 10 mm from the reference, and by this measure nearer to where they belong: it "
               "cannot tell which is right to a few millimetres.",
-              quick="signatures.py --poses 3,24,48"),
+              quick="signatures.py --poses 3,24"),
     Benchmark("coregistration", "Co-registration", "coregistration.py --held --landmarks 7 --rounds 2 --clickless 10",
               scans.coregistration,
               "Virtual scans of one man, ten poses held out from all tuning, on copies of 5,000 triangles. Skeleton "
               "and model come from these registrations alone. `failed`: more than 25 mm off on average.",
-              quick="coregistration.py --held --landmarks 7 --rounds 1 --beside 4 --clickless 4"),
+              quick=""),
     Benchmark("decimation", "Decimation of 400,000 triangles to 50,000", "decimation.py --only closed,open",
               scans.decimation,
               "A body subdivided twice, with relief. Where we lose: fast-simplification and pyfqmr are several times "
@@ -167,11 +168,12 @@ BENCHMARKS = (
               "that no point of the scan touches."),
     Benchmark("half_views_blind", "The same without landmarks", "half_views.py -m FOLD_0 --marks 0",
               completion.half_views,
-              "Where we lose: limbs that are wholly hidden, and a man who sits."),
+              "Where we lose: limbs that are wholly hidden, and a man who sits.",
+              quick="half_views.py -m FOLD_0 --marks 0 --only 0 2 4 6 8 10 12"),
     Benchmark("half_views_published", "The same with the settings of the paper, seven landmarks",
               "half_views.py -m FOLD_0 --only 0 3 6 9 12 --published", completion.half_views,
               "Rotations, surface and shape in turns [SCAPE] Eq. 11.",
-              quick="half_views.py -m FOLD_0 --only 0 6 12 --published"),
+              quick="half_views.py -m FOLD_0 --only 0 6 --published"),
     Benchmark("half_people", "Half views of held-out men, unknown shape", "half_people.py -m MEN",
               completion.half_people,
               "45 men, seven landmarks; settings chosen on a dozen of the training men with a model without them."),
@@ -179,12 +181,12 @@ BENCHMARKS = (
               completion.half_people,
               "The nearest training body of 182 by trimmed closest points; bent: made the template of a pose-only "
               "model and fitted by our own solver. Poisson has no vertices in common with the truth.",
-              quick="half_people.py -m MEN --peers --only 0 9 18 27 36"),
+              quick="half_people.py -m MEN --peers --only 0 18 36"),
     Benchmark("few_scans", "Few scans: a model of 8 poses of one man and 10 men", "few_scans.py --models SCRATCH",
               completion.few_scans,
               "Three draws of training scans. `wrong`: the unseen surface off by more than 30 mm, or a part by more "
               "than 150 mm. Where we lose: limbs that nobody saw.",
-              quick="few_scans.py --models SCRATCH --offsets 0"),
+              quick="few_scans.py --models SCRATCH --offsets 0 --only 0 2 4 6 8 10 12"),
     Benchmark("few_scans_fewest", "The same with 3 poses and one man",
               "few_scans.py --models SCRATCH --poses 3 --men 1", completion.few_scans,
               "What it can still do: follow the man where he was seen.",
@@ -194,20 +196,21 @@ BENCHMARKS = (
               "Dressed bodies before a wall, cut off by the border of the picture, unknown shape, a model of 43 "
               "poses and 46 men; tuned on other bodies, cameras and clothes. A part is seen when a fifth of its "
               "vertices is. Where we lose: limbs that the body hides, and legs of which the picture shows nothing.",
-              quick="depth_camera.py -m SCRATCH/model.npz --only 2 3 4 5 6 7 --marks up 4"),
+              quick="depth_camera.py -m SCRATCH/model.npz --only 2 3 4 5 6 --marks up"),
     Benchmark("searches", "Two searches for pose and shape", "searches.py -m MEN --fold FOLD_0", completion.searches,
               "That of `complete` and that of co-registration, which ends with a non-rigid registration. Held-out "
-              "men and poses."),
+              "men and poses.",
+              quick=""),
     Benchmark("wrong_landmarks", "Landmarks at wrong places", "wrong_landmarks.py -m FOLD_0",
               completion.wrong_landmarks,
               "Half views of held-out poses, known subject: as they are, exchanged, or one of them at the place of "
               "another. Told rightly: the body that is found without landmarks is far from the wrong ones alone.",
-              quick="wrong_landmarks.py -m FOLD_0 --only 0 4 8 12"),
+              quick="wrong_landmarks.py -m FOLD_0 --only 0 8"),
     Benchmark("worn_markers", "Markers clicked on a scan of the person who wears them", "worn_markers.py -m MEN",
               completion.worn_markers,
               "Seven landmarks, all clicks without error, `cmu41`. Where we lose: places on a limb that is rolled "
               "about its axis, and the trunk of bent bodies.",
-              quick="worn_markers.py -m MEN --poses 2,17 --men 2,52 --people 2"),
+              quick="worn_markers.py -m MEN --poses 2,17 --men 2 --people 2"),
     Benchmark("tracking", "Frames of points without markers", "tracking.py", completion.tracking,
               "A walk at 30 Hz of a synthetic person who is not in the model, two depth cameras with 5 mm noise, no "
               "landmarks. `surface`: the model's vertices to the true surface of the whole body.",
@@ -216,13 +219,13 @@ BENCHMARKS = (
               "imported_models.py --star --smplx --frames 120 --bodies 3", completion.imported_models,
               "The pose columns of the STAR and SMPL-X layouts are noise here, and the latter's hands too: their "
               "distances say only that the fits end; the seconds are what counts.",
-              quick="imported_models.py --frames 120 --bodies 3"),
+              quick="imported_models.py --frames 60 --bodies 1"),
     Benchmark("measures", "Measurements of people", "measures.py --bodies SCRATCH", completion.measures,
               "Synthetic people against sections of their true triangles by trimesh; scans of four views registered "
               "with ten landmarks, half views in random poses, 47 markers. Repeated: SPRING men, two scans each. The "
               "constants of stated errors were chosen on the even people. Where we lose: under-bust and chest girths "
               "of women, upper arms, and the trunk of an unknown person from one side.",
-              quick="measures.py --bodies SCRATCH --people 6 --men 2"),
+              quick="measures.py --bodies SCRATCH --people 4 --men 2"),
 
     Benchmark("markers", "Markers on random vertices of held-out poses, and real recordings",
               "markers.py -m FOLD_0 --c3d C3D --people MEN", completion.markers,
@@ -243,7 +246,8 @@ BENCHMARKS = (
               "its data."),
     Benchmark("mosh_c3d_published", "The same with the weights of the patent",
               "mosh_c3d.py C3D -m MEN --preset published", mocap.recordings,
-              "No marker is an outlier, nothing is repaired; its prior of poses is that of 71 scans here."),
+              "No marker is an outlier, nothing is repaired; its prior of poses is that of 71 scans here.",
+              quick=""),
     Benchmark("peer_markers", "Marker tracking by pymomentum on the same recordings", "peer_markers.py C3D -m MEN",
               mocap.peer_markers,
               "35 of 41 markers; the person or the calibration is in the time. pymomentum has the joints of our mean "
@@ -266,15 +270,16 @@ BENCHMARKS = (
               "mosh_worn_elsewhere.py C3D -m MEN --first 20 --seeds 1", mocap.worn_elsewhere,
               "Every fourth frame of the recordings. Moved markers are simulated from the fitted body and what the "
               "marker was off it. Limits were chosen with other draws of these recordings.",
-              quick="mosh_worn_elsewhere.py C3D -m MEN --first 20 --seeds 1 --files 85_02 basketball"),
+              quick="mosh_worn_elsewhere.py C3D -m MEN --first 20 --seeds 1 --files 85_02"),
     Benchmark("mosh_sex", "Sex from markers", "mosh_sex.py --models SCRATCH --strength 1 0.5 0.25", mocap.sex,
               "Synthetic people not learned from, 41 markers 5 mm off. Half and a quarter: people half way and less "
               "to the middle between the sexes.",
-              quick="mosh_sex.py --models SCRATCH --count 16"),
+              quick="mosh_sex.py --models SCRATCH --count 12"),
     Benchmark("mosh_characters", "A motion on two cartoon figures", "mosh_characters.py --folder SCRATCH",
               mocap.characters,
               "Soft tissue twice. Triangles that turn over against the rotations of their parts. Where we lose: "
-              "acrobatics turn over tens of triangles a frame."),
+              "acrobatics turn over tens of triangles a frame.",
+              quick=""),
     Benchmark("mosh_design", "Which markers to put on", "mosh_design.py -m MEN --men held-out", mocap.marker_sets,
               "45 held-out men in 8 poses, 114 symmetric candidates, left and right together.",
               quick=""),

@@ -78,6 +78,33 @@ def tracking(report: dict) -> Lines:
             ("frames tracked", f"{1 / run['CPU s a frame']:.1f} a second")]
 
 
+def mosh(report: dict) -> Lines:
+    return [(f"`scape mosh`, {row['file'].removesuffix('.c3d')}, {row['frames']:,} frames with soft tissue and files; "
+             "pages too; memory",
+             f"{row['frames_per_s']:.0f}, {row['frames_per_s_all']:.0f} frames a second; {row['peak_MiB']:.0f} MiB")
+            for row in report["files"]]
+
+
+def recordings(report: dict) -> Lines:
+    mean = {name: both["of_files"] for name, both in report["mean"].items()}
+    return [("four recordings of actors without a scan, soft tissue too: markers used; left out, by the layout's places; "
+             "calibrated", "; ".join(_mm(mean[f"soft_{name}_mm"]) for name in ("observed", "held_out", "calibrated")))]
+
+
+def peer_markers(report: dict) -> Lines:
+    tools = list(dict.fromkeys(row["tool"] for row in report["rows"]))
+    mean = {tool: np.mean([[row["used_mm"], row["held_out_mm"]] for row in report["rows"] if row["tool"] == tool
+                           and "used_mm" in row], axis=0) for tool in tools}
+    return [(f"the same with fixed shape, used and calibrated: {'; '.join(tools)}",
+             "; ".join(_mm(*figures) for figures in mean.values()))]
+
+
+def soft_tissue(report: dict) -> Lines:
+    rows = [row for row in report["rows"] if row["where"] == "spacing below 12 cm"]
+    return [(f"soft tissue of 10 mm, 2 to 15 Hz, markers nearer than 12 cm: found of it, {row['markers']} markers",
+             f"{row['amplitude']:.0%}, {row['phase_deg']:.0f}° late or early") for row in rows]
+
+
 def statues(report: dict) -> Lines:
     finest = [row["levels"][-1]["mean_mm"] for row in report["rows"] if not row["vectors"]]
     return [(f"{len(finest)} scans as statues, 400,000 triangles: distance to the scan",
@@ -92,4 +119,5 @@ def measures(report: dict) -> Lines:
 HEADLINES: dict[str, Callable[[dict], Lines]] = {
     "registration_10": registration, "scape_5fold": poses, "learning": learning, "half_views": half_views,
     "half_people": half_people, "few_scans": few_scans, "depth_camera": depth_camera, "tracking": tracking,
-    "markers": markers, "mosh_people": people, "measures": measures, "statues": statues}
+    "markers": markers, "mosh_people": people, "mosh_c3d": recordings,
+    "peer_markers": peer_markers, "mosh_soft": soft_tissue, "mosh_speed": mosh, "mosh_memory": mosh, "measures": measures, "statues": statues}
