@@ -87,7 +87,7 @@ def mosh(report: dict) -> Lines:
 
 def recordings(report: dict) -> Lines:
     mean = {name: both["of_files"] for name, both in report["mean"].items()}
-    return [("four recordings of actors without a scan, soft tissue too: markers used; left out, by the layout's places; "
+    return [("four recordings of actors, soft tissue too: markers used; left out, by the layout's places; "
              "calibrated", "; ".join(_mm(mean[f"soft_{name}_mm"]) for name in ("observed", "held_out", "calibrated")))]
 
 
@@ -119,5 +119,5 @@ def measures(report: dict) -> Lines:
 HEADLINES: dict[str, Callable[[dict], Lines]] = {
     "registration_10": registration, "scape_5fold": poses, "learning": learning, "half_views": half_views,
     "half_people": half_people, "few_scans": few_scans, "depth_camera": depth_camera, "tracking": tracking,
-    "markers": markers, "mosh_people": people, "mosh_c3d": recordings,
-    "peer_markers": peer_markers, "mosh_soft": soft_tissue, "mosh_speed": mosh, "mosh_memory": mosh, "measures": measures, "statues": statues}
+    "markers": markers, "mosh_people": people, "mosh_c3d": recordings, "peer_markers": peer_markers,
+    "mosh_soft": soft_tissue, "mosh_speed": mosh, "mosh_memory": mosh, "measures": measures, "statues": statues}
