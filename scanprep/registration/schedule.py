@@ -123,7 +123,7 @@ class RegistrationConfig(Settings):
         GraphStage(150, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=4, paths=0.05, hints=0.1),
         GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=4),
         GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06, 0.0, rounds=4),
-        GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=5, ends=True),
+        GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=5, detail=0.014, ends=True),
         GraphStage(1000, 0.02, 0.002, 0.35, 0.01, 0.037, detail=0.008),
         GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )

@@ -14,10 +14,10 @@ import argparse
 import dataclasses
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -51,10 +51,36 @@ def processor_seconds() -> float:
     return sum(os.times()[:4])
 
 
-def peaks_gib() -> dict[str, float]:
-    """The largest memory that this process, and that any one of its children, has had at a time."""
-    return {name: resource.getrusage(who).ru_maxrss / 2**20
-            for name, who in (("peak_gib", resource.RUSAGE_SELF), ("peak_worker_gib", resource.RUSAGE_CHILDREN))}
+class PeakMemory:
+    """The largest memory of this process and all below it together, sampled; pages that they share count once (Linux).
+    """
+
+    def __init__(self) -> None:
+        self.gib = 0.0
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        while True:
+            self.gib = max(self.gib, sum(map(memory_gib, family(os.getpid()))))
+            time.sleep(0.5)
+
+
+def family(pid: int) -> list[int]:
+    """A process and all below it."""
+    try:
+        below = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:                                                             # ended meanwhile
+        below = []
+    return [pid, *(one for child in below for one in family(int(child)))]
+
+
+def memory_gib(pid: int) -> float:
+    """Of one process, its share of what it shares with others included."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 2**20
 
 
 def by_command(data: RealData, train: np.ndarray, kind: str, model: BodyModel) -> dict:
@@ -66,11 +92,12 @@ def by_command(data: RealData, train: np.ndarray, kind: str, model: BodyModel) -
         for i in train:
             (folder / "people" / meshes[i].name).symlink_to(meshes[i].resolve())
         (folder / "learn.toml").write_text("[scape]\ncomponents = 80\n")
-        begun = time.perf_counter()
+        begun, own = time.perf_counter(), memory_gib(os.getpid())
         words = ["--poses", data_folder() / "scape_poses", "--shapes", folder / "people", "--kind", kind,
                  "--config", folder / "learn.toml", "-o", folder / "model.npz"]
         running = subprocess.Popen([sys.executable, "-m", "completion", "learn", *map(str, words)],
                                    cwd=Path(__file__).parents[2])
+        memory = PeakMemory()
         _, status, used = os.wait4(running.pid, 0)
         if status:
             raise SystemExit("scape learn failed")
@@ -78,7 +105,7 @@ def by_command(data: RealData, train: np.ndarray, kind: str, model: BodyModel) -
         metrics = json.loads((folder / "model.npz.report.json").read_text())["metrics"]
         learned = load_model(folder / "model.npz")
         pose, betas = np.full((len(model.skeleton.parents), 3), 0.1), np.ones(10)
-        return {"wall_s": wall, "cpu_s": used.ru_utime + used.ru_stime, "peak_gib": used.ru_maxrss / 2**20,
+        return {"wall_s": wall, "cpu_s": used.ru_utime + used.ru_stime, "peak_gib": memory.gib - own,
                 "steps_s": {m["name"][6:]: m["value"] for m in metrics if m["name"].startswith("time: ")},
                 "disagreement_m": float(np.abs(learned.vertices(pose, betas) - model.vertices(pose, betas)).max())}
 
@@ -143,13 +170,13 @@ def main() -> None:
     config = LearnConfig(components=80)
     report = {"protocol": "SPRING-182/45", "kind": args.kind, "config": dataclasses.asdict(config),
               "machine": machine()}
-    clock, start, cpu = Clock(), time.perf_counter(), processor_seconds()
+    clock, memory, start, cpu = Clock(), PeakMemory(), time.perf_counter(), processor_seconds()
     skeleton = clock("skeleton", None, lambda: choose_skeleton(data.template, data.poses).skeleton)
     learn = learn_scape if args.kind == "scape" else learn_blendscape
     model: BodyModel = learn(data.template, data.poses, data.shapes[train], skeleton, config,  # type: ignore[operator]
                              step=clock)
     report |= {"parts": len(skeleton.parents), "steps_s": clock.wall, "steps_cpu_s": clock.cpu,
-               "learn_s": time.perf_counter() - start, "learn_cpu_s": processor_seconds() - cpu, **peaks_gib(),
+               "learn_s": time.perf_counter() - start, "learn_cpu_s": processor_seconds() - cpu, "peak_gib": memory.gib,
                "explained": model.explained[[9, 19, 39, 79]].tolist()}
     if args.keep:
         model.save(args.keep)

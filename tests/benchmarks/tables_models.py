@@ -51,10 +51,9 @@ def learning(report: dict) -> str:
     rows: Rows = [(f"time: {step} (s)", value) for step, value in report["steps_s"].items()]
     rows += [(f"processor: {step} (s)", value) for step, value in report.get("steps_cpu_s", {}).items()]
     rows += [("all of it (s)", report["learn_s"]), ("all of it, processor (s)", report["learn_cpu_s"]),
-             ("largest memory (GiB)", report["peak_gib"])]
+             ("largest memory, all processes (GiB)", report["peak_gib"])]
     if "command" in report:
-        rows += [("largest memory of a worker process (GiB)", report["peak_worker_gib"]),
-                 *[(f"scape learn: {name}", value) for name, value in flat(report["command"])]]
+        rows += [(f"scape learn: {name}", value) for name, value in flat(report["command"])]
     rows += [(name, report[key]) for name, key in (("model file, 80 components (MiB)", "file_mib"),
                                                    ("loading it (s)", "load_s"),
                                                    ("memory of the loaded model (MiB)", "loaded_mib")) if key in report]
