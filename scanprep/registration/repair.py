@@ -64,17 +64,18 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     given = replace(prepare(template, scan), landmarks=landmarks, hints=correspondences)
     coarse = tuple(stage for stage in stages if stage.nodes == stages[0].nodes)
     graph, told = build_graph(template, coarse[0].nodes), progress or _silent
-    tries = [np.zeros(len(parts.R_template_rest)),
-             *other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)]
+    tries = other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)
     start, looks = motion_of(graph, x), list[_Look]()
+    # with as little detail as the rolls are looked at with
+    now = gravity(limb_doubts(template, parts, deform(graph, start)))
     for number, angles in enumerate(tries):
         motion = rolled(graph, start, template, parts, x, angles)
         begun = GraphFit(deform(graph, motion), graph, motion, iterations=fit.iterations)
         looks.append(_look(given, parts, begun, coarse, scan))
         told(number + 1, len(tries) + 1)
-    best = min(looks[1:], key=lambda look: (look.gravity, look.uncovered), default=looks[0])
-    if best.gravity + LESS_DOUBTED < looks[0].gravity:
-        end = followed(given, best.fit, stages[len(coarse) - 1:], config.ends, lambda steps: None)
+    best = min(looks, key=lambda look: (look.gravity, look.uncovered), default=None)
+    if best is not None and best.gravity + LESS_DOUBTED < now:
+        end = followed(given, best.fit, stages[len(coarse) - 1:], 0, lambda steps: None)      # ends were rolled already
         trial = measured(given, finished(given, end, config), scan)
         if better(template, parts, trial, fit):
             fit = replace(trial, rolled=True)
