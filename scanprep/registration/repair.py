@@ -75,7 +75,7 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
         told(number + 1, len(tries) + 1)
     best = min(looks, key=lambda look: (look.gravity, look.uncovered), default=None)
     if best is not None and best.gravity + LESS_DOUBTED < now:
-        end = followed(given, best.fit, stages[len(coarse) - 1:], 0, lambda steps: None)      # ends were rolled already
+        end = followed(given, best.fit, stages[len(coarse) - 1:], config.ends, lambda steps: None)
         trial = measured(given, finished(given, end, config), scan)
         if better(template, parts, trial, fit):
             fit = replace(trial, rolled=True)
