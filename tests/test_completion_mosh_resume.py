@@ -69,7 +69,7 @@ def test_killed_in_the_middle_of_a_recording_it_goes_on(copied, stage, call, kep
 
 @pytest.mark.parametrize("words, settings, anew", [
     ((), {}, set()), ((), {"exaggeration": 1.5}, {"files", "page", "person page"}),
-    ((), {"soft": {"change": 0.5}}, {"soft", "files", "page", "person page"}),
+    ((), {"soft": {"reach": 0.12}}, {"soft", "files", "page", "person page"}),
     ((), {"poses": {"prior_weight": 0.2}}, ALL - PERSON), ((), {"person": {"shape": 0.4}}, ALL),
     (("--hold-out", "M7"), {}, ALL), (("--force",), {}, ALL)])
 def test_what_depends_on_a_changed_setting_is_done_anew(copied, words, settings, anew):
