@@ -11,7 +11,7 @@ from PIL import Image
 from test_completion_depth_picture import AWAY, taken
 from test_completion_interactive import NAMES, clicked_on_the_scan, finished
 from test_completion_partial import errors
-from test_scanprep_pipeline_mend import ENDING, mend, place  # noqa: F401 -- a fixture
+from test_scanprep_pipeline_mend import ENDING, made, mend, place  # noqa: F401 -- fixtures
 from test_scanprep_pipeline_mend import wait as wait_for
 from viewing_apps import app_of, ask
 
