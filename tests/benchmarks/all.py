@@ -172,15 +172,16 @@ def versions() -> str:
 
 
 def shown(one: Benchmark, runner: Runner) -> str:
-    """The section of a benchmark; why there is none where it could not run."""
+    """The section of a benchmark, with an older result where there is no new one; why there is none where it failed."""
     state, command = runner.state(one), f"python tests/benchmarks/{runner.arguments(one)}"
     head = f"\n## {one.title}\n\n`{command}`"
     if state.get("failed"):
         return f"{head}: no result, {state['failed']}\n"
     path = RESULTS / f"{one.name}.json"
-    if not path.exists() or state.get("code") != runner.code(one):
-        return f"{head}: not measured with this code.\n"
-    took = f": {state['wall_s'] / 60:.1f} minutes, {state['peak_gib']:.1f} GiB"
+    if not path.exists():
+        return f"{head}: not measured yet.\n"
+    took = f": {state['wall_s'] / 60:.1f} minutes, {state['peak_gib']:.1f} GiB" \
+        if state.get("code") == runner.code(one) else ": **a result of earlier code**, not measured with this one"
     return "\n\n".join(part for part in (head + took, one.table(json.loads(path.read_text())), one.note) if part) + "\n"
 
 

@@ -233,6 +233,10 @@ BENCHMARKS = (
               "markers missing, exchanged and astray; four recordings whose person comes from the markers. Where we "
               "lose: strays in the very first frame, and acrobatics.",
               quick="markers.py -m FOLD_0 --c3d C3D --people MEN --limit 300"),
+    Benchmark("c3d", "Person and motion from real recordings", "c3d.py C3D -m MEN", completion.recordings,
+              "One layout for four people, whose markers were moved by what was found over these same files; markers "
+              "that the layout calls loose are sought on each person.",
+              quick=""),
     Benchmark("mosh_people", "People from simulated markers alone", "mosh_people.py -m MEN --every 3", mocap.people,
               "45 held-out men with their own full shape; markers 5 mm beside their place, 12 frames. The patent: "
               "13.1 mm with 42 markers and 11.4 with 73, on scanned people. Where we lose: what betas say of posture "
