@@ -76,14 +76,9 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     out = normals.copy()
     for root in np.unique(patch, return_index=True)[1]:
         order, before = breadth_first_order(tree, root, directed=False)
-        number = np.empty(n, dtype=np.int64)
-        number[order] = np.arange(len(order))
-        above = number[before[order[1:]]]
-        turned = np.einsum("nd,nd->n", normals[order[1:]], normals[order[above]]) < 0
-        sign, above = np.r_[1.0, np.where(turned, -1.0, 1.0)], np.r_[0, above]
-        while above.any():                           # the root is 0; twice as far towards it each time
-            sign, above = sign * sign[above], above[above]
-        out[order] *= sign[:, None]
+        for i in order[1:]:
+            if out[i] @ out[before[i]] < 0:
+                out[i] = -out[i]
     coarse = points[spread(points, COARSE)] if n > COARSE else points
     far, around = cKDTree(coarse).query(points, 48, distance_upper_bound=WIDE, workers=search_threads(len(points)))
     found = np.isfinite(far)
