@@ -1,4 +1,4 @@
-"""Soft tissue: skin that moved on the body is found, in size and phase, and none where it did not move."""
+"""Soft tissue: skin or betas that moved are found, in size and phase, and nothing where nothing moved."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -12,7 +12,9 @@ from completion import MarkerLayout, MarkerSequence, Motion, follow_soft_tissue
 from completion.mocap.pose.marked_body import supports
 from completion.mocap.soft_tissue import follow
 from completion.mocap.soft_tissue.changing_body import changing_bodies, skin_movement
-from completion.mocap.soft_tissue.follow import SoftFollower, SoftTissueConfig, variances, whitening
+from completion.mocap.soft_tissue.follow import ShapeFollower, SkinFollower, variances
+from completion.mocap.soft_tissue.follower import whiten
+from completion.mocap.soft_tissue.settings import SoftTissueConfig
 from completion.mocap.soft_tissue.skin import SkinMovement, in_root, in_world, smooth_modes
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.viewing.soft import soft_columns
@@ -144,7 +146,7 @@ def test_whitened_markers_are_independent() -> None:
     covariance = np.cov(rng.normal(size=(6, 20)))
     share = rng.uniform(0, 1, (3, 6))
     share[0, 2] = 0
-    W = whitening(covariance, share)
+    W = whiten(covariance, share)
     for mine, counts in zip(W, share, strict=True):
         some = counts > 0                                        # the noise of a marker that counts is 1 / share
         wanted = np.zeros((6, 6))
@@ -155,9 +157,9 @@ def test_whitened_markers_are_independent() -> None:
 def test_derivatives_are_finite_differences() -> None:
     model, step, where = body(), 1e-6, layout(body(), 0.01, 20)
     markers, motion = seen(model, where, noise=0.005)
-    follower = SoftFollower(model, motion, markers, where, SoftTissueConfig())
+    follower = SkinFollower(model, motion, markers, where, SoftTissueConfig())
     x = follower.body.body.join(motion.poses[:2], motion.trans[:2])
-    given = markers.positions[:2], 100 * whitening(follower.root @ follower.root.T, np.full((2, 20), 0.7))
+    given = markers.positions[:2], 100 * whiten(follower.root @ follower.root.T, np.full((2, 20), 0.7))
     _, gradient, _ = follower.system(x, *given)
     for k in range(x.shape[1]):
         d = np.zeros(x.shape)
@@ -170,15 +172,14 @@ def test_the_movement_is_the_mean_of_a_gaussian_process() -> None:
     """Without smoothness over time: K (K + noise)⁻¹ of what markers are off, a missing one left out."""
     model, where = body(), layout(body(), count=20)
     markers, motion = seen(model, where)
-    follower = SoftFollower(model, motion, markers, where, SoftTissueConfig(temporal_smoothness=0.0))
-    x = follower.body.body.join(motion.poses, motion.trans)
+    follower = SkinFollower(model, motion, markers, where, SoftTissueConfig(temporal_smoothness=0.0))
+    off = in_root(follower.off(follower.body.body.join(motion.poses, motion.trans), markers.positions), motion.poses)
     share = np.ones((T, 20))
     share[3, 5] = 0
-    off = follower.off(x, markers.positions)
     size = follow.LOOSE * np.sqrt(np.maximum(variances(off, share) - 1e-6, 1e-8))
     root, some = size[:, None] * follower.root, np.arange(20) != 5
     K = root @ root.T
-    found = follower.displaced(x, markers.positions, share)
+    found = follower.displaced(off, share)
     for t, used in ((3, some), (7, np.full(20, True))):
         wanted = K[:, used] @ np.linalg.solve(K[np.ix_(used, used)] + 1e-6 * np.eye(used.sum()), off[t, used])
         np.testing.assert_allclose(found[t], wanted, atol=1e-6)
@@ -257,6 +258,48 @@ def test_few_frames_and_frames_without_markers(count: int) -> None:
     assert not found.skin.moved.any() and np.array_equal(found.motion.poses, few.poses)
 
 
+def changing(model: BodyModel, where: MarkerLayout, changes: np.ndarray) -> tuple[MarkerSequence, Motion]:
+    """The markers of the worm whose betas change, and the motion of the one whose do not."""
+    poses, trans = moving(model)
+    meshes = changing_bodies(model, poses, OWN + changes, trans)
+    positions = np.stack([where.place(model.template.with_vertices(v)) for v in meshes])
+    return MarkerSequence(positions, where.labels, RATE), fixed(poses, trans, where)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_betas_that_changed_are_found(kind: str) -> None:
+    model, where = body(kind), layout(body(kind), count=40)
+    changes = 0.5 * np.sin(2 * np.pi * np.array([2.0, 3.0, 5.0]) * np.arange(T)[:, None] / RATE + np.arange(3))
+    believing = SoftTissueConfig(pose=1e-4, velocity=1e-3, shape_change=1e-4)
+    markers, motion = changing(model, where, changes)
+    found = follow_soft_tissue(model, motion, markers, where, believing)
+    np.testing.assert_allclose(found.changes, changes, rtol=0, atol=5e-3)
+    assert found.skin is None and np.nanmax(found.motion.residuals) < 2e-4 and found.motion.converged.all()
+    held = follow_soft_tissue(model, motion, markers, where, replace(believing, shape_change=1e8))
+    assert np.abs(held.changes).max() < 1e-3
+
+
+def test_betas_are_those_of_the_papers_energy() -> None:
+    """At the poses found, no other betas have less of Eq. 24; markers that are missing count nothing."""
+    model, where, config = body(), layout(body(), 0.01, 20), SoftTissueConfig.published()
+    markers, motion = seen(model, where)
+    gone = markers.positions.copy()
+    gone[5:9, 3] = np.nan
+    found = follow_soft_tissue(model, motion, replace(markers, positions=gone), where, config)
+    follower = ShapeFollower(model, motion, markers, where, config)
+    x = follower.body.body.join(found.motion.poses, found.motion.trans)
+    off = np.where(np.isnan(gone), 0, gone - follower.body.positions(x))
+    D = follower.slopes(x).reshape(T, 3, 20, 3)
+
+    def energy(z: np.ndarray) -> np.ndarray:
+        away = np.where(np.isnan(gone), 0, off - np.einsum("tdlk,tk->tld", D, z))
+        return 0.75e4 * (away**2).sum(axis=(1, 2)) + 0.25 * (z**2).sum(axis=1)
+    least = energy(found.changes)
+    for step in (0.01, -0.01):
+        for k in range(3):
+            assert (energy(found.changes + step * np.eye(3)[k]) > least).all()
+
+
 def test_exaggeration_points_columns_and_movement() -> None:
     model = body()
     soft = soft_of(model)
@@ -309,6 +352,6 @@ def test_what_does_not_belong_together_is_refused() -> None:
         follow_soft_tissue(model, motion, markers.frames(slice(0, 5)), where)
     for name, value in (("marker_sd", 0.0), ("reach", -1.0), ("temporal_smoothness", -1.0)):
         with pytest.raises(ValueError, match=f"{name}: expected|config"):
-            SoftFollower(model, motion, markers, where, SoftTissueConfig(**{name: value}))
+            SkinFollower(model, motion, markers, where, SoftTissueConfig(**{name: value}))
     with pytest.raises(ValueError, match="k at most 3"):
         changing_bodies(model, motion.poses, np.zeros((T, 4)), motion.trans)

@@ -23,7 +23,8 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import animate
 from ..pose.settings import RATE, AnimateConfig
-from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
+from ..soft_tissue.follow import follow_soft_tissue
+from ..soft_tissue.settings import SoftTissueConfig
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
 from ..subject.worn_elsewhere import Worn, find_worn
@@ -65,16 +66,16 @@ class MoshConfig(Settings):
         velocity 57600 instead of 0.75, 1 and 6.25: the prior of a few dozen scans is narrow and must not outweigh
         markers, and joints accelerate by 60 radians per second squared, not by 5760.
     soft : SoftTissueConfig
-        The shape that changes with time.
+        How the skin, or the shape, moves with time.
     artefacts : ArtefactConfig
         What counts as wrong with the markers.
     soft_tissue : bool
-        Let the shape change with time.
+        Let the skin move on the body.
     repair : bool
         Put swapped labels right, seek markers that are worn elsewhere than in the layout, and leave out markers that
         slip, jitter or stray.
     exaggeration : float
-        Factor on the change of shape in exaggerated.glb and on a character; 0 leaves it out there.
+        Factor on soft tissue in exaggerated.glb and on a character; 0 leaves it out there.
     """
 
     person: PersonConfig = field(default_factory=PersonConfig)
@@ -131,7 +132,7 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     Labels are put right as far as tracks tell. The person is found from a few frames of all sequences; markers that are
     far from where the layout has them are sought over the whole body. Then the pose of every frame is found. The motion
     tells which labels were swapped and which markers were not on the body; where that concerns the frames that told of
-    the person, the person is found again, and so is what is wrong. At last the shape may change with time.
+    the person, the person is found again, and so is what is wrong. At last the skin may move.
 
     Parameters
     ----------

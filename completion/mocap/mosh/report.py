@@ -106,7 +106,7 @@ def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) 
 
 
 def _soft_section(page: Page, take: Take, frames: np.ndarray) -> None:
-    page.section("Soft tissue", "The shape may change in every frame, as flesh does and as a pose model with one fixed "
+    page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one fixed "
                  "shape cannot. What it takes up may also be markers that slide with the skin.")
     page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
     page.bodies(pictures.changed_panes(take, pictures.most_changed(take, frames, 4)),

@@ -204,7 +204,7 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
 
 
 def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
-    """All files of a sequence but its page; exaggerated.glb where the factor on the change of shape is not 1.
+    """All files of a sequence but its page; exaggerated.glb where the factor on soft tissue is not 1.
 
     Returned is how far the GLB files are from the exact bodies.
     """

@@ -1,4 +1,4 @@
-"""Bodies whose betas change in every frame, as soft tissue was stored by earlier versions."""
+"""Bodies whose betas change in every frame."""
 from __future__ import annotations
 
 import numpy as np

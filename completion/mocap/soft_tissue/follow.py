@@ -1,72 +1,28 @@
-"""How the skin of a person moves, from markers. [MoSh] Eq. 24"""
+"""How the soft tissue of a person moves, from markers. [MoSh] Eq. 24"""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.geometry.least_squares import Dense
 from scanprep.geometry.sparse import overlapping_windows, solve_smooth
-from scanprep.ranges import Positive, Settings
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
-from ...smoothing import windowed_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.follow import FURTHEST, STILL
-from ..pose.marked_body import MarkedBody, batches, point_system
-from ..pose.robust import marker_weights
-from ..pose.settings import RATE, AnimateConfig
-from .skin import SkinMovement, in_root, smooth_modes
+from ..pose.marked_body import batches
+from ..pose.settings import RATE
+from .follower import SoftFollower, Whitening, whiten
+from .settings import SoftTissueConfig
+from .skin import SkinMovement, in_root, in_world, smooth_modes
 from .soft_tissue import SoftTissue
 
-PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
-ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
 USUAL = 2.0                          # medians of how far markers lie off (squared) within which it is noise to the pose
 LOOSE = 3.0                          # sizes of the movement by which the prior allows it; at 1 it shrinks what it finds
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
-
-
-@dataclass(frozen=True)
-class SoftTissueConfig(Settings):
-    """Settings of `follow_soft_tissue`.
-
-    Weights stand on squared centimetres, as in the paper, whose own are `published()`. They are those by which the
-    poses were found before, see `MoshConfig`.
-
-    Attributes
-    ----------
-    data : float
-        Weight of the markers against their simulation, when poses are found.
-    pose : float
-        Weight of the pose prior; the paper's is 1.
-    velocity : float
-        Weight of the squared change of velocity from frame to frame, 120 frames a second; the paper's is 6.25.
-    marker_sd : float, metres
-        How far a marker lies from where the moving skin has it: what cameras are off.
-    reach : float, metres
-        Along the skin: where the movement of two points is correlated by 0.6.
-    temporal_smoothness : float
-        Weight of the squared second difference of the movement from frame to frame, 120 frames a second, against that
-        of the movement itself.
-    outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight.
-    """
-
-    data: Positive = 2.0
-    pose: float = 0.3
-    velocity: Positive = 57600.0
-    marker_sd: Positive = 0.001
-    reach: Positive = 0.09
-    temporal_smoothness: float = 2.0
-    outlier: Positive = 0.06
-
-    @classmethod
-    def published(cls) -> SoftTissueConfig:
-        """The weights of [MoSh] for poses; what moves is our skin, not betas as in its Eq. 24."""
-        return cls(data=0.75, pose=1.0, velocity=6.25, outlier=1000.0)
+MOST_BETAS = 200                     # that change, of those that the model has
 
 
 @one_thread()
@@ -74,11 +30,12 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
                        config: SoftTissueConfig | None = None, progress: Progress | None = None) -> SoftTissue:
     """A motion in which the skin moves on the body, as the markers tell.
 
-    [MoSh] changes the betas in every frame and holds the change by its squared length. Betas of 182 people have a
-    sixth to a third of the energy of a bump of 6 to 12 cm, so here the skin itself moves: a Gaussian process over the
-    surface, whose size at each marker is taken from how far that marker strays. Poses are found again, and a marker
-    that strays more than most counts the less for them, so that they do not follow soft tissue. Where no marker is
-    near, the skin does not move; markers that were not seen, and those that the motion did not trust, count nothing.
+    [MoSh] changes the betas in every frame and holds the change by its squared length; `published()` does so. Betas of
+    182 people have a sixth to a third of the energy of a bump of 6 to 12 cm, so by default the skin itself moves: a
+    Gaussian process over the surface, whose size at each marker is taken from how far that marker strays. Poses are
+    found again, and a marker that strays more than most counts the less for them, so that they do not follow soft
+    tissue. Where no marker is near, the skin does not move; markers that were not seen, and those that the motion did
+    not trust, count nothing.
 
     Parameters
     ----------
@@ -100,127 +57,101 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
 
     [MoSh] Eq. 24
     """
-    follower = SoftFollower(model, motion, markers, layout, config or SoftTissueConfig())
-    x, skin, settled = follower.solve(progress)
+    config = config or SoftTissueConfig()
+    _check(model, motion, markers)
+    follower = (ShapeFollower if config.shape_change else SkinFollower)(model, motion, markers, layout, config)
+    x, some, share = follower.solve(progress)
+    added, changes, skin = follower.moved(x, some, share)
+    if progress:
+        progress(len(x), len(x))
     pose, trans, _ = follower.body.body.split(x)
-    found = replace(motion, poses=pose.copy(), trans=trans.copy(), converged=motion.converged & settled)
     residuals = np.full(markers.positions.shape[:2], np.nan)
-    places = follower.body.positions(x) + skin.at(skin.modes[follower.nearest], pose)
-    residuals[:, follower.rows] = np.linalg.norm(places - follower.targets, axis=2)
-    assert motion.betas is not None, "checked"
-    return SoftTissue(replace(found, residuals=residuals), np.zeros((len(x), len(motion.betas))), skin)
+    residuals[:, follower.rows] = np.linalg.norm(follower.body.positions(x) + added - follower.targets, axis=2)
+    return SoftTissue(replace(motion, poses=pose.copy(), trans=trans.copy(), residuals=residuals,
+                              converged=motion.converged & follower.settled), changes, skin)
 
 
-class SoftFollower:
-    """The markers of a sequence, and the body whose skin carries them; arguments as of `follow_soft_tissue`.
-
-    Unknowns are x (T, P) as in `MarkedBody`, and what the skin under each marker is displaced (T, L, 3).
-    """
+class SkinFollower(SoftFollower):
+    """The skin moves on the body, a Gaussian process along it and along the axes of the root."""
 
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
                  config: SoftTissueConfig) -> None:
-        _check(model, motion, markers)
-        labels = layout.matched(markers.labels)
-        self.config, self.motion, layout = config, motion, layout.select(labels)
-        self.rows = np.array([markers.labels.index(label) for label in labels])
-        self.targets = markers.positions[:, self.rows]
-        poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
-        self.body = MarkedBody(model.subject(motion.betas), layout, config.pose, poses.prior_shrinkage)
-        self.inertia = poses.inertia(markers.rate, self.body.n_unknowns)
-        self.nearest = layout.nearest
-        self.modes, self.root = smooth_modes(model.template, self.nearest, config.reach)
+        super().__init__(model, motion, markers, layout, config)
+        self.modes, self.root = smooth_modes(model.template, self.layout.nearest, config.reach)
         self.smoothness = config.temporal_smoothness * (markers.rate / RATE)**4
 
-    def solve(self, progress: Progress | None = None) -> tuple[np.ndarray, SkinMovement, np.ndarray]:
-        """Unknowns (T, P), the movement of the skin, and which frames settled (T,)."""
-        T, tell = len(self.targets), progress or (lambda done, total: None)
-        x = self.body.body.join(self.motion.poses, self.motion.trans)
-        off, last = np.zeros((T, self.body.count, 3)), np.zeros(T)
-        some, share = self.share(x)
-        for i in range(ROUNDS if len(some) > 2 else 0):
-            before = self.body.positions(x[some])
-            x[some] = self.round(x[some], self.targets[some], share[some])
-            last[some] = np.linalg.norm(self.body.positions(x[some]) - before, axis=2).max(axis=1)
-            tell(round(T * (i + 1) / (ROUNDS + 1)), T)
-        if len(some):
-            off[some] = self.displaced(x[some], self.targets[some], share[some])
-        tell(T, T)
-        return x, SkinMovement(self.modes, off), last < STILL
-
-    def share(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Frames from the first to the last with a marker that counts (n,), and how much each counts (T, L)."""
-        share, _ = marker_weights(self.body.positions(x), self.targets, 1.0, self.config.outlier)
-        share *= self.motion.trusted[:, self.rows]
-        some = np.flatnonzero((share > 0).any(axis=1))
-        return (np.arange(some[0], some[-1] + 1) if len(some) else some), share
-
-    def off(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """Where markers are against the body at x (B, P), along the axes of the root (B, L, 3), 0 for one not seen."""
-        away = targets - self.body.positions(x)
-        return in_root(np.where(np.isnan(away), 0.0, away), self.body.body.split(x)[0])
-
-    def round(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Frames (T, P) that follow each other after one Gauss-Newton step, the movement of the skin integrated out.
-
-        How far most of the markers lie off is noise to the pose; what a marker is beyond it is movement of the skin.
-        """
+    def whitening(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> Whitening:
+        """How far most of the markers lie off is noise to the pose; what a marker is beyond it is soft tissue."""
         strays = variances(self.off(x, targets), share)
         noise = max(USUAL * float(np.median(strays)), self.config.marker_sd**2)
-        size = np.sqrt(np.maximum(strays / noise - 1, 0))
-        root = size[:, None] * self.root
-        covariance, weight = root @ root.T, np.sqrt(self.config.data * PER_SQUARE_METRE)
+        root = np.sqrt(np.maximum(strays / noise - 1, 0))[:, None] * self.root
+        return lambda near: whiten(root @ root.T, share[near])
 
-        def equations(near: slice) -> tuple[np.ndarray, np.ndarray]:
-            at, goal, counts = x[near], targets[near], share[near]
-            gradient, hessian = np.empty(at.shape), np.empty((*at.shape, at.shape[1]))
-            for few in batches(len(at)):
-                whiten = weight * whitening(covariance, counts[few])
-                _, gradient[few], hessian[few] = self.system(at[few], goal[few], whiten)
-            return gradient, hessian
+    def moved(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
+        assert self.motion.betas is not None, "checked"
+        moved, poses = np.zeros(self.targets.shape), self.body.body.split(x)[0]
+        if len(some):
+            moved[some] = self.displaced(in_root(self.off(x[some], self.targets[some]), poses[some]), share[some])
+        return in_world(moved, poses), np.zeros((len(x), len(self.motion.betas))), SkinMovement(self.modes, moved)
 
-        step = windowed_steps(x, equations, self.inertia)
-        longest = np.abs(step).max(axis=1, keepdims=True)
-        return self.body.retract(x, step * np.minimum(1, FURTHEST / np.maximum(longest, 1e-12)))
-
-    def system(self, x: np.ndarray, targets: np.ndarray, whiten: np.ndarray) -> Dense:
-        """Markers (B, L, 3) whose residuals `whiten` (B, L, L) makes independent, and the pose prior, at x (B, P)."""
-        pose, trans, _ = self.body.body.split(x)
-        y, columns = self.body.shapes.columns(pose, trans)
-        away = y - np.swapaxes(targets, 1, 2)
-        away = np.where(np.isnan(away), 0.0, away) @ whiten
-        columns = (columns.reshape(len(x), -1, self.body.count) @ whiten).reshape(columns.shape)
-        return self.body.with_prior(point_system(away, columns, np.zeros_like(targets), np.ones(targets.shape[:2])),
-                                    pose)
-
-    def displaced(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """The movement of the skin under the markers (T, L, 3), metres, along the axes of the root, poses x held.
+    def displaced(self, off: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """The movement of the skin under the markers (T, L, 3), metres, which lie off the body (T, L, 3).
 
         [MoSh] Eq. 24, with |z|² in place of |β_t|²
         """
-        off, sd = self.off(x, targets), self.config.marker_sd
+        sd = self.config.marker_sd
         size = LOOSE * np.sqrt(np.maximum(variances(off, share) - sd**2, (0.1 * sd)**2))
         root = size[:, None] * self.root                                       # the movement is root @ z, z ~ N(0, 1)
-        z, coupled = np.empty((len(x), root.shape[1], 3)), len(x) > 2
-        for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP) if coupled else [(slice(None),) * 3]:
+        z, coupled = np.empty((len(off), root.shape[1], 3)), len(off) > 2
+        for near, kept, where in overlapping_windows(len(off), WINDOW, OVERLAP) if coupled else [(slice(None),) * 3]:
             counts = share[near, :, None] / sd**2
             blocks, pull = root.T @ (counts * root) + np.eye(root.shape[1]), root.T @ (counts * off[near])
             z[where] = (solve_smooth(blocks, self.smoothness, pull) if coupled else np.linalg.solve(blocks, pull))[kept]
         return root @ z
 
 
+class ShapeFollower(SoftFollower):
+    """The betas change in every frame, β_t = β + z_t, at a cost of λ_Δ |z_t|². [MoSh] Eq. 24"""
+
+    def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
+                 config: SoftTissueConfig) -> None:
+        super().__init__(model, motion, markers, layout, config)
+        assert motion.betas is not None, "checked"
+        self.skin = model.points(*self.layout.skin, min(max(MOST_BETAS, len(motion.betas)), model.n_betas))
+
+    def slopes(self, x: np.ndarray) -> np.ndarray:
+        """Derivative (B, 3L, K) of the markers by the betas at x (B, P), coordinates before markers, metres.
+
+        A marker moves as the skin below it.
+        """
+        D = self.skin.shape_jacobian(self.body.body.split(x)[0])
+        return np.swapaxes(D, 1, 2).reshape(len(x), -1, D.shape[-1])
+
+    def whitening(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> Whitening:
+        def of(near: slice) -> np.ndarray:
+            D = self.slopes(x[near])
+            return whiten(self.weight / self.config.shape_change * D @ np.swapaxes(D, 1, 2),
+                          np.tile(share[near], 3))
+        return of
+
+    def moved(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
+        T, K = len(x), self.skin.n_betas
+        added, changes, off = np.zeros(self.targets.shape), np.zeros((T, K)), self.off(x, self.targets)
+        for few in batches(T):
+            D = self.slopes(x[few])
+            away = np.swapaxes(off[few], 1, 2).reshape(len(D), -1, 1)
+            pull = np.swapaxes(self.weight * np.tile(share[few], 3)[..., None] * D, 1, 2)
+            changes[few] = np.linalg.solve(pull @ D + self.config.shape_change * np.eye(K), pull @ away)[..., 0]
+            added[few] = np.swapaxes((D @ changes[few, :, None]).reshape(len(D), 3, -1), 1, 2)
+        return added, changes, None
+
+
 def variances(off: np.ndarray, share: np.ndarray) -> np.ndarray:
     """(L,) square metres: the mean square of a coordinate of residuals (T, L, 3), which count by their share (T, L)."""
     return np.einsum("tl,tld->l", share, off**2) / (3 * np.maximum(share.sum(axis=0), 1e-12))
 
-
-def whitening(covariance: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """W (B, L, L), with which rows r (L,) become independent, r @ W, where a unit of noise is added to the covariance.
-
-    Noise counts by its share (B, L): `W Wᵀ = S (S C S + 1)⁻¹ S` with S the roots of the shares.
-    """
-    S = np.sqrt(share)
-    root = np.linalg.cholesky(S[:, :, None] * covariance * S[:, None] + np.eye(len(covariance)))
-    return np.swapaxes(np.linalg.solve(root, S[:, :, None] * np.eye(len(covariance))), 1, 2)
 
 
 def _check(model: BodyModel, motion: Motion, markers: MarkerSequence) -> None:

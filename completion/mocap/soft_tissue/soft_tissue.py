@@ -1,4 +1,4 @@
-"""Soft tissue: a person whose skin moves a little on the body in every frame. [MoSh] Eq. 24"""
+"""Soft tissue: a person whose skin or shape moves a little in every frame. [MoSh] Eq. 24"""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -19,17 +19,17 @@ CHANGES, MODES, MOVED = "shape_changes", "skin_modes", "skin_moved"       # in a
 
 @dataclass(frozen=True, eq=False)
 class SoftTissue:
-    """A motion of a body whose skin moves on it.
+    """A motion of a body whose skin moves on it, or whose betas change.
 
     Attributes
     ----------
     motion : Motion
         Poses and places, and the residuals with the moving skin; `motion.betas` is the person's own shape.
     changes : (T, K) float
-        What is added to the person's betas in every frame, in files of versions that had soft tissue so; else zero. K
-        may be more than the person's betas, which are zero beyond their end.
+        What is added to the person's betas in every frame, as in the paper; zero where the skin moves instead. K may
+        be more than the person's betas, which are zero beyond their end.
     skin : SkinMovement, optional
-        How the skin moves on the body; None in files of those versions.
+        How the skin moves on the body; None where betas change instead.
     """
 
     motion: Motion
@@ -82,7 +82,7 @@ class SoftTissue:
     def save(self, path: str | Path) -> None:
         """Write a motion file (see `Motion.save`) that also holds soft tissue.
 
-        Versions that had soft tissue as changes of betas read it as a motion of fixed shape.
+        Versions that know changes of betas only read a moving skin as a motion of fixed shape.
         """
         more = {CHANGES: self.changes}
         if self.skin is not None:
