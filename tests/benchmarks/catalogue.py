@@ -55,7 +55,7 @@ BENCHMARKS = (
               "Seconds beside a process that computes all the time on one of the cores, by the number of threads of "
               "the linear algebra; `own` is what scapekit decides.",
               quick="threads.py --busy 1 --threads own 2", alone=True),
-    Benchmark("folder", "A folder of scans", "folder.py SCRATCH", scans.as_they_are,
+    Benchmark("folder", "A folder of scans", "folder.py SCRATCH", scans.folders,
               "Ten landmarks a scan. The largest memory is that of the one process, and of the largest worker.",
               quick="folder.py SCRATCH --scans 4 12 --workers 2 --different 4", alone=True),
     Benchmark("mosh_speed", "How long `scape mosh` takes", "mosh_speed.py C3D -m MEN", mocap.speed,
@@ -249,7 +249,7 @@ BENCHMARKS = (
               "on these files, as were the places of loose markers. The patent: 7.9 and 6.2 mm, held out 34 mm, on "
               "its data."),
     Benchmark("mosh_c3d_published", "The same with the weights of the patent",
-              "mosh_c3d.py C3D -m MEN --preset published", mocap.recordings,
+              "mosh_c3d.py C3D -m MEN --preset published --soft", mocap.recordings,
               "No marker is an outlier, nothing is repaired; its prior of poses is that of 71 scans here.",
               quick=""),
     Benchmark("peer_markers", "Marker tracking by pymomentum on the same recordings", "peer_markers.py C3D -m MEN",
@@ -259,10 +259,9 @@ BENCHMARKS = (
               "in the head of the script. It has no prior of shapes and poses, and a rig made by hand may do better. "
               "Its second row was chosen by the used and held-out markers of 01_01.c3d; the weights of our poses and "
               "our layout by the used markers of all four files."),
-    Benchmark("mosh_soft", "Soft tissue of known size", "mosh_soft.py C3D -m MEN", scans.as_they_are,
+    Benchmark("mosh_soft", "Soft tissue of known size", "mosh_soft.py C3D -m MEN", mocap.soft_tissue,
               "Bumps of 6 to 12 cm that swing by 10 mm at 2 to 15 Hz, ten at a time, 1 mm of noise. 1 is the whole "
-              "amplitude; `with_pose` counts what the pose moves the skin, `betas_share` is what betas could have of "
-              "the energy. Where we lose: bumps narrower than the distance of the markers, and 41 markers, which "
+              "amplitude. Where we lose: bumps narrower than the distance of the markers, and 41 markers, which "
               "leave waist, buttocks and calves bare.",
               quick="mosh_soft.py C3D -m MEN --frames 120 --runs 1"),
     Benchmark("mosh_faults", "Faults put into markers",

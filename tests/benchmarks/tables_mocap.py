@@ -48,6 +48,17 @@ def speed(report: dict) -> str:
                  rows)
 
 
+def soft_tissue(report: dict) -> str:
+    """Bumps by their markers, and the whole skin."""
+    names = {"markers": "markers", "where": "bumps", "bumps": "number", "amplitude": "amplitude found",
+             "least": "least", "with_pose": "with what the pose moves", "phase_deg": "phase off (degrees)",
+             "betas_share": "energy that betas could have"}
+    skins = {"markers": "markers", "where": "skin", "fixed_mm": "fixed shape (mm)", "soft_mm": "with soft tissue (mm)",
+             "moved_rms_mm": "moved by soft tissue (RMS, mm)"}
+    return "\n\n".join(table(tuple(of.values()), [tuple(row[name] for name in of) for row in report["rows"]
+                                                   if ("bumps" in row) == ("bumps" in of)]) for of in (names, skins))
+
+
 def faults(report: dict) -> str:
     """Exchanges and bad spans, found and there."""
     rows: Rows = []

@@ -17,10 +17,12 @@ def table(header: tuple[str, ...], rows: Rows) -> str:
     return "\n".join("| " + " | ".join(map(text, line)) + " |" for line in lines)
 
 
-def as_they_are(report: dict) -> str:
-    """All rows of a result, a column for every figure."""
-    names = list(dict.fromkeys(name for row in report["rows"] for name in row))
-    return table(tuple(names), [tuple(row.get(name, "") for name in names) for row in report["rows"]])
+def folders(report: dict) -> str:
+    """`scape prep run` by the number of scans and workers."""
+    names = {"scans": "scans", "triangles": "triangles of each", "workers": "workers", "wall_s": "all (s)",
+             "cpu_s": "all (s CPU)", "cpu_s_each": "a scan (s CPU)", "scans_per_hour": "scans an hour",
+             "parent_mb": "memory (MB)", "worker_mb": "largest worker (MB)", "page_mb": "page (MB)"}
+    return table(tuple(names.values()), [tuple(row[name] for name in names) for row in report["rows"]])
 
 
 def registration(report: dict) -> str:
