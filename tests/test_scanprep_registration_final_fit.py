@@ -11,8 +11,9 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
-from scanprep.registration.final_fit import FinalFit, Triangles, final_fit, smoothed_scan
+from scanprep.registration.final_fit import FinalFit, final_fit, smoothed_scan
 from scanprep.registration.schedule import FinalFitConfig, FinalFitRound
+from scanprep.registration.stretches import Triangles
 
 LEFT, RIGHT = np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.7, 0.0])
 NOISE = 0.002

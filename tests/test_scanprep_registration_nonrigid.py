@@ -13,7 +13,7 @@ from jointed_bodies import bent, crab
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.registration import final_fit as inverted
+from scanprep.registration import folds
 from scanprep.registration import graph_fit as graph
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
@@ -115,9 +115,9 @@ def test_a_folded_patch_is_laid_flat_again():
     x[[405, 406]] = x[[406, 405]]                                # two neighbours have changed places
     x[700] += 0.05 * body.vertex_normals[700] + 0.05 * (body.vertices[721] - body.vertices[700]) / 0.02
     upright = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-    assert inverted.inverted_triangles(body, x, upright).sum() >= 2
-    laid = inverted.unfold(body, x, upright)
-    assert not inverted.inverted_triangles(body, laid, upright).any()
+    assert folds.inverted_triangles(body, x, upright).sum() >= 2
+    laid = folds.unfold(body, x, upright)
+    assert not folds.inverted_triangles(body, laid, upright).any()
     np.testing.assert_allclose(laid, body.vertices, atol=1e-12)
 
 
@@ -139,8 +139,8 @@ def test_wider_patches_are_kept_only_where_they_leave_fewer_inverted_triangles(m
     few, more = body.vertices.copy(), body.vertices.copy()
     few[410], more[[205, 410, 615]] = -few[410], -more[[205, 410, 615]]
     wide = body.vertices if mended else more
-    monkeypatch.setattr(inverted, "unfold", lambda template, x, rings=None: wide if rings else few)
-    np.testing.assert_array_equal(inverted.without_inverted(body, few), wide if mended else few)
+    monkeypatch.setattr(folds, "unfold", lambda template, x, rings=None: wide if rings else few)
+    np.testing.assert_array_equal(folds.without_inverted(body, few), wide if mended else few)
 
 
 def test_a_similarity_is_free_and_exact():

@@ -13,7 +13,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import target_of
-from scanprep.registration.final_fit import vertex_rotations
+from scanprep.registration.folds import vertex_rotations
 from scanprep.registration.limb_ends import RigidFit, find_ends, rotated_end
 from scanprep.registration.matches import (
     Likeness,

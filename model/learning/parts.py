@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from scanprep.batch.room import Step, once
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.finder import SkeletonFinder
 from scanprep.skeleton.parts import SkeletonConfig
+from scanprep.skeleton.restarts import SkeletonFinder
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 

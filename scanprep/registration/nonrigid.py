@@ -21,7 +21,8 @@ from ..geometry.surface import OrientedPoints, Surface
 from ..geometry.target import Target, orient
 from ..judgement import HAND, extent, size, unit_problem
 from ..threads import one_thread
-from .final_fit import final_fit, inverted_triangles, without_inverted
+from .final_fit import final_fit
+from .folds import inverted_triangles, without_inverted
 from .graph_fit import GraphFit, graph_fit
 from .matches import NORMALS, Inputs, placed, prepare
 from .schedule import RegistrationConfig

@@ -9,9 +9,9 @@ import numpy as np
 from ..batch.room import Step, once
 from ..geometry.mesh import Mesh
 from ..threads import one_thread
-from .finder import SkeletonFinder
 from .joints import Loop
 from .parts import SkeletonConfig
+from .restarts import SkeletonFinder
 from .symmetry import Symmetry
 from .tree import Skeleton
 

@@ -33,7 +33,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
-from scanprep.registration.final_fit import final_fit, inverted_triangles, unfold
+from scanprep.registration.final_fit import final_fit
+from scanprep.registration.folds import inverted_triangles, unfold
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 

@@ -19,7 +19,7 @@ from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface, checked_points
 from scanprep.geometry.target import Target, target_of
 from scanprep.ranges import Count, Positive, Range, Settings
-from scanprep.registration.final_fit import inverted_triangles, unfold
+from scanprep.registration.folds import inverted_triangles, unfold
 from scanprep.threads import one_thread
 
 from .local_shape import local_shape
