@@ -11,7 +11,7 @@ from completion.partial.pull import Pull
 from scanprep.geometry.least_squares import levenberg_marquardt, normal_equations
 
 RNG = np.random.default_rng(3)
-IDS = np.array([3, 90, 91, 200, 310, 395])
+IDS, MATCHED = np.array([3, 90, 91, 200, 310, 395]), np.array([200, 3, 90, 200, 310, 90])
 TARGETS, NORMALS = RNG.normal(0, 0.3, (6, 3)), RNG.normal(size=(6, 3))
 NORMALS /= np.linalg.norm(NORMALS, axis=1)[:, None]
 TO_POINT, TO_PLANE = np.array([1.0, 0, 0.3, 2, 0, 1]), np.array([0.0, 1, 3, 0.5, 2, 0])
@@ -26,10 +26,10 @@ def unknowns(body):
 @pytest.mark.parametrize("body", BODIES.values(), ids=BODIES)
 def test_one_residual_of_three_rows_is_that_of_place_and_plane(body):
     x = unknowns(body)
-    points = body.follow(IDS, x)(x[None])
+    points = body.follow(MATCHED, x)(x[None])
     plain = normal_equations([energy.point_to_point(points, TARGETS, TO_POINT),
                               energy.point_to_plane(points, TARGETS, NORMALS, TO_PLANE)])
-    pull = Pull(body.near(IDS, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
+    pull = Pull(*body.gathered(MATCHED, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
     nothing = normal_equations([energy.stay_near(x[None], x, np.zeros(len(x)))])
     for ours, theirs in zip(pull.equations(x[None], nothing).dense, plain, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
@@ -49,7 +49,7 @@ def test_a_matrix_is_assembled_only_where_a_step_is_taken():
             asked.append(x)
             return near.columns(x)
 
-    pull = Pull(Counted, TARGETS, NORMALS, TO_POINT, TO_PLANE)
+    pull = Pull(Counted, np.arange(6), TARGETS, NORMALS, TO_POINT, TO_PLANE)
     held = np.ones(len(x))
     found = levenberg_marquardt(lambda at: pull.equations(at, normal_equations([energy.stay_near(at, x, held)])),
                                 x[None], 1)

@@ -109,14 +109,19 @@ class ScanFit:
         return out
 
     def few(self) -> ScanFit:
-        """The same with few vertices of the body, whose normals rotate with their parts: for a search."""
-        out, template, skeleton = copy(self), self.body.template, self.body.skeleton
+        """The same with few vertices of the body and points of the scan: for a search."""
+        template, skeleton = self.body.template, self.body.skeleton
         rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
-        ids = np.unique(np.concatenate([spread(template.vertices, FEW), self.vertices, *rings]))
-        out.body = self.body.some(ids)
-        out._is_of(ids, self.vertices, self.config.model_points // 2)
-        out.gaps = float(np.sqrt(template.face_areas.sum() / len(ids)))
+        out = self.some(np.concatenate([spread(template.vertices, FEW), *rings]), self.config.model_points // 2)
         out.thin = self.cloud.thinned(self.config.scan_points // 2)
+        return out
+
+    def some(self, ids: np.ndarray, matched: int) -> ScanFit:
+        """The same with some vertices of the body, whose normals rotate with their parts; so many are matched."""
+        out, ids = copy(self), np.union1d(ids, self.vertices)
+        out.body = self.body.some(ids)
+        out._is_of(ids, self.vertices, matched)
+        out.gaps = float(np.sqrt(self.body.template.face_areas.sum() / len(ids)))
         return out
 
     @property
@@ -241,8 +246,8 @@ class ScanFit:
         skin, free = self.skin(x), np.full(len(self.vertices), self.config.landmark_sd**-2)
         ids, target, normal, weights = self.matches(skin, scan, reach)
         out_ids, out_target, out_normal, out_weights = self.violations(skin)
-        points = self.body.near(np.concatenate([self.vertices, ids, out_ids]), x)
-        pull = Pull(points, np.concatenate([self.points, target, out_target]),
+        points, at = self.body.gathered(np.concatenate([self.vertices, ids, out_ids]), x)
+        pull = Pull(points, at, np.concatenate([self.points, target, out_target]),
                     np.concatenate([np.zeros_like(self.points), normal, out_normal]),
                     np.concatenate([free, 0.1 * weights, 0 * out_weights]),
                     np.concatenate([0 * free, weights, out_weights]))

@@ -116,8 +116,9 @@ class Outside:
 
     def at(self, places: np.ndarray) -> np.ndarray:
         """(...) metres, for places (..., 3); beyond the table as at its end."""
-        cell = np.clip(((places - self.low) / CELL).astype(np.int64), 0, self.count - 1)
-        return self.excess[(cell[..., 0] * self.count[1] + cell[..., 1]) * self.count[2] + cell[..., 2]]
+        cell = ((places - self.low.astype(places.dtype)) / CELL).astype(np.int32)
+        x, y, z = (np.clip(cell[..., axis], 0, count - 1) for axis, count in enumerate(self.count.tolist()))
+        return self.excess[(x * int(self.count[1]) + y) * int(self.count[2]) + z]
 
 
 def find_cameras(cloud: ScanPoints) -> tuple[CameraView | PictureView, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
 
 from scanprep.geometry.least_squares import Deferred, Dense
 
@@ -12,42 +13,57 @@ from ..bodies import NearPoints
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """`Σ a |y - t|² + b (n·(y - t))²` over some points y of a body, as one residual `A (y - t)` of three rows a point.
-
-    With `A = √a I + (√(a + b) - √a) n nᵀ`, whose square is `a I + b n nᵀ`.
+    """`Σ a |y - t|² + b (n·(y - t))²` over matches, each of one of some points y of a body.
 
     Attributes
     ----------
     points : NearPoints
+    at : (L,) int
+        Which of the points each match is of; the matrix is summed over matches of the same one first.
     targets, normals : (L, 3) float, metres, and unit
     to_point, to_plane : (L,) float
         The weights a and b.
     """
 
     points: NearPoints
+    at: np.ndarray
     targets: np.ndarray
     normals: np.ndarray
     to_point: np.ndarray
     to_plane: np.ndarray
 
     def energies(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What each point (L,) costs for its distance to the place, and to the plane, at unknowns (P,)."""
-        off = self.points.positions(x) - self.targets
-        return self.to_point * (off**2).sum(axis=1), self.to_plane * np.einsum("ld,ld->l", self.normals, off)**2
+        """What each match (L,) costs for its distance to the place, and to the plane, at unknowns (P,)."""
+        off, along = self._off(self.points.positions(x))
+        return self.to_point * (off**2).sum(axis=1), self.to_plane * along**2
 
     def equations(self, x: np.ndarray, known: Dense) -> Deferred:
         """At unknowns (1, P), with those of all else that is known of them."""
-        residual = self._weighed(self.points.positions(x[0]) - self.targets).ravel()
+        places = self.points.positions(x[0])
+        off, along = self._off(places)
+        cost = known.energy + self.to_point @ (off**2).sum(axis=1) + self.to_plane @ along**2
 
         def assemble() -> Dense:
-            columns = self._weighed(self.points.columns(x[0])[1]).reshape(x.shape[1], -1)
-            return Dense(known.energy + residual @ residual, known.gradient + columns @ residual,
-                         known.hessian + columns @ columns.T)
+            columns, gather = self.points.columns(x[0])[1], self._gather(len(places))
+            force = gather @ (self.to_point[:, None] * off + (self.to_plane * along)[:, None] * self.normals)
+            rows = columns.reshape(x.shape[1], -1)
+            drawn = np.swapaxes(np.swapaxes(columns, 0, 1) @ self._stiffness(gather), 0, 1).reshape(rows.shape)
+            return Dense(cost, known.gradient + rows @ force.ravel(), known.hessian + rows @ drawn.T)
 
-        return Deferred(known.energy + residual @ residual, assemble)
+        return Deferred(cost, assemble)
 
-    def _weighed(self, off: np.ndarray) -> np.ndarray:
-        """A times (..., L, 3)."""
-        near = np.sqrt(self.to_point)
-        along = (np.sqrt(self.to_point + self.to_plane) - near) * np.einsum("ld,...ld->...l", self.normals, off)
-        return near[:, None] * off + along[..., None] * self.normals
+    def _off(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far (L, 3) points at places (V, 3) are from their targets, and from the planes (L,), metres."""
+        off = places[self.at] - self.targets
+        return off, np.einsum("ld,ld->l", self.normals, off)
+
+    def _gather(self, count: int) -> csr_array:
+        """(V, L) sums over the matches of each point."""
+        each = np.arange(len(self.at))
+        return csr_array(coo_array((np.ones(len(each)), (self.at, each)), shape=(count, len(each))))
+
+    def _stiffness(self, gather: csr_array) -> np.ndarray:
+        """(V, 3, 3) the sum of a I + b n nᵀ over the matches of each point."""
+        n = self.normals
+        each = self.to_point[:, None, None] * np.eye(3) + self.to_plane[:, None, None] * n[:, :, None] * n[:, None, :]
+        return (gather @ each.reshape(-1, 9)).reshape(-1, 3, 3)

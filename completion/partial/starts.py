@@ -163,13 +163,13 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     places, normals = fit.posed_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    table = fit.outside
+    table, rough = fit.outside, np.swapaxes(turns, 1, 2).astype(np.float32)
     cost, shift = np.zeros((len(poses), len(turns))), np.empty((len(poses), len(turns), 3))
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
         shift[a] = _laid(y, n, turns, toward, scan.points) if fit.upright is None else \
             _stood(y, n, turns, lift, toward, scan.points, fit.upright)
         if table is not None:
-            out = table.at((y @ np.swapaxes(turns, 1, 2) + shift[a][:, None]).astype(np.float32))
+            out = table.at(y.astype(np.float32) @ rough + shift[a][:, None].astype(np.float32))
             cost[a] = config.free_space_weight * (out**2).mean(axis=1)
     share = PROMISING if fit.upright is None else STANDING
     unlikely = cost > (np.quantile(cost, share) if table is not None else np.inf)
@@ -201,7 +201,7 @@ def _facing(n: np.ndarray, turns: np.ndarray, toward: np.ndarray) -> np.ndarray:
     """(T, L) 1 for vertices with normals (L, 3) that face a camera in direction (C, 3) when turned; without one all."""
     if not len(toward):
         return np.ones((len(turns), len(n)))
-    return ((n @ np.swapaxes(turns, 1, 2) @ toward.T) > FACING).any(axis=2).astype(float)
+    return np.any([(to @ turns) @ n.T > FACING for to in toward], axis=0).astype(float)
 
 
 def _laid(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray, scan: np.ndarray) -> np.ndarray:

@@ -10,10 +10,8 @@ import numpy as np
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import (
     Arrow,
-    Deferred,
     Dense,
     by_rotations,
-    levenberg_marquardt,
     normal_equations,
     retract_pose,
     step_between,
@@ -22,15 +20,17 @@ from scanprep.geometry.surface import Surface
 
 from .. import energy
 from ..bodies import FixedBody, ShapedBody
-from ..partial.fit import Matched, ScanFit
+from ..partial.fit import ScanFit
 from ..partial.limbs import reinitialise_limbs
-from ..partial.scan import ScanPoints
+from ..partial.scan import ScanPoints, spread
 from ..partial.starts import approach, best_starts, first_starts
 from ..smoothing import inertia
 from .settings import TrackConfig
 
 REACH, FINAL_REACH = 0.1, 0.03       # metres: limits on the distance of matches in the first round and the third
 SETTLED = 1e-3                       # metres, root mean square: a round that moves the body less is the last
+ROUGH, VERTICES = 2, 2000            # rounds that take few vertices, and how many
+DAMPING = np.array([1e-3])           # share of the diagonal that is added to the matrix of a step
 NEAR, EXPLAINED = 0.05, 0.7          # metres: points that have the body within this are explained; share that must be
 NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
@@ -55,6 +55,7 @@ class FrameFit:
     def __init__(self, body: FixedBody, cloud: ScanPoints, config: TrackConfig, rate: float) -> None:
         self.body, self.config = body, config
         self.scan = ScanFit(body, cloud, *NOTHING, config.scan)
+        self.few = self.scan.some(spread(body.template.vertices, VERTICES), config.body_points)
         self.inertia = inertia(body.n_angles + 3, rate, config.angle_acceleration, config.place_acceleration)
 
     def good(self, found: Refined) -> bool:
@@ -65,27 +66,21 @@ class FrameFit:
         """The best unknowns near x (P,), held by the expected ones where there are such."""
         # variance of a prediction from two uncertain frames, against the acceleration's
         held = 0 * self.inertia if expected is None else self.inertia / 10.0
-        goal, place, n = x if expected is None else expected, self.body.vertices(x), self.body.n_angles
-
+        goal, n, few = x if expected is None else expected, self.body.n_angles, self.few.on(fit.cloud)
         for i in range(self.config.rounds):
-            matched = fit.matched_at(x, fit.thin, _reach(i))
-
-            def equations(at: np.ndarray, matched: Matched = matched) -> Deferred:
-                now, off = matched.equations(at), step_between(goal, at, n)
-
-                def assemble() -> Dense:
-                    cost, gradient, hessian = by_rotations(now.dense, at, n)
-                    return Dense(cost + (off**2) @ held, gradient + held * off, hessian + np.diag(held))
-
-                return Deferred(now.energy + (off**2) @ held, assemble)
-
-            best = levenberg_marquardt(equations, x[None], 1, 1e-3, retract=retract_pose(n)).x
-            x, before, place = best[0], place, self.body.vertices(best[0])
-            if i >= 2 and np.sqrt(((place - before)**2).sum(axis=1).mean()) < SETTLED:
+            now, at = few if i < ROUGH else fit, x[None]
+            places = now.skin(x).places
+            frame = by_rotations(now.matched_at(x, fit.cloud, _reach(i)).equations(at).dense, at, n)
+            off = step_between(goal, at, n)
+            step, _ = Dense(frame.energy + (off**2) @ held, frame.gradient + held * off,
+                            frame.hessian + np.diag(held)).step(DAMPING)
+            x = retract_pose(n)(x, step[0])
+            moved = np.linalg.norm(now.skin(x).places - places, axis=1)
+            if i >= ROUGH and np.sqrt((moved**2).mean()) < SETTLED:
                 break
-        _, gradient, precision = by_rotations(matched.equations(best).dense, best, n)
-        distance = Surface(self.body.template.with_vertices(place)).closest(fit.cloud.points).distances
-        return Refined(x, gradient[0], precision[0], float(distance.mean()), float((distance < NEAR).mean()))
+        gradient = frame.gradient[0] + frame.hessian[0] @ step[0]    # where the step led
+        distance = Surface(self.body.template.with_vertices(fit.skin(x).places)).closest(fit.cloud.points).distances
+        return Refined(x, gradient, frame.hessian[0], float(distance.mean()), float((distance < NEAR).mean()))
 
     def again(self, fit: ScanFit, starts: Sequence[np.ndarray], scratch: bool) -> Refined:
         """A lost frame anew from far starts (P,), or from scratch as well, whichever explains it best."""
