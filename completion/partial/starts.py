@@ -230,10 +230,11 @@ def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarra
     points, directions = (scan.points - shift[:, None]) @ turns, scan.normals @ turns
     ask = np.concatenate([points, NORMALS * directions], axis=2).reshape(-1, 6).astype(np.float32)
     have = np.hstack([y, NORMALS * n]).astype(np.float32)
-    squared = (have**2).sum(axis=1)[:, None]
-    # |a - b|² = |a|² + (|b|² - 2 a·b); a piece at a time, so that it stays near the processor
-    nearest = np.concatenate([(squared + have @ (-2 * some.T)).min(axis=0)
-                              for some in np.array_split(ask, 1 + len(ask) // AT_ONCE)]) + (ask**2).sum(axis=1)
+    # |a - b|² = |a|² + (|b|², b)·(1, -2 a); a piece at a time, so that it stays near the processor
+    have = np.hstack([(have**2).sum(axis=1, keepdims=True), have])
+    other = np.hstack([np.ones_like(ask[:, :1]), -2 * ask])
+    nearest = np.concatenate([(have @ some.T).min(axis=0)
+                              for some in np.array_split(other, 1 + len(other) // AT_ONCE)]) + (ask**2).sum(axis=1)
     return np.minimum(nearest, CAP**2).reshape(len(turns), len(scan.points)).mean(axis=1)
 
 
