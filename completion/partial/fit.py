@@ -88,8 +88,8 @@ class ScanFit:
         """All that belongs to the scan."""
         config = self.config
         self.cloud = cloud
-        self.thin = cloud.thinned(config.scan_points)
-        self.coarse = cloud.thinned(config.scan_points // 4)
+        self._thin: ScanPoints | None = None
+        self._coarse: ScanPoints | None = None
         self.tree = OrientedPoints(cloud.points, cloud.normals)
         self.cameras = find_cameras(cloud) if config.free_space_weight > 0 else ()
         self.clothing = None if cloud.masked is None else Clothing(cloud.masked)
@@ -113,7 +113,7 @@ class ScanFit:
         template, skeleton = self.body.template, self.body.skeleton
         rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
         out = self.some(np.concatenate([spread(template.vertices, FEW), *rings]), self.config.model_points // 2)
-        out.thin = self.cloud.thinned(self.config.scan_points // 2)
+        out._thin = self.cloud.thinned(self.config.scan_points // 2)
         return out
 
     def some(self, ids: np.ndarray, matched: int) -> ScanFit:
@@ -123,6 +123,20 @@ class ScanFit:
         out._is_of(ids, self.vertices, matched)
         out.gaps = float(np.sqrt(self.body.template.face_areas.sum() / len(ids)))
         return out
+
+    @property
+    def thin(self) -> ScanPoints:
+        """The points of the scan that are matched."""
+        if self._thin is None:
+            self._thin = self.cloud.thinned(self.config.scan_points)
+        return self._thin
+
+    @property
+    def coarse(self) -> ScanPoints:
+        """Few points of the scan, for the first rounds of a search."""
+        if self._coarse is None:
+            self._coarse = self.cloud.thinned(self.config.scan_points // 4)
+        return self._coarse
 
     @property
     def outside(self) -> Outside | None:

@@ -75,8 +75,7 @@ class FrameFit:
             step, _ = Dense(frame.energy + (off**2) @ held, frame.gradient + held * off,
                             frame.hessian + np.diag(held)).step(DAMPING)
             x = retract_pose(n)(x, step[0])
-            moved = np.linalg.norm(now.skin(x).places - places, axis=1)
-            if i >= ROUGH and np.sqrt((moved**2).mean()) < SETTLED:
+            if i >= ROUGH and np.sqrt(((now.skin(x).places - places)**2).sum(axis=1).mean()) < SETTLED:
                 break
         gradient = frame.gradient[0] + frame.hessian[0] @ step[0]    # where the step led
         distance = Surface(self.body.template.with_vertices(fit.skin(x).places)).closest(fit.cloud.points).distances
