@@ -63,6 +63,15 @@ def test_few_vertices_of_a_body_are_those_of_the_whole():
     np.testing.assert_allclose(few.near(np.array([1, 4]), x).positions(x), few.vertices(x)[[1, 4]], atol=1e-12)
 
 
+@pytest.mark.parametrize("ids", [[4, 1, 4], [5, 0, 1, 5, 3, 2]], ids=["some", "most"])
+def test_vertices_are_found_among_the_points_that_are_gathered(ids):
+    few, x = BODIES["known"].some(IDS), unknowns(BODIES["known"])
+    points, at = few.gathered(np.array(ids), x)
+    y, columns = points.columns(x)
+    np.testing.assert_allclose(y[at], few.vertices(x)[ids], atol=1e-12)
+    np.testing.assert_allclose(columns[:, at], few.near(np.array(ids), x).columns(x)[1], atol=1e-12)
+
+
 def test_few_vertices_of_an_unknown_shape_are_rough_and_their_own_derivative():
     whole = BODIES["shaped"]
     few, x = whole.some(IDS), unknowns(whole)

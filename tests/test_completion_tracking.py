@@ -8,12 +8,13 @@ from test_completion_partial import MARKS, QUICK
 from completion import Motion, TrackConfig, smoothing, track
 from completion.bodies import FixedBody, ShapedBody
 from completion.smoothing import inertia, predicted, smooth
-from completion.tracking.frame_fit import shared_shape, spread_poses
+from completion.tracking.frame_fit import FrameFit, shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
 from completion.tracking.sequence import Tracker
 from scanprep.batch.values import load_value, save_value
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
+from scanprep.geometry.least_squares import step_between
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
@@ -150,6 +151,18 @@ def same(ours, theirs):
     """Bit by bit."""
     for name in ("number", "x", "found", "residual", "explained", "gradient", "precision"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
+
+
+def test_what_a_frame_says_is_told_where_the_last_step_led(model, known):
+    """There what the points want and what the prediction wants cancel out."""
+    bodies, frames = known
+    body, poses, trans = FixedBody(model.subject(None)), *motion()
+    fitter = FrameFit(body, prepare_frame(frames[0], 700, 24, expected=bodies[0]), replace(SETTINGS, rounds=1), RATE)
+    begin = body.join(poses[0], trans[0]) + 0.02
+    found = fitter.refine(fitter.scan, begin, begin)
+    step, held = step_between(begin, found.x, body.n_angles), fitter.inertia / 10
+    assert np.linalg.norm(step) > 0.02
+    assert np.linalg.norm(found.gradient + held * step) < 0.01 * np.linalg.norm(found.precision @ step)
 
 
 def test_a_sequence_without_anything_is_refused(model):
