@@ -63,7 +63,7 @@ class FrameFit:
         return found.residual <= self.config.lost and found.explained >= EXPLAINED
 
     def refine(self, fit: ScanFit, x: np.ndarray, expected: np.ndarray | None = None) -> Refined:
-        """The best unknowns near x (P,), held by the expected ones where there are such."""
+        """The best unknowns near x (P,), held by the expected ones where there are such: one step for each matching."""
         # variance of a prediction from two uncertain frames, against the acceleration's
         held = 0 * self.inertia if expected is None else self.inertia / 10.0
         goal, n, few = x if expected is None else expected, self.body.n_angles, self.few.on(fit.cloud)
