@@ -153,8 +153,7 @@ class ShapedBody(FixedBody):
         self.n_angles = 3 * len(model.skeleton.parents)
         self.pose_mean, self.pose_covariance = model.pose_mean, model.pose_covariance
         self.pose_examples, self.left_out_error = model.pose_examples, model.info.get("left_out_error")
-        self._at = np.zeros(self.n_betas)
-        self.subject = model.subject(self._at)
+        self._at, self.subject = np.zeros(self.n_betas), model.mean_subject
         self._anchor: Anchor | None = None
         self._last = (np.zeros(0), np.zeros((0, 3)))
 
@@ -272,8 +271,8 @@ class Anchor:
         self.skeleton = model.skeleton
         self.part = model.skeleton.part_of_vertex(model.template)
         self.R = model.skeleton.part_rotations(pose)
-        D = model.shape_jacobian(pose)
-        self.joints = np.einsum("jn,ndk->jdk", model.joint_regressor.toarray(), D)
+        D = model.shape_jacobian(pose) if pose.any() else model.rest_shape_jacobian
+        self.joints = (model.joint_regressor @ D.reshape(len(D), -1)).reshape(-1, *D.shape[1:])
         self.local = D - self.joints[self.part]
 
     def turned(self, pose: np.ndarray) -> float:

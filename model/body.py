@@ -216,6 +216,16 @@ class BodyModel(ABC):
         return Subject(self.template, self.skeleton, kept, self.operator(betas).astype(dtype), self.pose_mean,
                        self.pose_covariance, self.pose_examples, self.info.get("left_out_error"), self.regressor)
 
+    @cached_property
+    def mean_subject(self) -> Subject:
+        """The mean person, where every search for a shape begins."""
+        return self.subject(np.zeros(self.n_betas))
+
+    @cached_property
+    def rest_shape_jacobian(self) -> np.ndarray:
+        """(N, 3, K) metres, the derivative of the vertices by betas in the pose of the template."""
+        return self.shape_jacobian(np.zeros(self.skeleton.joints.shape))
+
     def jacobian(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None,
                  vertex_ids: np.ndarray | None = None) -> Derivatives:
         """Vertices at one pose with their derivatives with respect to pose parameters and betas.

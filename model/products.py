@@ -112,7 +112,7 @@ def _combined(basis: np.ndarray, weights: np.ndarray | sparray) -> np.ndarray:
     """T (..., L, 3) of combinations of points."""
     rows = chosen_rows(weights)
     if rows is not None:
-        return np.take(basis, rows, axis=-2)                   # in one block, as an index would not leave it
+        return np.ascontiguousarray(basis[..., rows, :])       # in one block; `take` would copy all of T first
     if isinstance(weights, np.ndarray):
         return np.moveaxis(np.tensordot(basis, weights.astype(basis.dtype), axes=(-2, 1)), -1, -2)
     sparse = csr_array(weights)

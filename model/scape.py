@@ -23,6 +23,7 @@ from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
 VERSION = 3                          # 1 had linear features only, 2 no pose examples
+AT_ONCE = 1000                       # triangles whose components are near the processor together
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,12 +82,6 @@ class ScapeModel(BodyModel):
         """The products of features and rotations that a fixed body is linear in."""
         return self.parts.terms(self.pose_space.features)
 
-    @cached_property
-    def _components_by_face(self) -> np.ndarray:
-        """(F, 3 K, 3) the components, row by row of each triangle."""
-        U = self.shape_space.components
-        return np.ascontiguousarray(U.transpose(1, 2, 0, 3)).reshape(U.shape[1], -1, 3)
-
     def posed_edges(self, pose: np.ndarray) -> np.ndarray:
         """`Q v̂` (F, 2, 3) of every triangle at one pose (J, 3)."""
         return self.parts.posed(self.pose_space.gradients(pose))
@@ -141,9 +136,12 @@ class ScapeModel(BodyModel):
         K, F = self.n_betas, len(R)
         if not K:
             return np.zeros((self.template.vertices.shape[0] if vertex_ids is None else len(vertex_ids), 3, 0))
-        bent = self._components_by_face.astype(np.float64) @ np.swapaxes(posed, -1, -2)      # F products, not K F
-        e = (R @ bent.reshape(F, 3, 2 * K)).reshape(F, 3, K, 2)                             # R U_k Q v̂_j
-        rhs = self.stitching.edge_operator.T @ e.transpose(0, 3, 1, 2).reshape(2 * F, 3 * K)
+        by_entry = (R[:, None, :, :, None] * posed[:, :, None, None, :]).reshape(F, 6, 9)
+        U, e = self.shape_space.components.reshape(K, F, 9), np.empty((F, 6, K))
+        for start in range(0, F, AT_ONCE):                                                  # R U_k Q v̂_j
+            some = slice(start, start + AT_ONCE)
+            e[some] = by_entry[some] @ np.ascontiguousarray(U[:, some].transpose(1, 2, 0), dtype=np.float64)
+        rhs = self.stitching.edge_operator.T @ e.reshape(2 * F, 3 * K)
         y = self.stitching.solve(rhs).reshape(-1, 3, K)
         return y if vertex_ids is None else y[vertex_ids]
 

@@ -9,7 +9,8 @@ from completion_bodies import worm_with_prior
 from completion.bodies import FixedBody
 from completion.partial.completion import Completion, doubts, left_over, load_completion, save_completion
 from completion.partial.confidence import expected_error
-from completion.partial.fit import ScanFit, Solved, solve_jointly
+from completion.partial.fit import ScanFit
+from completion.partial.rounds import Solved, solve_jointly
 from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
 from scanprep.geometry import storage
@@ -109,7 +110,7 @@ def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide
         reaches.append(some[-1])
         return Solved(np.array([len(reaches) - 1]), True, len(some), {})
 
-    monkeypatch.setattr("completion.partial.fit._in_rounds", rounds)
+    monkeypatch.setattr("completion.partial.rounds._in_rounds", rounds)
     fit = SimpleNamespace(config=CompletionConfig(), misfit=lambda x: (None, wide, narrow)[x[0]])
     solved = solve_jointly(fit, fit, np.zeros(1), lambda done: None)
     assert solved.x[0] == 1 + kept and reaches[0] == reaches[1] > reaches[2]

@@ -23,8 +23,9 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .fit import EVIDENCE, FINAL_REACH, REACH, SETTLED, ScanFit, Skin, Solved
+from .fit import EVIDENCE, FINAL_REACH, REACH, ScanFit, Skin
 from .free_surface import FreeSurface
+from .rounds import SETTLED, Solved
 from .settings import CompletionConfig
 
 MORE = 3                             # times as many rounds as the joint method: each block gives way only a little

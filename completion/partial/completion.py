@@ -21,11 +21,12 @@ from scanprep.threads import one_thread
 from ..bodies import as_body
 from .alternation import turns_of
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
-from .fit import STRANGE, ScanFit, solve_jointly
+from .fit import STRANGE, ScanFit
 from .free_space import free_space_violation
 from .free_surface import distance_to, free_surface
 from .inputs import in_metres
 from .limbs import with_limbs
+from .rounds import solve_jointly
 from .scale import ScaledBody
 from .scan import Scan
 from .settings import CompletionConfig

@@ -1,9 +1,9 @@
-"""Pose, place and shape of a body from a scan: matches, robust weights, and a search that escapes wrong limbs."""
+"""A body on a scan: matches and robust weights, a better body for one matching, and how badly a body explains it."""
 from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -25,12 +25,8 @@ from .upright import TILT, Upright
 Terms = dict[str, Residual]
 
 LIKELY = 0.04                        # metres: matches closer than this are mostly right
-SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
-REACH, WIDE_REACH, FINAL_REACH = 0.2, 0.08, 0.03    # metres: limits on the distance of matches, from first to last
-FINE = 2                             # rounds at the wide reach that take all vertices, at least
-NARROWING, SETTLING = 3, 6           # rounds from the wide to the final reach; that a reach is held at most
-CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
-FEW, QUICK = 3000, 1500              # vertices that a search takes, and a quick look
+REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches, first and last
+FEW = 3000                           # vertices that a search takes
 BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
 MIN_COSINE = 0.6                     # between the normals of a match
 # Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
@@ -196,23 +192,6 @@ class ScanFit:
         beyond = self.body.joints_from_known(self.body.split(x)[0]) - STRANGE
         return (np.maximum(beyond, 0) / ODD)**2
 
-    def quick_misfits(self, x: np.ndarray, cap: float = 0.1) -> np.ndarray:
-        """How badly bodies (n, P) explain the scan, on few vertices whose normals rotate with their parts."""
-        ids, few = spread(self.body.template.vertices[self.ids], QUICK), slice(None, None, 3)
-        contact = Contact(self.body.skeleton, self.part[ids[few]])
-        pose, trans, _ = self.body.split(x)
-        places, normals = self.posed_points(ids, pose, trans)
-        out = np.empty(len(x))
-        for i, (y, n) in enumerate(zip(places, normals, strict=True)):
-            found = OrientedPoints(y, n).match(self.coarse.points, self.coarse.normals, cap, MIN_COSINE)
-            apart = (np.minimum(found.distances, cap)**2).mean()
-            depth = contact.violation(y[few], n[few]).excess
-            apart += self.config.contact_weight * (np.minimum(depth, cap)**2).mean()
-            if self.outside is not None:
-                apart += self.config.free_space_weight * (np.minimum(self.outside.at(y[few]), cap)**2).mean()
-            out[i] = EVIDENCE * apart / self.config.scan_sd**2 + self.unlikely(x[i])
-        return out
-
     def posed_points(self, ids: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None
                      ) -> tuple[np.ndarray, np.ndarray]:
         """Some vertices (B, L, 3) in poses (B, J, 3), and normals that rotate with their parts."""
@@ -347,43 +326,3 @@ class Matched:
                 "scan_planes": float(to_plane[self.landmarks:end].sum()),
                 "scan_points": float(to_point[self.landmarks:end].sum()), "violations": float(to_plane[end:].sum()),
                 **{name: float(term.energy[0]) for name, term in self.known(x[None]).items()}}
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """Unknowns (P,) at the end of the rounds, whether they settled, the rounds, and each term of the energy."""
-
-    x: np.ndarray
-    converged: bool
-    rounds: int
-    energies: dict[str, float]
-
-
-def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
-    """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach, `few` vertices first.
-
-    A model of many scans follows a scan closely, and matches that are farther off than it ever is are wrong. One of
-    few scans does not, and drops the limbs that it follows badly. So the rounds settle at a wide reach first, then at
-    a narrow one, and the former is kept where it explains clearly more.
-
-    [SCAPE] Eq. 10
-    """
-    reaches = np.geomspace(REACH, WIDE_REACH, fit.config.rounds)
-    rough = _in_rounds(few, x, reaches, tell)
-    wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(FINE), lambda i: None)
-    narrow = _in_rounds(fit, wide.x, np.geomspace(WIDE_REACH, FINAL_REACH, NARROWING), lambda i: None)
-    best = wide if fit.misfit(wide.x) < CLEARLY * fit.misfit(narrow.x) else narrow
-    return replace(best, rounds=rough.rounds + wide.rounds + narrow.rounds)
-
-
-def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None]) -> Solved:
-    """Unknowns from x (P,) on when matches reach so far, metres, round by round, and the last until they settle."""
-    shift, place, rounds = np.inf, fit.body.vertices(x), len(reaches)
-    for i, reach in enumerate([*reaches, *reaches[-1:].repeat(SETTLING)]):
-        x, matched = fit.step(x, fit.thin, reach)
-        before, place = place, fit.body.vertices(x)
-        shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
-        tell(min(i + 1, rounds))
-        if i + 1 >= rounds and shift < SETTLED:
-            break
-    return Solved(x, bool(shift < 2 * SETTLED), i + 1, matched.energies(x))

@@ -11,7 +11,6 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from model.posing.cli import read_subject
 from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
@@ -62,6 +61,8 @@ def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyMod
     """The model where the person's shape is to be found, else a body of known shape."""
     if subject is None and model.n_betas:
         return model
+    from model.posing.cli import read_subject  # with all that makes models
+
     return read_subject(model, None if subject in (None, "template") else Path(str(subject)), unit)
 
 

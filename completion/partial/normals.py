@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from scanprep.threads import search_threads
 
 COARSE = 2000                        # points that show the form at large
+EACH = 4                             # one of so many points is asked which way its patch bulges
 WIDE = 0.12                          # metres: at this scale a body is convex enough to tell in from out
 GRAZING = 0.3                        # cosine below which a scanner sees little
 FEW = 2000                           # points that are enough to find the viewpoint
@@ -21,16 +22,15 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     """Indices of about `count` points, one to each cell of a grid, so that they cover the whole evenly."""
     extent = np.ptp(points, axis=0).max()
     low, high = extent / 2048, extent
+    cell = np.sqrt(low * high)
     for _ in range(20):
-        cell = np.sqrt(low * high)
         keys = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
         _, first = np.unique(keys @ np.array([1, 4096, 4096**2]), return_index=True)
-        if len(first) > count:
-            low = cell
-        else:
-            high = cell
         if abs(len(first) - count) <= 0.03 * count:
             break
+        low, high = (cell, high) if len(first) > count else (low, cell)
+        ahead = cell * np.sqrt(len(first) / count)                            # cells of a surface go by the square
+        cell = ahead if low < ahead < high else np.sqrt(low * high)
     return np.sort(first)
 
 
@@ -73,18 +73,21 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     tree = minimum_spanning_tree(graph)
     tree = tree + tree.T
     patches, patch = connected_components(tree, directed=False)
-    out = normals.copy()
-    for root in np.unique(patch, return_index=True)[1]:
+    roots, flipped = np.unique(patch, return_index=True)[1], [False] * n
+    for root in roots:
         order, before = breadth_first_order(tree, root, directed=False)
-        for i in order[1:]:
-            if out[i] @ out[before[i]] < 0:
-                out[i] = -out[i]
+        turned = (np.einsum("nd,nd->n", normals, normals[np.maximum(before, 0)]) < 0).tolist()
+        above = before.tolist()
+        for i in order[1:].tolist():
+            flipped[i] = flipped[above[i]] != turned[i]
+    out = np.where(np.array(flipped)[:, None], -normals, normals)
     coarse = points[spread(points, COARSE)] if n > COARSE else points
-    far, around = cKDTree(coarse).query(points, 48, distance_upper_bound=WIDE, workers=search_threads(len(points)))
+    some = np.r_[roots, 0:n:EACH]
+    far, around = cKDTree(coarse).query(points[some], 48, distance_upper_bound=WIDE, workers=search_threads(len(some)))
     found = np.isfinite(far)
-    total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[:, None], 0).sum(axis=1)
-    bulge = -np.einsum("nd,nd->n", out, total)
-    sign = np.where(np.bincount(patch, bulge, patches) < 0, -1.0, 1.0)
+    total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[some, None], 0).sum(axis=1)
+    bulge = -np.einsum("nd,nd->n", out[some], total)
+    sign = np.where(np.bincount(patch[some], bulge, patches) < 0, -1.0, 1.0)
     out = out * sign[patch][:, None]
     facing = faces(facing_point(points, out), points, out)
     if facing.mean() < ONE_VIEW:
@@ -105,10 +108,12 @@ def facing_point(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     normals, centre = normals[keep], points[keep].mean(axis=0)
     points = points[keep] - centre
     size = max(np.linalg.norm(points, axis=1).max(), 1e-12)
+    points /= size
+    outward, squared = np.einsum("nd,nd->n", normals, points), (points**2).sum(axis=1)
 
     def turned_away(q: np.ndarray) -> float:
-        to = q[:3] / np.linalg.norm(q[:3]) - q[3] * points / size
-        cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
+        to, near = q[:3] / np.linalg.norm(q[:3]), q[3]           # the view is in direction `to`, 1 / near away
+        cosine = (normals @ to - near * outward) / np.sqrt(1 - 2 * near * (points @ to) + near**2 * squared)
         return float(np.mean(np.clip(GRAZING - cosine, 0, 0.5)**2))   # some normals may have the wrong sign
 
     start = normals.mean(axis=0)

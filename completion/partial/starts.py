@@ -12,7 +12,7 @@ from scanprep.geometry.least_squares import normal_equations
 from .. import energy
 from ..bodies import FixedBody, Follow
 from ..starts import distinct, search
-from .fit import ScanFit
+from .fit import EVIDENCE, ScanFit
 from .scan import ScanPoints, spread
 from .upright import SPREAD, SPREAD_OF_MANY, Upright
 
@@ -24,7 +24,7 @@ FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these
 ROTATIONS = 600                         # about 25 degrees between neighbours
 LEVELS = 5                           # heights at which a body that stands is laid on what is seen of it
 POSES = 100                          # tried at most
-VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns
+VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns, or all draws
 CAP = 0.15                           # metres: further off is as bad
 NORMALS = 0.1                        # metres that a difference of normals of unit length weighs
 FACING = 0.15                        # cosine to the camera's direction from which a vertex counts as seen
@@ -70,8 +70,20 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
     drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, fit.config.random_starts, fit.rng)
                                 for start in x)])
     drawn = np.hstack([drawn, np.zeros((len(drawn), fit.body.n_betas))])
-    drawn = drawn[np.argsort(few.quick_misfits(drawn))]
+    drawn = drawn[np.argsort(at_a_glance(few, drawn))]
     return drawn[distinct(places_of(few, drawn), CANDIDATES)]
+
+
+def at_a_glance(fit: ScanFit, x: np.ndarray) -> np.ndarray:
+    """How badly bodies (n, P) explain the scan, on very few points, whatever parts enter each other."""
+    scan, ids = fit.cloud.thinned(POINTS), spread(fit.body.template.vertices[fit.ids], VERTICES)
+    places, normals = fit.posed_points(ids, *fit.body.split(x)[:2])
+    apart = np.array([_distances(y, n, np.eye(3)[None], np.zeros((1, 3)), scan)[0]
+                      for y, n in zip(places, normals, strict=True)])
+    if fit.outside is not None:
+        apart += fit.config.free_space_weight * (fit.outside.at(places)**2).mean(axis=1)
+    unlikely = sum(term.energy for term in fit.prior_terms(x).values())
+    return EVIDENCE / fit.config.scan_sd**2 * apart + unlikely
 
 
 def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,

@@ -91,10 +91,8 @@ class Mesh:
     @cached_property
     def vertex_normals(self) -> np.ndarray:
         """(N, 3) unit normals, area-weighted; zero at a vertex without triangles."""
-        total = np.zeros_like(self.vertices)
-        for corner in range(3):
-            np.add.at(total, self.faces[:, corner], self._cross)
-        return _unit(total)
+        corner, count = self.faces.T.ravel(), len(self.vertices)
+        return _unit(np.stack([np.bincount(corner, np.tile(along, 3), count) for along in self._cross.T], axis=1))
 
     @cached_property
     def vertex_areas(self) -> np.ndarray:

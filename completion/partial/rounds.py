@@ -1,0 +1,55 @@
+"""Pose, place and shape together, in rounds of matching with shrinking reach."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .fit import FINAL_REACH, REACH, ScanFit
+
+WIDE_REACH = 0.08                    # metres: limit on the distance of matches, for models that follow a scan badly
+SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
+FINE = 2                             # rounds at the wide reach that take all vertices, at least
+NARROWING, SETTLING = 3, 6           # rounds from the wide to the final reach; that a reach is held at most
+CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Unknowns (P,) at the end of the rounds, whether they settled, the rounds, and each term of the energy."""
+
+    x: np.ndarray
+    converged: bool
+    rounds: int
+    energies: dict[str, float]
+
+
+def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
+    """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach, `few` vertices first.
+
+    A model of many scans follows a scan closely, and matches that are farther off than it ever is are wrong. One of
+    few scans does not, and drops the limbs that it follows badly. So the rounds settle at a wide reach first, then at
+    a narrow one, and the former is kept where it explains clearly more.
+
+    [SCAPE] Eq. 10
+    """
+    reaches = np.geomspace(REACH, WIDE_REACH, fit.config.rounds)
+    rough = _in_rounds(few, x, reaches, tell)
+    wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(FINE), lambda i: None)
+    narrow = _in_rounds(fit, wide.x, np.geomspace(WIDE_REACH, FINAL_REACH, NARROWING), lambda i: None)
+    best = wide if fit.misfit(wide.x) < CLEARLY * fit.misfit(narrow.x) else narrow
+    return replace(best, rounds=rough.rounds + wide.rounds + narrow.rounds)
+
+
+def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None]) -> Solved:
+    """Unknowns from x (P,) on when matches reach so far, metres, round by round, and the last until they settle."""
+    shift, place, rounds = np.inf, fit.skin(x).places, len(reaches)
+    for i, reach in enumerate([*reaches, *reaches[-1:].repeat(SETTLING)]):
+        x, matched = fit.step(x, fit.thin, reach)
+        before, place = place, fit.skin(x).places
+        shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
+        tell(min(i + 1, rounds))
+        if i + 1 >= rounds and shift < SETTLED:
+            break
+    return Solved(x, bool(shift < 2 * SETTLED), i + 1, matched.energies(x))
