@@ -106,7 +106,7 @@ def test_a_bend_that_the_model_never_saw_is_named():
 def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide, narrow, kept):
     reaches = []
 
-    def rounds(fit, x, some, tell):
+    def rounds(fit, x, some, tell, settling=6):
         reaches.append(some[-1])
         return Solved(np.array([len(reaches) - 1]), True, len(some), {})
 

@@ -26,6 +26,7 @@ Terms = dict[str, Residual]
 
 LIKELY = 0.04                        # metres: matches closer than this are mostly right
 REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches, first and last
+DAMPING = 1e-3, 1e-1                 # of the one step for a matching, and of another one where it lowers nothing
 FEW = 3000                           # vertices that a search takes
 BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
 MIN_COSINE = 0.6                     # between the normals of a match
@@ -227,7 +228,11 @@ class ScanFit:
         def equations(at: np.ndarray) -> Deferred:
             return matched.equations(at, energy.shape_prior(at, betas, stiff), energy.stay_near(at, x, held))
 
-        return levenberg_marquardt(equations, x[None], 2, 1e-3).x[0], matched            # [SCAPE] Eq. 11
+        for damping in DAMPING:
+            ahead = levenberg_marquardt(equations, x[None], 1, damping=damping).x[0]     # [SCAPE] Eq. 11
+            if not np.array_equal(ahead, x):
+                break
+        return ahead, matched
 
     def precision(self, x: np.ndarray) -> np.ndarray:
         """(P, P) how sharply scan, landmarks and priors together determine unknowns (P,): the Gauss-Newton matrix."""

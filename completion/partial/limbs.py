@@ -26,6 +26,7 @@ KEPT = 24                            # draws around which the next are made
 CELL = 0.03                          # metres: of the table of the inside of a body
 EXPLAINED = 0.04                     # metres of the body within which a point of the scan needs no limb
 FOLLOWED, APART = 4, 0.1             # draws that are followed, and by how many metres they differ at the limb's end
+CARRIED = 2                          # of them, those that go on after the first round
 AMISS = 30.0                         # energy of what is wrong with a limb from which on it is sought
 GRAVE = 100.0                        # energy from which on the whole body may be wrong
 RIVAL = 1.1                          # times the least misfit that of another body may have to be nearly as good
@@ -103,8 +104,10 @@ def amiss(fit: ScanFit, x: np.ndarray, limb: list[int], wrong: np.ndarray, lost:
 def _reinitialised(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
     """Unknowns (P,) with a limb as it is, or as the draw that explains most after a few rounds."""
     best, search = fit.misfit(x), LimbSearch.around(fit, x, limb)
-    for drawn in search.best(draws(fit, x, limb, DRAWS * fit.config.random_starts)):
-        tried = approach(fit, drawn, REACHES)
+    drawn = search.best(draws(fit, x, limb, DRAWS * fit.config.random_starts))
+    begun = sorted((approach(fit, one, REACHES[:1]) for one in drawn), key=fit.misfit)
+    for one in begun[:CARRIED]:
+        tried = approach(fit, one, REACHES[1:])
         if (misfit := fit.misfit(tried)) < best - max(BETTER, SHARE * best):
             x, best = tried, misfit
     return x

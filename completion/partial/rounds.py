@@ -35,17 +35,18 @@ def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int
     [SCAPE] Eq. 10
     """
     reaches = np.geomspace(REACH, WIDE_REACH, fit.config.rounds)
-    rough = _in_rounds(few, x, reaches, tell)
+    rough = _in_rounds(few, x, reaches, tell, 0)
     wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(FINE), lambda i: None)
     narrow = _in_rounds(fit, wide.x, np.geomspace(WIDE_REACH, FINAL_REACH, NARROWING), lambda i: None)
     best = wide if fit.misfit(wide.x) < CLEARLY * fit.misfit(narrow.x) else narrow
     return replace(best, rounds=rough.rounds + wide.rounds + narrow.rounds)
 
 
-def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None]) -> Solved:
+def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None],
+               settling: int = SETTLING) -> Solved:
     """Unknowns from x (P,) on when matches reach so far, metres, round by round, and the last until they settle."""
     shift, place, rounds = np.inf, fit.skin(x).places, len(reaches)
-    for i, reach in enumerate([*reaches, *reaches[-1:].repeat(SETTLING)]):
+    for i, reach in enumerate([*reaches, *reaches[-1:].repeat(settling)]):
         x, matched = fit.step(x, fit.thin, reach)
         before, place = place, fit.skin(x).places
         shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
