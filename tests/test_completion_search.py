@@ -11,7 +11,7 @@ from completion.partial.free_space import Outside, find_camera
 from completion.partial.limbs import examples_of
 from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
-from completion.partial.starts import AXES, all_rotations, from_nothing, placements, starting_poses, varied
+from completion.partial.starts import AXES, all_rotations, at_a_glance, from_nothing, placements, starting_poses, varied
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -62,6 +62,16 @@ def test_the_table_says_what_the_camera_denies(scene):
     there = np.minimum(camera.violation(places).excess, 0.15)
     assert np.abs(table.at(places) - there).mean() < 0.015               # cells are 4 cm wide
     assert table.at(points[:1] + 10)[0] == pytest.approx(0.15)
+
+
+def test_a_glance_tells_the_body_of_the_scan_from_others(model, scene):
+    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
+    x = np.repeat(fit.body.join(POSE, TRANS)[None], 40, axis=0)
+    x[1:, 3:12] += np.random.default_rng(1).normal(0, 0.3, (39, 9))
+    cost = at_a_glance(fit, x)
+    misfit = np.array([fit.misfit(one) for one in x])
+    assert cost.argmin() == misfit.argmin() == 0
+    assert np.corrcoef(cost.argsort().argsort(), misfit.argsort().argsort())[0, 1] > 0.9
 
 
 def test_what_is_laid_on_the_scan_lies_there(model, scene):

@@ -176,6 +176,7 @@ def test_glyphs_lie_where_they_should():
     corners, normals, owner = balls(points, 0.1)
     assert np.allclose(np.linalg.norm(corners - points[owner][:, None], axis=2), 0.1)
     assert np.allclose(corners - points[owner][:, None], 0.1 * normals)
+    assert len(balls(np.zeros((4001, 3)), 0.1)[2]) == 4001 * 20           # the plainest that there are
     ends = np.array([[0.0, 0, 1], [1, 2, 2]])
     corners, normals, owner = capsules(points, ends, 0.1)
     assert np.allclose(np.linalg.norm(normals, axis=2), 1)
