@@ -146,7 +146,7 @@ class ShapedBody(FixedBody):
     `turn` radians, how far a part may turn before D is stitched anew.
     """
 
-    def __init__(self, model: BodyModel, renew: float = 2.0, turn: float = 0.7) -> None:
+    def __init__(self, model: BodyModel, renew: float = 4.0, turn: float = 1.2) -> None:
         self.model, self.renew, self.turn = model, renew, turn
         self.n_betas = model.n_betas
         self.template, self.skeleton = model.template, model.skeleton

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+AT_ONCE = 20_000                     # entries of S that are near the processor together
+
 
 @dataclass(frozen=True, eq=False)
 class ShapeSpace:
@@ -39,10 +41,11 @@ class ShapeSpace:
             return np.broadcast_to(np.eye(3), self.mean.shape).copy()
         betas = np.asarray(betas, dtype=np.float64)
         self._check(betas, 1)
-        S = self.mean.astype(np.float64)
-        for beta, component in zip(betas, self.components, strict=False):
-            S += np.multiply(beta, component, dtype=np.float64)
-        return S
+        S = self.mean.ravel().astype(np.float64)
+        U = self.components[:len(betas)].reshape(len(betas), S.size)
+        for start in range(0, S.size, AT_ONCE):
+            S[start:start + AT_ONCE] += betas @ U[:, start:start + AT_ONCE].astype(np.float64)
+        return S.reshape(self.mean.shape)
 
     def some_gradients(self, betas: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """S (B, f, 3, 3) of some triangles (f,) for betas (B, k) of many people."""

@@ -24,7 +24,7 @@ FACING = 0.97                        # share of the points of a scan that must f
 TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
 RIM = 2                              # pixels that a depth camera loses at the edge of a body
 INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
-CELL, MARGIN, CAP = 0.04, 0.3, 0.15   # metres: of the table of what cameras must have seen; further off is as bad
+CELL, MARGIN, CAP = 0.05, 0.3, 0.15   # metres: of the table of what cameras must have seen; further off is as bad
 CLOTHING, NOISE = 0.10, 0.003        # metres that hair or a skirt may stand off the skin; that skin may stick out
 
 

@@ -12,7 +12,7 @@ from .fit import MIN_COSINE
 from .scan import ScanPoints
 from .settings import CompletionConfig
 
-NEAR, ROUNDS = 0.03, 3              # metres: limit on the distance of scan points to the free surface; its matchings
+NEAR, ROUNDS = 0.03, 4              # metres: limit on the distance of scan points to the free surface; its matchings
 
 
 class FreeSurface:
