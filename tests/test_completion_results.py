@@ -117,6 +117,21 @@ def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide
     assert solved.rounds > CompletionConfig().rounds
 
 
+@pytest.mark.parametrize(("lowest", "steps", "moved"), [(0, 1, 1), (0.01, 2, 1), (1e9, 2, 0)])
+def test_where_a_step_lowers_nothing_a_shorter_one_is_tried(monkeypatch, lowest, steps, moved):
+    tried = []
+
+    def once(equations, x, iterations, damping):
+        tried.append(damping)
+        return SimpleNamespace(x=x + (damping >= lowest))
+
+    monkeypatch.setattr("completion.partial.fit.levenberg_marquardt", once)
+    fit = ScanFit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
+                  np.zeros((0, 3)), CompletionConfig())
+    assert (fit.step(np.zeros(15), fit.thin, 0.1)[0] == moved).all()
+    assert len(tried) == steps and tried == sorted(tried)
+
+
 def test_a_joint_held_as_in_no_known_pose_is_named_and_a_known_way_is_not():
     poses = np.zeros((1, 4, 3))
     poses[0, 1, 0] = np.radians(120)

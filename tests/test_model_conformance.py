@@ -174,6 +174,9 @@ def test_shape_jacobian_matches_differences(model, rng):
     corners, weights = rng.choice(398, (8, 3)), rng.dirichlet(np.ones(3), 8)
     np.testing.assert_allclose(model.points(corners, weights).shape_jacobian(pose),
                                np.einsum("lk,lkdc->ldc", weights, slope[corners]), rtol=0, atol=1e-12)
+    at_rest = np.zeros_like(pose)
+    np.testing.assert_allclose(model.rest_shape_jacobian, model.shape_jacobian(at_rest), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(model.mean_subject.vertices(at_rest), model.vertices(at_rest, 0 * BETAS), atol=1e-9)
     # affine in betas: one slope serves them all
     np.testing.assert_allclose(model.vertices(pose, 3 * BETAS) - model.vertices(pose, BETAS), slope @ (2 * BETAS),
                                rtol=0, atol=1e-9)
