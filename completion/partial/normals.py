@@ -73,7 +73,7 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     tree = minimum_spanning_tree(graph)
     tree = tree + tree.T
     patches, patch = connected_components(tree, directed=False)
-    roots, flipped = np.unique(patch, return_index=True)[1], [False] * n
+    roots, flipped = np.unique(patch, return_index=True)[1], np.zeros(n, dtype=bool).tolist()
     for root in roots:
         order, before = breadth_first_order(tree, root, directed=False)
         turned = (np.einsum("nd,nd->n", normals, normals[np.maximum(before, 0)]) < 0).tolist()
