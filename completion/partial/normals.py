@@ -76,10 +76,10 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     roots, flipped = np.unique(patch, return_index=True)[1], np.zeros(n, dtype=bool).tolist()
     for root in roots:
         order, before = breadth_first_order(tree, root, directed=False)
-        turned = (np.einsum("nd,nd->n", normals, normals[np.maximum(before, 0)]) < 0).tolist()
-        above = before.tolist()
-        for i in order[1:].tolist():
-            flipped[i] = flipped[above[i]] != turned[i]
+        mine, above = order[1:], before[order[1:]]
+        turned = np.einsum("nd,nd->n", normals[mine], normals[above]) < 0
+        for i, parent, turn_it in zip(mine.tolist(), above.tolist(), turned.tolist(), strict=True):
+            flipped[i] = flipped[parent] != turn_it
     out = np.where(np.array(flipped)[:, None], -normals, normals)
     coarse = points[spread(points, COARSE)] if n > COARSE else points
     some = np.r_[roots, 0:n:EACH]
