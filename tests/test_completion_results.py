@@ -121,7 +121,7 @@ def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide
 def test_where_a_step_lowers_nothing_a_shorter_one_is_tried(monkeypatch, lowest, steps, moved):
     tried = []
 
-    def once(equations, x, iterations, damping):
+    def once(equations, x, iterations, tolerance, damping):
         tried.append(damping)
         return SimpleNamespace(x=x + (damping >= lowest))
 

@@ -26,7 +26,7 @@ Terms = dict[str, Residual]
 
 LIKELY = 0.04                        # metres: matches closer than this are mostly right
 REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches, first and last
-DAMPING = 1e-3, 1e-1                 # of the one step for a matching, and of another one where it lowers nothing
+DAMPING = 1e-3, 1e-1                 # of the first step for a matching, and of another one where that lowers nothing
 FEW = 3000                           # vertices that a search takes
 BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
 MIN_COSINE = 0.6                     # between the normals of a match
@@ -218,7 +218,7 @@ class ScanFit:
                                                                             self.upright.nearest(x), TILT)}
         return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits, **stands}
 
-    def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, Matched]:
+    def step(self, x: np.ndarray, scan: ScanPoints, reach: float, steps: int = 1) -> tuple[np.ndarray, Matched]:
         """Better unknowns (P,) for one matching, and that matching."""
         held = np.full(len(x), self.config.twist_weight)
         held[:3] = held[self.body.n_angles:] = 0
@@ -229,7 +229,7 @@ class ScanFit:
             return matched.equations(at, energy.shape_prior(at, betas, stiff), energy.stay_near(at, x, held))
 
         for damping in DAMPING:
-            ahead = levenberg_marquardt(equations, x[None], 1, damping=damping).x[0]     # [SCAPE] Eq. 11
+            ahead = levenberg_marquardt(equations, x[None], steps, 1e-3, damping).x[0]   # [SCAPE] Eq. 11
             if not np.array_equal(ahead, x):
                 break
         return ahead, matched

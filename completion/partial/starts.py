@@ -19,6 +19,7 @@ from .upright import SPREAD, SPREAD_OF_MANY, Upright
 AXES = 4                             # directions of the training poses along which a search from landmarks starts
 CANDIDATES = 3                       # starts that are carried on from the landmarks to the scan
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
+STEPS = 2                            # for each matching of them: they are too few to settle with one
 PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
 FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
 ROTATIONS = 600                         # about 25 degrees between neighbours
@@ -127,7 +128,7 @@ def places_of(fit: ScanFit, x: np.ndarray) -> np.ndarray:
 def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
     """Unknowns (P,) after a few rounds on few points."""
     for reach in reaches:
-        x, _ = fit.step(x, fit.coarse, reach)
+        x, _ = fit.step(x, fit.coarse, reach, STEPS)
     return x
 
 
