@@ -11,7 +11,7 @@ from .fit import FINAL_REACH, REACH, ScanFit
 WIDE_REACH = 0.08                    # metres: limit on the distance of matches, for models that follow a scan badly
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 FINE = 2                             # rounds at the wide reach that take all vertices, at least
-NARROWING, SETTLING = 3, 6           # rounds from the wide to the final reach; that a reach is held at most
+NARROWING, SETTLING = 3, 12          # rounds from the wide to the final reach; that a reach is held at most
 CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
 
 
