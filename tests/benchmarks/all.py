@@ -24,11 +24,12 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 
 from catalogue import BENCHMARKS, Benchmark
-from headlines import HEADLINES
+from headlines import HEADLINES, IN_README
 from protocols import machine
 from tables_scans import Rows, table
 
@@ -185,11 +186,11 @@ def shown(one: Benchmark, runner: Runner) -> str:
     return "\n\n".join(part for part in (head + took, one.table(json.loads(path.read_text())), one.note) if part) + "\n"
 
 
-def headlines(runner: Runner) -> str:
-    """A table of the figures that the README quotes, with the command of each."""
+def headlines(runner: Runner, names: Collection[str]) -> str:
+    """A table of the main figures of some benchmarks, with the command of each."""
     rows: Rows = []
     for one in BENCHMARKS:
-        if one.name in HEADLINES and runner.is_done(one):
+        if one.name in names and runner.is_done(one):
             report = json.loads((RESULTS / f"{one.name}.json").read_text())
             rows += [(*line, f"`{runner.arguments(one)}`") for line in HEADLINES[one.name](report)]
     return table(("", "", "command"), rows)
@@ -206,8 +207,7 @@ def into_readme(figures: str) -> None:
 
 def write_tables(runner: Runner) -> None:
     """BENCHMARKS.md, and the README's figures, from the results of this code."""
-    figures = headlines(runner)
-    into_readme(figures)
+    into_readme(headlines(runner, IN_README))
     here = [one for one in BENCHMARKS if runner.arguments(one)]
     out = [one for one in BENCHMARKS if not runner.arguments(one)]
     seconds = sum(runner.state(one).get("wall_s", 0.0) for one in here)
@@ -219,7 +219,7 @@ def write_tables(runner: Runner) -> None:
     if runner.quick:
         parts.append("\n`--quick` takes fewer bodies where there are many"
                      + (f", and leaves out {', '.join(one.name for one in out)}" if out else "") + ".\n")
-    parts.append(f"\n## In short\n\n{figures}\n")
+    parts.append(f"\n## In short\n\n{headlines(runner, HEADLINES)}\n")
     parts += [shown(one, runner) for one in here]
     (HERE / "BENCHMARKS.md").write_text("".join(parts))
 

@@ -1,4 +1,4 @@
-"""The figures that the README quotes, each read from the result of one benchmark."""
+"""The figures that come first in BENCHMARKS.md, each read from the result of one benchmark; the README quotes some."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -121,3 +121,6 @@ HEADLINES: dict[str, Callable[[dict], Lines]] = {
     "half_people": half_people, "few_scans": few_scans, "depth_camera": depth_camera, "tracking": tracking,
     "markers": markers, "mosh_people": people, "mosh_c3d": recordings, "peer_markers": peer_markers,
     "mosh_soft": soft_tissue, "mosh_speed": mosh, "mosh_memory": mosh, "measures": measures, "statues": statues}
+
+IN_README = ("scape_5fold", "learning", "registration_10", "half_views", "half_people", "tracking", "mosh_people",
+             "mosh_c3d", "mosh_soft", "mosh_speed", "measures")
