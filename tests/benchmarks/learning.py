@@ -106,7 +106,7 @@ def by_command(data: RealData, train: np.ndarray, kind: str, model: BodyModel) -
         learned = load_model(folder / "model.npz")
         pose, betas = np.full((len(model.skeleton.parents), 3), 0.1), np.ones(10)
         return {"wall_s": wall, "cpu_s": used.ru_utime + used.ru_stime, "peak_gib": memory.gib - own,
-                "steps_s": {m["name"][6:]: m["value"] for m in metrics if m["name"].startswith("time: ")},
+                "steps_s": {m["metric"][6:]: m["value"] for m in metrics if m["metric"].startswith("time: ")},
                 "disagreement_m": float(np.abs(learned.vertices(pose, betas) - model.vertices(pose, betas)).max())}
 
 
