@@ -213,8 +213,7 @@ BENCHMARKS = (
               quick="worn_markers.py -m MEN --poses 2,17 --men 2 --people 2"),
     Benchmark("tracking", "Frames of points without markers", "tracking.py", completion.tracking,
               "A walk at 30 Hz of a synthetic person who is not in the model, two depth cameras with 5 mm noise, no "
-              "landmarks. `surface`: the model's vertices to the true surface of the whole body.",
-              quick="tracking.py --quick"),
+              "landmarks. `surface`: the model's vertices to the true surface of the whole body."),
     Benchmark("imported_models", "Imported models beside SCAPE, on synthetic people not learned",
               "imported_models.py --star --smplx --frames 120 --bodies 3", completion.imported_models,
               "The pose columns of the STAR and SMPL-X layouts are noise here, and the latter's hands too: their "
@@ -262,8 +261,7 @@ BENCHMARKS = (
     Benchmark("mosh_soft", "Soft tissue of known size", "mosh_soft.py C3D -m MEN", mocap.soft_tissue,
               "Bumps of 6 to 12 cm that swing by 10 mm at 2 to 15 Hz, ten at a time, 1 mm of noise. 1 is the whole "
               "amplitude. Where we lose: bumps narrower than the distance of the markers, and 41 markers, which "
-              "leave waist, buttocks and calves bare.",
-              quick="mosh_soft.py C3D -m MEN --frames 120 --runs 1"),
+              "leave waist, buttocks and calves bare."),
     Benchmark("mosh_faults", "Faults put into markers",
               "mosh_artefacts.py C3D -m MEN --men 3 --held-out --no-real --files basketball 85_02", mocap.faults,
               "Held-out men moved as in two recordings; a tenth of the markers exchanged at any time, a twentieth "

@@ -78,10 +78,10 @@ def tracking(report: dict) -> Lines:
 
 
 def mosh(report: dict) -> Lines:
-    return [(f"`scape mosh`, {row['file'].removesuffix('.c3d')}, {row['frames']:,} frames with soft tissue and files; "
-             "pages too; memory",
-             f"{row['frames_per_s']:.0f}, {row['frames_per_s_all']:.0f} frames a second; {row['peak_MiB']:.0f} MiB")
-            for row in report["files"]]
+    files = [f"{row['file'].removesuffix('.c3d')} of {row['frames']:,} frames" for row in report["files"]]
+    return [(f"`scape mosh`, soft tissue and files, with pages: {'; '.join(files)}; most memory",
+             "; ".join(f"{row['frames_per_s']:.0f}, {row['frames_per_s_all']:.0f}" for row in report["files"])
+             + f" frames a second; {max(row['peak_MiB'] for row in report['files']):,.0f} MiB")]
 
 
 def recordings(report: dict) -> Lines:
