@@ -17,6 +17,8 @@ from scanprep.synthetic.data_set import read_views
 from scanprep.viewer import server
 
 ROOT = Path(__file__).parents[1]
+CHILD = 0.6                          # the size of the person in the range views: small ones are merged quickly
+SIDES = {0: "front", 4: "back"}      # two views of the grown person
 SET_UP = {"pip install . && scape demo", 'pip install ".[test]" && pytest'}
 
 
@@ -68,8 +70,10 @@ def user_folder(demo, folder):
     shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
     cameras = {}
     for k, view in enumerate(read_views(demo / "template_scan" / "views" / "rest.npz")):
-        write_mesh(folder / "views" / f"view{k}.ply", view.mesh)
-        cameras[f"view{k}"] = view.camera.tolist()
+        if k in SIDES:
+            write_mesh(folder / f"{SIDES[k]}.ply", view.mesh)
+        write_mesh(folder / "views" / f"view{k}.ply", view.mesh.with_vertices(CHILD * view.mesh.vertices))
+        cameras[f"view{k}"] = (CHILD * view.camera).tolist()
     (folder / "views" / "cameras.json").write_text(json.dumps(cameras))
     model, motion = load_model(demo / "model.npz"), Motion.load(demo / "animation" / "motion.npz")
     write_body_npz(folder / "SMPL_NEUTRAL.npz", model, draws=40)
