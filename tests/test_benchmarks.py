@@ -79,5 +79,11 @@ def test_every_benchmark_names_a_script_and_options_that_it_has(benchmarks):
                 assert not re.match("-[a-z-]", word) or f'"{option}"' in text, f"{arguments}: {script} has no {word}"
 
 
+def test_words_about_the_code_do_not_outdate_results(benchmarks):
+    code = benchmarks.without_words(b'def f(x):\n    """Twice."""\n    return 2 * x\n')
+    assert benchmarks.without_words(b'def f(x):\n    return 2 * x  # twice\n') == code
+    assert benchmarks.without_words(b'def f(x):\n    return 3 * x\n') != code
+
+
 def test_every_headline_is_of_a_benchmark(benchmarks):
     assert set(benchmarks.IN_README) <= set(benchmarks.HEADLINES) <= {one.name for one in benchmarks.BENCHMARKS}

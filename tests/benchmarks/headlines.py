@@ -31,9 +31,11 @@ def poses(report: dict) -> Lines:
 def learning(report: dict) -> Lines:
     people = {row["components"]: row["mean_mm"] for row in report["people"]}
     count, components = report["people"][0]["people"], ", ".join(map(str, people))
+    command = report["command"]
     return [(f"{count} men never seen, model of 182 men: {components} components", _mm(*people.values())),
-            ("learning from 71 poses and 182 men, choice of parts included; meshes of a fixed person",
-             f"{report['learn_s']:.0f} s; {report['fast_path']['float64_meshes_per_s']:,.0f} a second")]
+            ("`scape learn` from 71 poses and 182 men, choice of parts included, two cores; meshes of a fixed person",
+             f"{command['wall_s']:.0f} s by the clock, {command['cpu_s']:.0f} s; "
+             f"{report['fast_path']['float64_meshes_per_s']:,.0f} a second")]
 
 
 def half_views(report: dict) -> Lines:
@@ -73,13 +75,15 @@ def people(report: dict) -> Lines:
 
 def tracking(report: dict) -> Lines:
     run = report["runs"]["unknown shape"]
-    return [("walk from two depth cameras, person unknown: distance to the true surface; frames",
+    return [("walk of a synthetic person from two depth cameras, unknown shape: distance to the true surface; frames",
              f"{_mm(run['surface'])}; {1 / run['CPU s a frame']:.1f} a second")]
 
 
 def mosh(report: dict) -> Lines:
-    files = [f"{row['file'].removesuffix('.c3d')} of {row['frames']:,} frames" for row in report["files"]]
-    return [(f"`scape mosh`, soft tissue and files, with pages: {'; '.join(files)}; most memory",
+    synthetic = {"walk.c3d": "a simulated walk", "faulty.c3d": "the same with faults"}
+    files = [f"{synthetic.get(row['file'], row['file'].removesuffix('.c3d'))}, {row['frames']:,} frames"
+             for row in report["files"]]
+    return [(f"`scape mosh` with soft tissue and files; with pages too: {'; '.join(files)}; most memory",
              "; ".join(f"{row['frames_per_s']:.0f}, {row['frames_per_s_all']:.0f}" for row in report["files"])
              + f" frames a second; {max(row['peak_MiB'] for row in report['files']):,.0f} MiB")]
 

@@ -31,7 +31,7 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     """A motion in which the skin moves on the body, as the markers tell.
 
     [MoSh] changes the betas in every frame and holds the change by its squared length; `published()` does so. Betas of
-    182 people have a sixth to a third of the energy of a bump of 6 to 12 cm, so by default the skin itself moves: a
+    182 people have a third of the energy of a bump of 6 to 12 cm on average, so by default the skin itself moves: a
     Gaussian process over the surface, whose size at each marker is taken from how far that marker strays. Poses are
     found again, and a marker that strays more than most counts the less for them, so that they do not follow soft
     tissue. Where no marker is near, the skin does not move; markers that were not seen, and those that the motion did
@@ -151,7 +151,6 @@ class ShapeFollower(SoftFollower):
 def variances(off: np.ndarray, share: np.ndarray) -> np.ndarray:
     """(L,) square metres: the mean square of a coordinate of residuals (T, L, 3), which count by their share (T, L)."""
     return np.einsum("tl,tld->l", share, off**2) / (3 * np.maximum(share.sum(axis=0), 1e-12))
-
 
 
 def _check(model: BodyModel, motion: Motion, markers: MarkerSequence) -> None:

@@ -30,7 +30,7 @@ class SoftTissueConfig(Settings):
         of the movement itself.
     shape_change : float
         Weight of the squared change of the betas from the person's own, the paper's is 0.25: the betas change in every
-        frame, as in the paper. 0: the skin moves instead, as the last three settings say.
+        frame, as in the paper. 0: the skin moves instead, as `marker_sd`, `reach` and `temporal_smoothness` say.
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight.
     """
