@@ -36,8 +36,9 @@ def runner(benchmarks, tmp_path, monkeypatch):
     return benchmarks.Runner(tmp_path / "work", quick=False)
 
 
-def entry(benchmarks, name, arguments):
-    return benchmarks.Benchmark(name, f"Title of {name}", arguments, lambda report: f"table of {report['rows']}")
+def entry(benchmarks, name, arguments, quick=None):
+    return benchmarks.Benchmark(name, f"Title of {name}", arguments, lambda report: f"table of {report['rows']}",
+                                quick=quick)
 
 
 def test_what_cannot_run_says_so_and_the_others_run(benchmarks, runner, capsys):
@@ -65,6 +66,17 @@ def test_a_result_is_kept_until_the_code_changes(benchmarks, runner, tmp_path):
     assert "a result of earlier code" in benchmarks.shown(one, runner)
     benchmarks.run_all(runner, [one], 1)
     assert "table of 3" in benchmarks.shown(one, runner)
+
+
+@pytest.mark.parametrize("quick", ["good.py --few", ""])
+def test_a_whole_result_is_better_than_a_quick_one(benchmarks, runner, tmp_path, quick):
+    one, hurried = entry(benchmarks, "good", "good.py", quick), benchmarks.Runner(runner.work, quick=True)
+    assert hurried.arguments(one) == quick
+    benchmarks.run_all(runner, [one], 1)
+    assert hurried.arguments(one) == "good.py" and hurried.is_done(one)
+    with (tmp_path / "good.py").open("a") as script:
+        script.write("\n# changed")
+    assert hurried.arguments(one) == quick
 
 
 def test_every_benchmark_names_a_script_and_options_that_it_has(benchmarks):

@@ -8,8 +8,9 @@ Called again, it goes on: what was measured with the sources as they are is kept
 data or a program are missing or it fails, says so, and the others run. Peers are measured where they are installed:
 `pip install ".[benchmarks]"`, and Bayesian coherent point drift as the program `bcpd`.
 
-`--quick` takes fewer bodies where there are many. `--at-once` runs so many benchmarks beside each other, each on one
-thread; those that time whole commands always run alone, on all cores. With `--tables` nothing is run.
+`--quick` takes fewer bodies where there are many, but keeps a whole result of today's code. `--at-once` runs so many
+benchmarks beside each other, each on one thread; those that time whole commands always run alone, on all cores. With
+`--tables` nothing is run.
 """
 from __future__ import annotations
 
@@ -75,6 +76,12 @@ def scripts_of(script: Path) -> list[Path]:
     return found
 
 
+def code_of(arguments: str) -> str:
+    """Of a script with these arguments, on the sources as they are."""
+    text = b"".join(path.read_bytes() for path in scripts_of(HERE / arguments.split()[0]))
+    return hashlib.sha256(digest_of_packages().encode() + text + arguments.encode()).hexdigest()[:16]
+
+
 class Runner:
     """What is run where: the folder of work, the size, and what was done before."""
 
@@ -85,13 +92,16 @@ class Runner:
         self.work.mkdir(parents=True, exist_ok=True)
 
     def arguments(self, one: Benchmark) -> str:
-        """Those of the size that was asked for; empty for a benchmark that is left out."""
-        return one.arguments if not self.quick or one.quick is None else one.quick
+        """Those of the whole where that is asked for or done, else of the quick run; empty for what that leaves out."""
+        if not self.quick or one.quick is None:
+            return one.arguments
+        state = self.state(one)
+        whole = state.get("code") == code_of(one.arguments) and not state.get("failed")
+        return one.arguments if whole else one.quick
 
     def code(self, one: Benchmark) -> str:
         """Changes with the sources, the script and its arguments."""
-        text = b"".join(p.read_bytes() for p in scripts_of(HERE / self.arguments(one).split()[0]))
-        return hashlib.sha256(digest_of_packages().encode() + text + self.arguments(one).encode()).hexdigest()[:16]
+        return code_of(self.arguments(one))
 
     def state(self, one: Benchmark) -> dict:
         """Of the last run: code, seconds, and why it failed."""

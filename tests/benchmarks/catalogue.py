@@ -50,14 +50,18 @@ BENCHMARKS = (
               models.learning,
               "The choice of parts included. Vertex PCA has no pose to adjust; with the pose held, only betas and "
               "place are fitted.", alone=True),
-    Benchmark("threads", "Threads of whole commands, beside one busy process", "threads.py --busy 1 --rounds 2",
+    Benchmark("threads", "Threads of whole commands, alone and beside one busy process", "threads.py --rounds 2",
               mocap.threads,
-              "Seconds beside a process that computes all the time on one of the cores, by the number of threads of "
-              "the linear algebra; `own` is what scapekit decides.",
-              quick="threads.py --busy 1 --threads own 2", alone=True),
+              "By the number of threads of the linear algebra; `own` is what scapekit decides. The busy process "
+              "computes all the time on one of the cores.",
+              quick="threads.py --threads own 2", alone=True),
     Benchmark("folder", "A folder of scans", "folder.py SCRATCH", scans.folders,
               "Ten landmarks a scan. The largest memory is that of the one process, and of the largest worker.",
               quick="folder.py SCRATCH --scans 4 12 --workers 2 --different 4", alone=True),
+    Benchmark("folder_of_1000", "A folder of a thousand scans: memory",
+              "folder.py SCRATCH --scans 100 1000 --workers 2 --different 4 --faces 3000", scans.folders,
+              "A template of 3,000 triangles, four scans under many names; other benchmarks may run beside it.",
+              quick=""),
     Benchmark("mosh_speed", "How long `scape mosh` takes", "mosh_speed.py C3D -m MEN", mocap.speed,
               "Whole commands with all files and pages, on one thread; a synthetic person walks for a minute, "
               "without faults and with them. The paper: 7 minutes for a person, 1 s for the poses and 2 s for the "
@@ -299,6 +303,7 @@ BENCHMARKS = (
               "mittens of the control mesh.",
               quick="statues.py DATA/scape_poses/mesh029.ply DATA/spring_shapes/SPRING0028.ply --emboss"),
     Benchmark("statue_fit", "Statues: fit of the control mesh", "statue_fit.py", statues.surface_fits,
-              "Fig. 7 of the paper. `published` are its Euler steps, and its own slack where said. Where we lose: "
-              "time, to the last pass of registration alone."),
+              "Fig. 6 and 7 of the paper, then bodies from the same start. `published` are its Euler steps, and its own "
+              "slack where said; `register` the whole registration of scans, `settle` its last pass. Where we lose: "
+              "time, to that pass alone."),
 )

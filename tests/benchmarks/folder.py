@@ -1,9 +1,9 @@
 """A folder of virtual scans through `scape prep run`: time, processor and memory by the number of scans and workers.
 
     SCAPEKIT_DATA=... python tests/benchmarks/folder.py FOLDER [--scans 20] [--workers 1 2] [--different 4]
-        [-o FILE]
+        [--faces 3000] [-o FILE]
 
-Ten landmarks a scan, template mesh000, every scan a person of its own, so no skeleton; some 100,000 triangles. With
+Ten landmarks a scan, template mesh000, with fewer triangles if asked, every scan a person of its own, so no skeleton; some 100,000 triangles. With
 `--different` there are only so many scans, each several times under other names, and registered each time: thus a
 folder of a thousand needs no thousand scans. Memory is the largest that was resident, of the process that was started
 and of any of its workers. Run it with nothing else on the machine. Linux only.
@@ -19,10 +19,11 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from protocols import load_real, machine, write_report
 from scans import HELD_POSES, TUNING_POSES, test_scan
 
-from scanprep import write_landmarks, write_mesh
+from scanprep import decimate, write_landmarks, write_mesh
 
 POLL = 0.2                           # seconds between looks at memory
 
@@ -42,11 +43,11 @@ class Run(NamedTuple):
     cpu_s_each: float                # parts of the template included
 
 
-def write_scans(folder: Path, poses: tuple[int, ...]) -> int:
-    """The template, and a scan with its landmarks for every pose; the triangles of a scan on average."""
+def write_scans(folder: Path, poses: tuple[int, ...], faces: int) -> int:
+    """The template of at most so many triangles, and a scan with its landmarks for every pose; the triangles of a scan on average."""
     data = load_real()
     names = {vertex: name for name, vertex in data.landmarks.items()}
-    write_mesh(folder / "template.ply", data.template)
+    write_mesh(folder / "template.ply", decimate(data.template, faces, keep=np.array(list(data.landmarks.values()))))
     write_landmarks(folder / "template.landmarks.json",
                     {name: data.template.vertices[v] for name, v in data.landmarks.items()})
     triangles = 0
@@ -121,9 +122,11 @@ def main() -> None:
     parser.add_argument("--scans", type=int, nargs="*", default=[20], help="in the folder, one run for each number")
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--different", type=int, default=20, help="how many different ones there are, at most 20")
+    parser.add_argument("--faces", type=int, default=50_000, help="of the template, which has fewer if it had fewer")
     parser.add_argument("-o", "--output", help="write all figures here")
     asked = parser.parse_args()
-    triangles = write_scans(asked.folder, (*HELD_POSES, *TUNING_POSES)[:min(asked.different, max(asked.scans))])
+    triangles = write_scans(asked.folder, (*HELD_POSES, *TUNING_POSES)[:min(asked.different, max(asked.scans))],
+                            asked.faces)
     runs = []
     for workers in asked.workers:
         for count in asked.scans:

@@ -143,9 +143,10 @@ def other_programs(report: dict) -> str:
 
 
 def threads(report: dict) -> str:
-    """Whole commands by the number of threads."""
-    return table(("command", "threads", "wall (s)", "processor (s)", "same files"),
-                 [tuple(r[n] for n in ("command", "threads", "wall_s", "cpu_s", "same")) for r in report["commands"]])
+    """Whole commands by the number of threads, alone and beside busy processes."""
+    names = ("command", "busy", "threads", "wall_s", "cpu_s", "same")
+    return table(("command", "busy processes beside", "threads", "wall (s)", "processor (s)", "same files"),
+                 [tuple(r[n] for n in names) for r in report["commands"]])
 
 
 def peer_markers(report: dict) -> str:

@@ -19,8 +19,17 @@ def statues(report: dict) -> str:
 
 
 def surface_fits(report: dict) -> str:
-    """Fig. 7: from a sphere to a head."""
+    """Fig. 6: noise on the humanoid; Fig. 7: from a sphere to a head; and real bodies."""
+    noise = report["figure_6"]
+    left: Rows = [(f"published, {steps} steps", f"{noise[f'published_{steps}']:.0%}") for steps in (10, 100, 1000)]
+    left.append(("ours, 10 solves", f"{noise['exact_10']:.0%}"))
     rows: Rows = [(one["way"], one["scan_rms_mm"], one["distortion"], int(one["inverted"]),
                    one["scan_against_percent"]) for one in report["figure_7"]]
-    return table(("from a sphere to a head", "scan to mesh, RMS (mm)", "distortion", "inverted triangles",
-                  "scan turned against the mesh (%)"), rows)
+    bodies: Rows = [(way, one["vertices_rms_mm"], one["scan_rms_mm"], one["distortion"], one["cpu_s"])
+                    for way, one in report["means"].items()]
+    return "\n\n".join((
+        table(("noise on the control mesh", "left of it"), left),
+        table(("from a sphere to a head", "scan to mesh, RMS (mm)", "distortion", "inverted triangles",
+               "scan turned against the mesh (%)"), rows),
+        table(("real bodies, mean", "mesh to scan, RMS (mm)", "scan to mesh, RMS (mm)", "distortion", "time (s CPU)"),
+              bodies)))

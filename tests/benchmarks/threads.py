@@ -1,14 +1,14 @@
 """What threads of the linear algebra cost and save: seconds of the clock and of the processor for whole commands.
 
     python tests/benchmarks/threads.py -o threads.json
-    python tests/benchmarks/threads.py --tree ../older --busy 2 -o before.json
+    python tests/benchmarks/threads.py --tree ../older --busy 0 2 -o before.json
 
 Every command runs in a process of its own, on synthetic people made beforehand: `prep register` of one scan, `learn` of
 a small set, `complete` of a half view, `mosh` of 720 frames, `track` of 24. Once with no variable set, which is what
-scapekit decides by itself, and once for each number of OMP_NUM_THREADS. `--busy` runs beside so many processes that
-compute all the time; `--tree` measures another version of the sources. `same` says that what was written is byte for
-byte what the first run wrote, figures of time and pages apart. A shared machine is noisy: seconds of the processor say
-most, and every command runs `--rounds` times, the settings in turn; the least of each is told.
+scapekit decides by itself, and once for each number of OMP_NUM_THREADS. `--busy` names how many processes compute all
+the time beside it, one run for each number; `--tree` measures another version of the sources. `same` says that what was
+written is byte for byte what the first run wrote, figures of time and pages apart. A shared machine is noisy: seconds
+of the processor say most, and every command runs `--rounds` times, the settings in turn; the least of each is told.
 """
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -82,12 +83,12 @@ def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, li
         "track": ["track", "frames", "-o", "OUT/done", *body]}
 
 
-def run(arguments: list[str], folder: Path, tree: Path, threads: str) -> dict[str, float | str]:
+def run(arguments: list[str], folder: Path, tree: Path, busy: int, threads: str) -> dict[str, float | str]:
     """One command in a process of its own; its seconds and a digest of what it wrote."""
     environment = {k: v for k, v in os.environ.items() if k not in VARIABLES} | {"PYTHONPATH": str(tree)}
     if threads != "own":
         environment["OMP_NUM_THREADS"] = threads
-    with tempfile.TemporaryDirectory(dir=folder) as out:
+    with tempfile.TemporaryDirectory(dir=folder) as out, beside(busy):
         start = time.perf_counter()
         child = subprocess.Popen([sys.executable, "-m", "completion", *(a.replace("OUT", out) for a in arguments)],
                                  cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -127,27 +128,29 @@ def main() -> None:
     parser.add_argument("--tree", type=Path, default=Path(__file__).resolve().parents[2], help="sources to measure")
     parser.add_argument("--threads", nargs="*", default=["own", "1", "2"], help="'own', or OMP_NUM_THREADS")
     parser.add_argument("--cases", nargs="*", help="some of register, learn, complete, mosh, track; else all")
-    parser.add_argument("--busy", type=int, default=0, help="processes that compute beside")
+    parser.add_argument("--busy", type=int, nargs="*", default=[0, 1], help="processes that compute beside")
     parser.add_argument("--rounds", type=int, default=1)
     args = parser.parse_args()
     model = synthetic_model()
-    with tempfile.TemporaryDirectory() as temporary, beside(args.busy):
+    with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         cases = make_cases(folder, model, synthetic_path())
         rows = []
+        settings = list(product(args.busy, args.threads))
         for name in args.cases or cases:
-            runs = [{t: run(cases[name], folder, args.tree.resolve(), t) for t in args.threads}
+            runs = [{setting: run(cases[name], folder, args.tree.resolve(), *setting) for setting in settings}
                     for _ in range(args.rounds)]
-            first = runs[0][args.threads[0]]["digest"]
-            for threads in args.threads:
-                row = {"command": name, "threads": threads,
-                       **{clock: min(r[threads][clock] for r in runs) for clock in ("wall_s", "cpu_s")},
-                       "same": all(r[threads]["digest"] == first for r in runs)}
+            first = runs[0][settings[0]]["digest"]
+            for busy, threads in settings:
+                those = [r[busy, threads] for r in runs]
+                row = {"command": name, "busy": busy, "threads": threads,
+                       **{clock: min(r[clock] for r in those) for clock in ("wall_s", "cpu_s")},
+                       "same": all(r["digest"] == first for r in those)}
                 rows.append(row)
-                print(f"{name:9} {threads:>4} threads: {row['wall_s']:7.1f} s wall {row['cpu_s']:7.1f} s processor"
-                      f"{'' if row['same'] else '  OTHER BYTES'}", flush=True)
+                print(f"{name:9} beside {busy}, {threads:>4} threads: {row['wall_s']:7.1f} s wall "
+                      f"{row['cpu_s']:7.1f} s processor{'' if row['same'] else '  OTHER BYTES'}", flush=True)
     write_report(args.output, {"protocol": "whole commands by threads of the linear algebra", "machine": machine(),
-                               "busy": args.busy, "rounds": args.rounds, "commands": rows})
+                               "rounds": args.rounds, "commands": rows})
 
 
 if __name__ == "__main__":
