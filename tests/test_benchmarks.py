@@ -1,4 +1,5 @@
 """The command that runs all benchmarks: what is kept, what is told where one cannot run, and its catalogue."""
+import ast
 import importlib.util
 import json
 import re
@@ -29,6 +30,7 @@ def runner(benchmarks, tmp_path, monkeypatch):
     """One with scripts, results and work in folders of its own, and no data."""
     monkeypatch.setattr(benchmarks, "HERE", tmp_path)
     monkeypatch.setattr(benchmarks, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(benchmarks, "digest_of_packages", lambda: "the packages as they are")
     monkeypatch.delenv("SCAPEKIT_DATA", raising=False)
     (tmp_path / "results").mkdir()
     (tmp_path / "good.py").write_text("import sys; open(sys.argv[-1], 'w').write('{\"rows\": 3}')")
@@ -89,6 +91,19 @@ def test_every_benchmark_names_a_script_and_options_that_it_has(benchmarks):
             for word in (*words, "-o"):
                 option = word.replace("--no-", "--")
                 assert not re.match("-[a-z-]", word) or f'"{option}"' in text, f"{arguments}: {script} has no {word}"
+
+
+@pytest.mark.parametrize("script", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
+def test_a_script_reads_only_options_that_it_has(script):
+    nodes = list(ast.walk(ast.parse(script.read_text())))
+    calls = [node for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
+    options = {word.value.lstrip("-").replace("-", "_") for call in calls if call.func.attr == "add_argument"
+               for word in (*call.args, *(k.value for k in call.keywords if k.arg == "dest"))}
+    given = {node.targets[0].id for node in nodes if isinstance(node, ast.Assign) and node.value in calls
+             and node.value.func.attr == "parse_args"}
+    used = [node for node in nodes if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") in given]
+    added = {node.attr for node in used if isinstance(node.ctx, ast.Store)}
+    assert {node.attr for node in used} <= options | added
 
 
 def test_words_about_the_code_do_not_outdate_results(benchmarks):

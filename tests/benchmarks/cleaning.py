@@ -267,7 +267,7 @@ def main() -> None:
         bodies += [embedded_body(100 * options.held + k, scale) for k in range(options.holes)]
         rows = filling(bodies)
         report |= {f"holes x {scale}": rows, f"hole_means x {scale}": summary(rows, "filler", keys)}
-    write_report(options.out, report)
+    write_report(options.output, report)
 
 
 if __name__ == "__main__":
