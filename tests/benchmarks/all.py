@@ -6,7 +6,8 @@ WORK is a folder outside the checkout, where models and logs stay. Results (`res
 README's table of figures are written here. `$SCAPEKIT_DATA` holds the real scans, and the recordings in `cmu_c3d`.
 Called again, it goes on: what was measured with the sources as they are is kept. A benchmark that cannot run, because
 data or a program are missing or it fails, says so, and the others run. Peers are measured where they are installed:
-`pip install ".[benchmarks]"`, and Bayesian coherent point drift as the program `bcpd`.
+`pip install ".[benchmarks]"`, Bayesian coherent point drift as the program `bcpd`, `$BPY` and `$NPM` as
+`other_programs.py` says.
 
 `--quick` takes fewer bodies where there are many, but keeps a whole result of today's code. `--at-once` runs so many
 benchmarks beside each other, each on one thread; those that time whole commands always run alone, on all cores. With

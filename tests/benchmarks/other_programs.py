@@ -1,12 +1,13 @@
 """What other programs make of our files: their vertices or joints against our exact bodies, in millimetres.
 
     python tests/benchmarks/other_programs.py --folder DIR [-m MODEL.npz --motion MOTION.npz] [-o FILE]
-        [--bpy /path/of/python/with/bpy] [--npm /folder/with/node_modules]
+        [--bpy PYTHON] [--npm DIR]
 
 The motion, else a walk of a synthetic person, is exported as GLB, BVH, USD (skinned, and as points) and, by the command
-of model/README.md, FBX, a body at rest as static GLB. Every file is opened in Blender (`bpy`, in a Python of its own),
-USD in usd-core too, GLB in three.js (`npm install three`, in headless Chromium, skinned on the processor); the Khronos
-validator (`npm install gltf-validator`) checks GLB. Programs that are not there are left out. The result holds a row
+of model/README.md, FBX, a body at rest as static GLB. Every file is opened in Blender (a Python that has `bpy`, named
+by `--bpy` or `$BPY`), USD in usd-core too, GLB in three.js (headless Chromium, skinned on the processor); the Khronos
+validator checks GLB. `--npm` or `$NPM` is a folder in which `npm install three gltf-validator` was called. Programs
+that are not there are left out. The result holds a row
 for each file and program; a new file is a new entry of `cases`, a new program a new entry of `PROGRAMS`.
 """
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -212,8 +214,9 @@ def main():
     parser.add_argument("--motion", type=Path, help="of that model; a walk when not given")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--bpy", help="a Python that has bpy")
-    parser.add_argument("--npm", type=Path, help="a folder with node_modules of three and gltf-validator")
+    parser.add_argument("--bpy", default=os.environ.get("BPY"), help="a Python that has bpy")
+    parser.add_argument("--npm", type=Path, default=os.environ.get("NPM"),
+                        help="a folder with node_modules of three and gltf-validator")
     asked = parser.parse_args()
     asked.folder.mkdir(parents=True, exist_ok=True)
     if asked.motion is None:
