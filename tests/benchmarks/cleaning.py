@@ -189,7 +189,8 @@ def open3d_fill(mesh: Mesh) -> tuple[Mesh, bool]:
 
     legacy = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),
                                        o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)))
-    filled = o3d.t.geometry.TriangleMesh.from_legacy(legacy).fill_holes(1e6)
+    given = o3d.t.geometry.TriangleMesh.from_legacy(legacy)          # what comes back may point into it
+    filled = given.fill_holes(1e6)
     return Mesh(filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()), False
 
 

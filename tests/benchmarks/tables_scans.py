@@ -9,9 +9,13 @@ Rows = list[tuple[Any, ...]]
 
 
 def table(header: tuple[str, ...], rows: Rows) -> str:
-    """A Markdown table; fractions with three significant digits."""
+    """A Markdown table; fractions with three significant digits, nothing for what is not a number."""
     def text(value: Any) -> str:
-        return f"{value:.3g}" if isinstance(value, float) else str(value)
+        if not isinstance(value, float):
+            return str(value)
+        if np.isnan(value):
+            return ""
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
     lines = [header, tuple("---" for _ in header), *rows]
     return "\n".join("| " + " | ".join(map(text, line)) + " |" for line in lines)
@@ -30,8 +34,9 @@ def registration(report: dict) -> str:
     names = ("all_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped", "cpu_s")
     rows: Rows = [(r["scan"], *(r[n] for n in names)) for r in report["rows"]]
     for kind, figures in report["summary"].items():
-        rows.append((f"mean of {kind}s", *(figures[n] for n in names)))
-        rows.append((f"{kind}s below 15 mm", f"{figures['below_15mm']:.0%}", *([""] * (len(names) - 1))))
+        kinds = {"pose": "poses", "man": "men"}[kind]
+        rows.append((f"mean of {kinds}", *(figures[n] for n in names)))
+        rows.append((f"{kinds} below 15 mm", f"{figures['below_15mm']:.0%}", *([""] * (len(names) - 1))))
     errors = table(("scan", "all (mm)", "where data (mm)", "elsewhere (mm)", "share beyond 50 mm",
                     "to the true surface, where data (mm)", "worst vertex (mm)", "flipped", "time (s CPU)"), rows)
     return f"{errors}\n\n{verdicts(report)}" if "flags" in report else errors
@@ -43,10 +48,9 @@ def verdicts(report: dict) -> str:
     rates = table(("wrong", "scans", "told to be looked at", "of them wrong", "precision", "recall"),
                   [(text, *(report["flags"][name][key] for key in ("wrong", "flagged", "both", "precision", "recall")))
                    for name, text in wrong.items()])
-    told = table(("scan", "worst limb", "off (mm)", "verdict"),
-                 [(r["scan"], r["worst_limb"], r["worst_limb_mm"], r["verdict"]) for r in report["rows"]
-                  if r["verdict"] != "good" or r["worst_limb_mm"] > 50 or r["all_mm"] > 30])
-    return f"{rates}\n\n{told}"
+    told: Rows = [(r["scan"], r["worst_limb"], r["worst_limb_mm"], r["verdict"]) for r in report["rows"]
+                  if r["verdict"] != "good" or r["worst_limb_mm"] > 50 or r["all_mm"] > 30]
+    return f"{rates}\n\n{table(('scan', 'worst limb', 'off (mm)', 'verdict'), told)}" if told else rates
 
 
 def rolled_limbs(report: dict) -> str:
