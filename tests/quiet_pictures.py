@@ -1,8 +1,13 @@
 """Pictures that nobody looks at, for tests of commands that draw them."""
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 
-from scanprep.pictures import scene
+from completion import motion_pictures
+from model.statue import report
+from scanprep.pictures import scene, shading
+from scanprep.pipeline import page
 
 
 def render(*_given, **_named):
@@ -15,4 +20,18 @@ def small_pictures():
     """For the file that imports this."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene, "render", render)
+        yield
+
+
+def coarse(shapes, camera, width, height, ground=False):
+    """Drawn as always, with a quarter of the pixels each way."""
+    return shading.render(shapes, camera, width // 4, height // 4, ground)
+
+
+@contextmanager
+def coarse_pictures():
+    """Everything that draws bodies draws few pixels."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (scene, page, report, motion_pictures):
+            patch.setattr(module, "render", coarse)
         yield

@@ -6,6 +6,7 @@ import re
 
 import pytest
 from people_bodies import SMALL
+from quiet_pictures import coarse_pictures
 from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder, with_demo_model
 
 from completion import synthetic_people
@@ -18,9 +19,10 @@ pytestmark = pytest.mark.timeout(1800)
 
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
-    """The folder of a user in which the commands of the README were run; the model of those without one is small."""
+    """The folder of a user in which the commands of the README were run; the model of those without one is small, and so
+    are all pictures."""
     folder = user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, coarse_pictures():
         patch.chdir(folder)
         patch.setenv("SCAPEKIT_CACHE", str(folder / "cache"))
         patch.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: build_synthetic(SMALL, progress))

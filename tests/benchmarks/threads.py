@@ -102,9 +102,11 @@ def run(arguments: list[str], folder: Path, tree: Path, busy: int, threads: str)
 
 
 def digest(folder: Path) -> str:
-    """Of all files that should not change from run to run."""
+    """Of all files that should not change from run to run; hidden folders keep seconds too."""
     told = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.endswith(TIMED)):
+        if any(part.startswith(".") for part in path.relative_to(folder).parts):
+            continue
         told.update(str(path.relative_to(folder)).encode() + path.read_bytes())
     return told.hexdigest()[:16]
 
