@@ -1,6 +1,5 @@
 """Marker sequences: what is written comes back, foreign forms are understood, bad files say what is wrong."""
 import csv
-import os
 import struct
 from pathlib import Path
 
@@ -369,11 +368,11 @@ def _numbers(data, start):
 
 
 @pytest.mark.real
-def test_real_marker_files_hold_people():
-    folder = os.environ.get("SCAPEKIT_MARKERS")
-    if not folder:
-        pytest.skip("SCAPEKIT_MARKERS is not set")
-    for path in sorted(Path(folder).glob("*.c3d")):
+def test_real_marker_files_hold_people(real_data):
+    paths = sorted((real_data / "cmu_c3d").glob("*.c3d"))
+    if not paths:
+        pytest.skip("the folder of real scans has no recordings in cmu_c3d")
+    for path in paths:
         seq = read_markers(path)
         height = np.nanmax(seq.positions[..., 2], axis=1) - np.nanmin(seq.positions[..., 2], axis=1)
         assert seq.rate == 120 and len(seq.labels) in (41, 42) and 1.4 < np.median(height) < 2.1
