@@ -63,7 +63,7 @@ def test_a_result_is_kept_until_the_code_changes(benchmarks, runner, tmp_path):
     benchmarks.run_all(runner, [one], 1)
     assert "table of 4" in benchmarks.shown(one, runner)
     with (tmp_path / "good.py").open("a") as script:
-        script.write("\n# changed")
+        script.write("\nchanged = True")
     assert not runner.is_done(one)
     assert "a result of earlier code" in benchmarks.shown(one, runner)
     benchmarks.run_all(runner, [one], 1)
@@ -77,7 +77,7 @@ def test_a_whole_result_is_better_than_a_quick_one(benchmarks, runner, tmp_path,
     benchmarks.run_all(runner, [one], 1)
     assert hurried.arguments(one) == "good.py" and hurried.is_done(one)
     with (tmp_path / "good.py").open("a") as script:
-        script.write("\n# changed")
+        script.write("\nchanged = True")
     assert hurried.arguments(one) == quick
 
 

@@ -1,7 +1,6 @@
 """Marker sequences: what is written comes back, foreign forms are understood, bad files say what is wrong."""
 import csv
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest

@@ -19,8 +19,10 @@ pytestmark = pytest.mark.timeout(1800)
 
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
-    """The folder of a user in which the commands of the README were run; the model of those without one is small, and so
-    are all pictures."""
+    """The folder of a user in which the commands of the README were run.
+
+    The model of those without one is small, and so are all pictures.
+    """
     folder = user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
     with pytest.MonkeyPatch.context() as patch, coarse_pictures():
         patch.chdir(folder)

@@ -79,7 +79,7 @@ def scripts_of(script: Path) -> list[Path]:
 
 def code_of(arguments: str) -> str:
     """Of a script with these arguments, on the sources as they are."""
-    text = b"".join(path.read_bytes() for path in scripts_of(HERE / arguments.split()[0]))
+    text = b"".join(without_words(path.read_bytes()) for path in scripts_of(HERE / arguments.split()[0]))
     return hashlib.sha256(digest_of_packages().encode() + text + arguments.encode()).hexdigest()[:16]
 
 

@@ -3,10 +3,10 @@
     SCAPEKIT_DATA=... python tests/benchmarks/folder.py FOLDER [--scans 20] [--workers 1 2] [--different 4]
         [--faces 3000] [-o FILE]
 
-Ten landmarks a scan, template mesh000, with fewer triangles if asked, every scan a person of its own, so no skeleton; some 100,000 triangles. With
-`--different` there are only so many scans, each several times under other names, and registered each time: thus a
-folder of a thousand needs no thousand scans. Memory is the largest that was resident, of the process that was started
-and of any of its workers. Run it with nothing else on the machine. Linux only.
+Ten landmarks a scan, template mesh000, with fewer triangles if asked, every scan a person of its own, so no skeleton;
+some 100,000 triangles. With `--different` there are only so many scans, each several times under other names, and
+registered each time: thus a folder of a thousand needs no thousand scans. Memory is the largest that was resident, of
+the process that was started and of any of its workers. Run it with nothing else on the machine. Linux only.
 """
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Run(NamedTuple):
 
 
 def write_scans(folder: Path, poses: tuple[int, ...], faces: int) -> int:
-    """The template of at most so many triangles, and a scan with its landmarks for every pose; the triangles of a scan on average."""
+    """The template of at most so many triangles, and a scan with landmarks for every pose; a scan's mean triangles."""
     data = load_real()
     names = {vertex: name for name, vertex in data.landmarks.items()}
     write_mesh(folder / "template.ply", decimate(data.template, faces, keep=np.array(list(data.landmarks.values()))))
