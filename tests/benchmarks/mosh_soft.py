@@ -1,6 +1,7 @@
 """Soft tissue of known size: how much of a simulated jiggle is found, with how many markers.
 
     python tests/benchmarks/mosh_soft.py FOLDER -m MODEL.npz -o mosh_soft.json [--file 02_05] [--frames 240]
+        [--picture worst.png]
 
 A person moves as in a recording, with 1 mm of noise on every coordinate of the markers. On waist, chest, thighs,
 buttocks and calves, left and right, a bump of the skin swings along the normals by 10 mm: exp(-(d / R)²) at distance d
@@ -13,6 +14,9 @@ truth, by complex regression; `with_pose` is the amplitude of the whole skin, wh
 far apart markers are there: 2.6 times the mean distance of the region (weight above a half) from its nearest marker, as
 on a square grid. Also the distance of the whole skin from the true one, with fixed shape and with soft tissue, and the
 root mean square of what soft tissue moves it (mm). 90 markers are the 67, and farthest points where the bumps are.
+
+`--picture` shows, a row for every number of markers, the bump below 12 cm of which least was found, when it swings
+farthest: how far the true skin is out, and what was found of it.
 """
 from __future__ import annotations
 
@@ -37,6 +41,9 @@ from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
 from scanprep.geometry.geodesics import SurfaceGraph
+from scanprep.pictures.camera import Camera, upright
+from scanprep.pictures.colors import Heat
+from scanprep.pictures.shading import Dots, Solid, render, save_png
 
 PLACES = {"waist": ("LBEL", "RBEL"), "chest": ("LPEC", "RPEC"), "thigh": ("LQUA", "RQUA"), "buttock": ("LGLU", "RGLU"),
           "calf": ("LCAL", "RCAL")}
@@ -160,6 +167,23 @@ def run(scene: Scene, layout: MarkerLayout, bumps: list[Bump], seed: int) -> tup
                      for name, skin in off.items()}, "moved_rms_mm": 1e3 * float(np.sqrt((alone**2).sum(2).mean()))}
 
 
+def picture(scene: Scene, layout: MarkerLayout, number: int, bump: Bump) -> np.ndarray:
+    """The true and the found displacement of the skin along its normals, in the frame when a bump of a run is farthest.
+    """
+    truth = scene.moved(scene.bumps(number))
+    _, soft = scene.found(truth, layout, number)
+    t = int(np.argmax(np.abs(bump.swing(scene.motion.times))))
+    found = soft.skin.at(soft.skin.modes, soft.motion.poses[[t]])[0]
+    mesh, centre = scene.model.template.with_vertices(scene.skin[t]), int(np.argmax(bump.weight))
+    vertical = np.eye(3)[upright(mesh)[0]]
+    near = mesh.vertices[bump.weight > 0.05]
+    camera = Camera.from_side(near, scene.normals[t, centre], vertical, margin=1.6)
+    dots = Dots(mesh.vertices[layout.nearest], (0.1, 0.1, 0.1), 0.006)
+    out = [np.einsum("nd,nd->n", moved, scene.normals[t]) for moved in (truth[t] - scene.skin[t], found)]
+    shown = [[Solid(mesh, Heat(far, -SIZE, SIZE)), dots] for far in out]
+    return np.concatenate([render(shapes, camera, 420, 420) for shapes in shown], axis=1)
+
+
 def summary(markers: int, where: str, rows: list[dict]) -> dict[str, object]:
     """The means of some bumps."""
     amplitude = np.array([row["amplitude"] for row in rows])
@@ -180,6 +204,7 @@ def main() -> None:
     parser.add_argument("--file", default="02_05", help="stem of the recording")
     parser.add_argument("--frames", type=int, default=240, help="from its middle")
     parser.add_argument("--runs", type=int, default=len(FREQUENCIES))
+    parser.add_argument("--picture", help="write the bumps of which least was found here")
     args = parser.parse_args()
     model, whole = load_model(args.model), read_markers(args.folder / f"{args.file}.c3d")
     layout = named_layout("cmu41", model.template)
@@ -189,6 +214,7 @@ def main() -> None:
                                  person.layout, MoshConfig().poses))
     rows: list[dict] = []
     details: list[dict] = []
+    pictures: list[np.ndarray] = []
     for count, layout in scene.layouts().items():
         bumps: list[dict] = []
         skins = []
@@ -206,10 +232,16 @@ def main() -> None:
                      **{name: float(np.mean([skin[name] for skin in skins])) for name in skins[0]}})
         rows.append({"markers": count, "where": "whole skin, still", **run(scene, layout, [], 0)[1]})
         details += [{"markers": count, **row} for row in bumps]
+        if args.picture:
+            dense = [i for i, row in enumerate(bumps) if row["spacing_cm"] < 12]
+            number, place = divmod(min(dense, key=lambda i: bumps[i]["amplitude"]), len(bumps) // args.runs)
+            pictures.append(picture(scene, layout, number, scene.bumps(number)[place]))
         for row in rows:
             if row["markers"] == count:
                 print("  ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{value}"
                                 for name, value in row.items()), flush=True)
+    if pictures:
+        save_png(args.picture, np.concatenate(pictures))
     write_report(args.output, {"protocol": f"swinging skin on the motion of {args.file}, {args.frames} frames",
                                "machine": machine(), "rows": rows, "bumps": details})
 
