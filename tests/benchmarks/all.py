@@ -203,7 +203,7 @@ def shown(one: Benchmark, runner: Runner) -> str:
     path = RESULTS / f"{one.name}.json"
     if not path.exists():
         return f"{head}: not measured yet.\n"
-    took = f": {state['wall_s'] / 60:.1f} minutes, {state['peak_gib']:.1f} GiB" \
+    took = f": {state['cpu_s'] / 60:.1f} minutes of the processor, {state['peak_gib']:.1f} GiB" \
         if state.get("code") == runner.code(one) else ": **a result of earlier code**, not measured with this one"
     return "\n\n".join(part for part in (head + took, one.table(json.loads(path.read_text())), one.note) if part) + "\n"
 
@@ -232,9 +232,9 @@ def write_tables(runner: Runner) -> None:
     into_readme(headlines(runner, IN_README))
     here = [one for one in BENCHMARKS if runner.arguments(one)]
     out = [one for one in BENCHMARKS if not runner.arguments(one)]
-    seconds = sum(runner.state(one).get("wall_s", 0.0) for one in here)
+    seconds = sum(runner.state(one).get("cpu_s", 0.0) for one in here)
     parts = [f"# Benchmarks\n\nWritten by `python tests/benchmarks/all.py WORK{' --quick' if runner.quick else ''}`, "
-             f"{seconds / 3600:.1f} hours of benchmarks, on {versions()}.\n\n"
+             f"{seconds / 3600:.1f} hours of the processor, on {versions()}.\n\n"
              "Real scans cannot be shipped; errors are mean vertex distances unless said otherwise. Seconds are of the "
              "processor where they say CPU. In commands MEN and FOLD_0 are models that the benchmarks before learned, "
              "DATA and C3D the folders of scans and recordings, SCRATCH an empty folder.\n"]
