@@ -41,7 +41,7 @@ def learning(report: dict) -> Lines:
 def folder(report: dict) -> Lines:
     most = max(report["rows"], key=lambda row: row["scans"])
     what = f"{most['scans']:,} scans of {most['triangles']:,} triangles, {most['workers']} workers"
-    return [(f"`scape prep run`, {what}: memory; of each worker", f"{most['parent_mb']:.0f}; {most['worker_mb']:.0f} MB")]
+    return [(f"`scape prep run`, {what}: memory; of a worker", f"{most['parent_mb']:.0f}; {most['worker_mb']:.0f} MB")]
 
 
 def half_views(report: dict) -> Lines:
@@ -128,9 +128,9 @@ def measures(report: dict) -> Lines:
 HEADLINES: dict[str, Callable[[dict], Lines]] = {
     "registration_10": registration, "folder_of_1000": folder, "scape_5fold": poses, "learning": learning,
     "half_views": half_views, "half_people": half_people, "few_scans": few_scans, "depth_camera": depth_camera,
-    "tracking": tracking, "markers": markers, "mosh_people": people, "mosh_c3d": recordings, "peer_markers":
-    peer_markers, "mosh_soft": soft_tissue, "mosh_speed": mosh, "mosh_memory": mosh, "measures": measures, "statues":
-    statues}
+    "tracking": tracking, "markers": markers, "mosh_people": people, "mosh_c3d": recordings,
+    "peer_markers": peer_markers, "mosh_soft": soft_tissue, "mosh_speed": mosh, "mosh_memory": mosh,
+    "measures": measures, "statues": statues}
 
 IN_README = ("scape_5fold", "learning", "registration_10", "half_views", "half_people", "tracking", "mosh_people",
              "mosh_c3d", "mosh_speed")
