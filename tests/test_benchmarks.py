@@ -78,7 +78,7 @@ def test_a_whole_result_is_better_than_a_quick_one(benchmarks, runner, tmp_path,
     assert hurried.arguments(one) == "good.py" and hurried.is_done(one)
     with (tmp_path / "good.py").open("a") as script:
         script.write("\nchanged = True")
-    assert hurried.arguments(one) == quick
+    assert hurried.arguments(one) == quick and not hurried.is_done(one)
 
 
 def test_every_benchmark_names_a_script_and_options_that_it_has(benchmarks):

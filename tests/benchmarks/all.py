@@ -110,6 +110,8 @@ class Runner:
         return json.loads(path.read_text()) if path.exists() else {}
 
     def is_done(self, one: Benchmark) -> bool:
+        if not self.arguments(one):  # it is left out
+            return False
         kept = all((self.work / f"{name}.npz").exists() for name, maker in MODELS.items() if maker == one.name)
         state = self.state(one)
         return kept and (RESULTS / f"{one.name}.json").exists() and state.get("code") == self.code(one) \
