@@ -114,3 +114,11 @@ def test_words_about_the_code_do_not_outdate_results(benchmarks):
 
 def test_every_headline_is_of_a_benchmark(benchmarks):
     assert set(benchmarks.IN_README) <= set(benchmarks.HEADLINES) <= {one.name for one in benchmarks.BENCHMARKS}
+
+
+def test_every_result_makes_its_table_and_its_headlines(benchmarks):
+    for one in benchmarks.BENCHMARKS:
+        report = json.loads((FOLDER / "results" / f"{one.name}.json").read_text())
+        assert "|" in one.table(report), one.name
+        for line in benchmarks.HEADLINES.get(one.name, lambda report: [])(report):
+            assert len(line) == 2 and all(line), one.name
