@@ -188,8 +188,8 @@ BENCHMARKS = (
               quick="half_people.py -m MEN --peers --only 0 18 36"),
     Benchmark("few_scans", "Few scans: a model of 8 poses of one man and 10 men", "few_scans.py --models SCRATCH",
               completion.few_scans,
-              "Three draws of training scans. `wrong`: the unseen surface off by more than 30 mm, or a part by more "
-              "than 150 mm. Where we lose: limbs that nobody saw.",
+              "Three draws of training scans (quick: one). `wrong`: the unseen surface off by more than 30 mm, or a "
+              "part by more than 150 mm. Where we lose: limbs that nobody saw.",
               quick="few_scans.py --models SCRATCH --offsets 0 --only 0 2 4 6 8 10 12"),
     Benchmark("few_scans_fewest", "The same with 3 poses and one man",
               "few_scans.py --models SCRATCH --poses 3 --men 1", completion.few_scans,

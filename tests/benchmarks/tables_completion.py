@@ -52,22 +52,22 @@ def half_people(report: dict) -> str:
 
 
 def few_scans(report: dict) -> str:
-    """What a model of few scans does, beside earlier code."""
-    mean, before = report["mean"], report.get("before", {})
+    """What a model of few scans does."""
+    mean = report["mean"]
     figures = (("held-out poses, the model fitted", "poses_error"), ("held-out men, the model fitted", "men_error"),
                ("half views of the known man: seen", "known_seen"), ("unseen", "known_unseen"),
                ("worst part", "known_limb"), ("half views of unknown men: seen", "unknown_seen"),
                ("unseen", "unknown_unseen"), ("worst part", "unknown_limb"),
                ("shape of a man from 47 markers", "mosh_error"))
-    rows: Rows = [(label, *(found.get(f"{name}_mm{worst}", "") for found in (before, mean) for worst in ("", "_worst")))
-                  for label, name in figures if f"{name}_mm" in mean]
-    told: Rows = [(label, before.get(name, ""), mean[name]) for label, name in (
+    rows: Rows = [(label, mean[f"{name}_mm"], mean[f"{name}_mm_worst"]) for label, name in figures
+                  if f"{name}_mm" in mean]
+    told: Rows = [(label, mean[name]) for label, name in (
         ("half views", "views"), ("with a part beyond 150 mm", "limbs_beyond_150_mm"),
         ("of them judged good", "limbs_beyond_150_mm_said_good"),
         ("wrong: unseen beyond 30 mm, or a part beyond 150 mm", "wrong"), ("judged check or failed", "flagged"),
         ("both", "wrong_and_flagged"), ("rank correlation, expected and true error, unseen", "correlation_expected_mm"),
         ("the same, worst part", "correlation_expected_limb_mm")) if name in mean]
-    return table(("mm", "before", "worst", "now", "worst"), rows) + "\n\n" + table(("", "before", "now"), told)
+    return table(("", "mean (mm)", "worst (mm)"), rows) + "\n\n" + table(("", ""), told)
 
 
 def markers(report: dict) -> str:
