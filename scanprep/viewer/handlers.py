@@ -172,8 +172,9 @@ class Socket(Guarded, WebSocketHandler):
     def end(self) -> None:
         """Close, without the patience of the protocol where the tab reads nothing."""
         stream = getattr(self.ws_connection, "stream", None)
+        behind = stream is not None and stream.writing()     # asked now: the farewell may empty the last buffer
         self.close(1001)
-        if stream is not None and stream.writing():
+        if behind:
             stream.close()
 
     def on_message(self, message: str | bytes) -> None:
