@@ -174,7 +174,7 @@ class Socket(Guarded, WebSocketHandler):
         stream = getattr(self.ws_connection, "stream", None)
         behind = stream is not None and stream.writing()     # asked now: the farewell may empty the last buffer
         self.close(1001)
-        if behind:
+        if stream is not None and behind:
             stream.close()
 
     def on_message(self, message: str | bytes) -> None:
