@@ -18,11 +18,12 @@ from click_app import app, server  # noqa: F401 -- fixtures
 from scanprep.command_line import run
 
 LONGEST = (
-    "readme", "scanprep_pipeline", "model_coregistration", "model_learning_resume", "model_statue_cli", "demo",
-    "completion_mosh_resume", "scanprep_registration_nonrigid", "model_learning_cli", "judgement",
-    "scanprep_skeleton_search", "completion_interactive", "completion_viewing_inside", "scanprep_skeleton_find",
-    "scanprep_decimation", "completion_tracking", "completion_stream", "scanprep_viewer_pick", "model_mixing",
-    "completion_tracking_cli", "scanprep_cli", "completion_mend", "completion_search", "model_conformance")
+    "readme", "scanprep_pipeline_workers", "model_coregistration_rounds", "scanprep_pipeline",
+    "model_coregistration", "model_learning_resume", "model_statue_cli", "demo", "completion_mosh_resume",
+    "scanprep_registration_nonrigid", "model_learning_cli", "judgement", "scanprep_skeleton_search",
+    "completion_interactive", "completion_viewing_inside", "scanprep_skeleton_find", "scanprep_decimation",
+    "completion_tracking", "completion_stream", "scanprep_viewer_pick", "model_mixing", "completion_tracking_cli",
+    "scanprep_cli", "completion_mend", "completion_search", "model_conformance")
 PLACE = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
 
 

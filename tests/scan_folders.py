@@ -6,6 +6,7 @@ from pathlib import Path
 
 import igl
 import numpy as np
+from trees import tree
 
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.batch.pool import Workers
@@ -18,7 +19,6 @@ MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
 STAGES = tuple(replace(stage, nodes=40) for stage in RegistrationConfig().graph[4:6])        # the scans lie near
 QUICK = PrepareConfig(ScanSettings(RegistrationConfig(STAGES), pictures=False), min_poses=99, workers=Workers(1))
 WITH_PICTURES = replace(QUICK, scan=replace(QUICK.scan, pictures=True))
-CHANGING = {"times.csv"}            # the only file that may differ between two runs
 
 
 def ball(level=3, radii=(0.3, 0.2, 0.9)):
@@ -41,8 +41,7 @@ def write_scans(folder, template, count=3):
 
 def contents(folder):
     """Path -> bytes of all files that must not depend on how a run went."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*"))
-            if p.is_file() and p.name not in CHANGING and ".scapekit" not in p.parts}
+    return tree(folder, "times.csv")
 
 
 if __name__ == "__main__":

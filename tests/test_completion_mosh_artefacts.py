@@ -1,28 +1,20 @@
-"""Faults that were put into markers come back, exactly, and nothing else does."""
-import itertools
-from dataclasses import replace
+"""Faults that were put into markers of a body come back, exactly, and nothing else does."""
 
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
+from marker_faults import CONFIG, FRAMES, LABELS, RATE, exchanged
 
 from completion.mocap.artefacts import simulated
 from completion.mocap.artefacts.find import ambiguous_swap, find_artefacts
-from completion.mocap.artefacts.results import ArtefactConfig, BadSpan, list_swaps
 from completion.mocap.artefacts.simulated import Simulation, bridged
-from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.pictures import chart_artefacts
 from completion.mocap.pose import follow, marked_body, swaps
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.marked_body import MarkedBody
-from completion.mocap.pose.swaps import TORN, Tracks, _two_states, find_order
-from scanprep.geometry import rotations
-
-FRAMES, RATE = 160, 100.0
-CONFIG = ArtefactConfig()
-LABELS = tuple(f"M{i}" for i in range(30))
+from completion.mocap.pose.swaps import Tracks, find_order
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +45,6 @@ def changed(positions):
     return MarkerSequence(positions, LABELS, RATE)
 
 
-def exchanged(positions, a, b, begin, end):
-    positions[begin:end + 1, [a, b]] = positions[begin:end + 1, [b, a]]
-
-
 def neighbours(positions):
     """The two markers that are closest to each other, and a far one."""
     apart = np.linalg.norm(positions[0, :, None] - positions[0], axis=2) + 9 * np.eye(30)
@@ -64,161 +52,6 @@ def neighbours(positions):
     apart[apart > 5] = 0
     return a, b, int(apart[a].argmax())
 
-
-def wavy(labels=6, frames=120):
-    """Tracks that swing about places 5 cm apart."""
-    t = np.arange(frames) / RATE
-    sway = 0.3 * np.sin(4 * t[:, None] + 0.1 * np.arange(labels))
-    out = np.stack([sway, 0.2 * np.cos(3 * t)[:, None] + 0 * sway, 0.05 * np.arange(labels) + 0 * sway], axis=2)
-    return out + np.random.default_rng(0).normal(0, 0.0003, out.shape)
-
-
-def tracked(positions):
-    return find_order(positions, RATE)
-
-
-# ---- tracks
-
-def test_a_track_of_constant_acceleration_does_not_jump():
-    t = np.arange(60)[:, None, None] / RATE
-    positions = np.broadcast_to(8 * t**2 + [1.0, 2.0, 3.0] * t, (60, 1, 3)).copy()
-    tracks = Tracks(positions, RATE)
-    assert np.nanmax(tracks.off[4:-4]) < 1e-12 and not tracks.jumped.any()
-    positions[30:] += [0.0, 0.02, 0.0]
-    tracks = Tracks(positions, RATE)
-    assert np.flatnonzero(tracks.jumped[:, 0]).tolist() == [30] and abs(tracks.off[30, 0] - 0.02) < 1e-12
-    positions[30:34] = np.nan
-    tracks = Tracks(positions, RATE)
-    assert not tracks.jumped.any() and np.flatnonzero(tracks.open[:, 0]).tolist() == [0, 30, 31, 32, 33, 34]
-
-
-def test_links_tell_which_label_goes_on():
-    positions = wavy()
-    exchanged(positions, 1, 4, 50, 119)
-    tracks = Tracks(positions, RATE)
-    some = np.arange(6)
-    cost = tracks.links(np.full((1, 1), 50), some[:, None], some)
-    assert cost.argmin(axis=1).tolist() == [0, 4, 2, 3, 1, 5] and (np.sort(cost, axis=1)[:, 1:] == TORN).all()
-    positions[45:50, 1] = np.nan                                     # over a gap: not as sure, but still the best
-    cost = Tracks(positions, RATE).links(np.array([50]), np.array([1]), np.array([4]))[0]
-    assert 0 < cost < TORN - 2
-
-
-# ---- exchanges from tracks alone
-
-def test_pairs_are_put_right_and_their_spans_are_exact():
-    positions = wavy()
-    faulty = positions.copy()
-    exchanged(faulty, 0, 1, 20, 44)
-    exchanged(faulty, 2, 5, 0, 9)
-    exchanged(faulty, 1, 3, 70, 119)
-    order = tracked(faulty)
-    np.testing.assert_array_equal(np.take_along_axis(faulty, order[..., None], axis=1), positions)
-    spans = [(e.first, e.second, e.begin, e.end) for e in list_swaps(order, np.ones((120, 6), bool), tuple("ABCDEF"))]
-    assert spans == [("C", "F", 0, 9), ("A", "B", 20, 44), ("B", "D", 70, 119)]
-
-
-def test_a_cycle_of_labels_comes_apart_into_pairs():
-    positions = wavy()
-    faulty = positions.copy()
-    faulty[30:60, [0, 2, 3, 5]] = positions[30:60, [2, 3, 5, 0]]
-    order = tracked(faulty)
-    np.testing.assert_array_equal(np.take_along_axis(faulty, order[..., None], axis=1), positions)
-    found = list_swaps(order, np.ones((120, 6), bool), tuple("ABCDEF"))
-    assert len(found) == 3 and {(e.begin, e.end) for e in found} == {(30, 59)}
-
-
-def test_exchanges_do_not_depend_on_the_order_of_labels_or_the_frame_of_space():
-    faulty = wavy()
-    exchanged(faulty, 0, 1, 20, 44)
-    faulty[60:70, 3] = np.nan
-    shuffle = np.array([3, 0, 5, 1, 4, 2])
-    R = rotations.exp(np.array([0.4, -1.0, 2.0]))
-    other = tracked((faulty @ R.T + [1.0, -2.0, 0.5])[:, shuffle])
-    np.testing.assert_array_equal(shuffle[other], tracked(faulty)[:, shuffle])
-
-
-def test_an_exchange_is_found_though_a_label_is_out_of_sight_when_it_begins():
-    positions = wavy()
-    faulty = positions.copy()
-    exchanged(faulty, 1, 4, 50, 89)
-    faulty[48:53, 1] = np.nan
-    order = tracked(faulty)
-    seen = np.isfinite(faulty[..., 0])
-    mended = np.take_along_axis(faulty, order[..., None], axis=1)
-    right = np.isclose(mended, positions, atol=1e-12).all(axis=2) | np.isnan(mended[..., 0])
-    assert right.all()
-    assert [(e.begin, e.end) for e in list_swaps(order, seen, tuple("ABCDEF"))] == [(50, 89)]
-
-
-def test_what_flickers_or_is_gone_is_not_exchanged():
-    positions = wavy()
-    positions[40, 2] += 0.05                                         # to where the next one is, which stays
-    positions[80:90, 3] += 0.3
-    positions[20:60, 5] = np.nan
-    assert (tracked(positions) == np.arange(6)).all()
-
-
-def test_two_states_are_the_best_of_all_ways():
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        gains, stay, switch = rng.normal(0, 5, 6), rng.uniform(0, 10, 5), rng.uniform(0, 10, 5)
-
-        def worth(way, gains=gains, stay=stay, switch=switch):
-            change = np.diff(way) != 0
-            return gains[np.array(way, bool)].sum() - np.where(change, switch + 4.0, stay).sum() + stay.sum()
-
-        best = max(itertools.product((0, 1), repeat=6), key=worth)
-        total, swapped = _two_states(gains, stay, switch)
-        assert total == pytest.approx(worth(best)) and swapped.astype(int).tolist() == list(best)
-
-
-# ---- bad spans
-
-def bad(local, jumps=None, **settings):
-    jumps = np.zeros(local.shape[:2]) if jumps is None else jumps
-    return find_bad(local, local, jumps, LABELS[:local.shape[1]], replace(CONFIG, **settings), RATE)
-
-
-def quiet(seed=0):
-    return np.random.default_rng(seed).normal(0, 0.001, (FRAMES, 5, 3)) + np.array([0.01, -0.01, 0.0])
-
-
-def test_a_slip_is_found_at_its_frame_and_a_slow_change_is_none():
-    local = quiet()
-    local[70:, 2] += [0.015, 0.015, -0.01]
-    local[:, 4] += 0.05 * np.linspace(0, 1, FRAMES)[:, None]          # drifts
-    assert [(s.label, s.kind, s.begin, s.end) for s in bad(local)] == []          # 2 cm without a jump may be the body
-    jumps = np.zeros(local.shape[:2])
-    jumps[70, 2] = 0.0235
-    (found,) = bad(local, jumps)
-    assert (found.label, found.kind, found.begin, found.end) == ("M2", "slipped", 70, FRAMES - 1)
-    assert abs(found.distance - np.sqrt(0.00055)) < 0.001
-    assert bad(local, jumps, slip=0.04) == ()
-
-
-def test_noise_and_strays_are_found_with_their_ends():
-    local, jumps = quiet(), np.zeros((FRAMES, 5))
-    local[50:90, 1] += np.random.default_rng(3).normal(0, 0.01, (40, 3))
-    local[100:110, 3] += [0.0, 0.15, 0.0]
-    jumps[[100, 110], 3] = 0.15
-    noisy, stray = bad(local, jumps)
-    assert (noisy.label, noisy.kind, stray.label, stray.kind) == ("M1", "noisy", "M3", "stray")
-    assert abs(noisy.begin - 50) <= 2 and abs(noisy.end - 89) <= 2
-    assert (stray.begin, stray.end) == (100, 109) and abs(stray.distance - 0.15) < 0.002
-
-
-def test_a_limb_that_is_lost_is_no_fault_of_its_markers():
-    spans = tuple(BadSpan(label, "stray", 10, 20, 0.1) for label in ("M0", "M1", "M2"))
-    alone = BadSpan("M4", "stray", 10, 40, 0.2)
-    slip = BadSpan("M0", "slipped", 50, 99, 0.03)
-    near = np.zeros((5, 5), bool)
-    near[:4, :4] = near[4, 4] = True
-    assert without_lost_limbs((*spans, alone, slip), near, LABELS[:5]) == (alone, slip)
-    assert without_lost_limbs(spans[:2], near, LABELS[:5]) == spans[:2]
-
-
-# ---- with the body
 
 def test_a_clean_sequence_has_no_faults(subject, layout, moved):
     _, _, positions, _ = moved

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motion_files import OTHERS, elsewhere, of_amass, random_poses
 from people_bodies import small_people
 from quiet_pictures import small_pictures  # noqa: F401 -- fixture
-from test_model_motions import OTHERS, elsewhere, of_amass, random_poses
 
 from completion.__main__ import main
 from completion.motion import Motion

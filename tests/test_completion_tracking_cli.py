@@ -13,6 +13,7 @@ import pytest
 from completion_bodies import worm_with_prior
 from recordings import FRAMES, arguments, quick_page, track, write_recording
 from scene_reader import scenes_of
+from trees import tree
 
 from completion import Motion
 from completion.tracking import cli
@@ -29,8 +30,7 @@ KNOWN = "--subject", "template", "--surfaces"
 
 def contents(folder):
     """Path -> bytes of all files but the report, which holds times."""
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*"))
-            if p.is_file() and p.name != "report.json" and HOME not in p.parts}
+    return tree(folder, "report.json")
 
 
 def touch(folder, *names):

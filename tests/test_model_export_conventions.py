@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bvh_reader import Bvh
+from exported_worms import worm, worm_motion, worm_rig  # noqa: F401 -- fixtures
 from glb_reader import Glb
-from model_bodies import random_poses, worm_model
+from model_bodies import worm_model
 
 from model.export.bvh import write_bvh
 from model.export.cli import export
@@ -24,22 +25,6 @@ from scanprep.geometry.files import read_mesh
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import stance
 from scanprep.skeleton.tree import Skeleton
-
-
-@pytest.fixture(scope="module")
-def model():
-    return worm_model()
-
-
-@pytest.fixture(scope="module")
-def rig(model):
-    return make_rig(model, np.array([0.5, -1.0]), 3)
-
-
-@pytest.fixture(scope="module")
-def motion(model):
-    rng = np.random.default_rng(0)
-    return random_poses(model, 5, rng, 0.8), rng.normal(size=(5, 3))
 
 
 @pytest.fixture(scope="module")
@@ -252,15 +237,15 @@ def test_blender_shows_the_same(tmp_path):
     pytest.importorskip("bpy", reason="Blender as a module (pip install bpy)")
     from blender_reader import evaluated
 
-    poses, trans = swaying(worm_rig := make_rig(worm_model(), np.array([0.5, -1.0]), 2))
+    poses, trans = swaying(theirs := make_rig(worm_model(), np.array([0.5, -1.0]), 2))
     subject = worm_model().subject(np.array([0.5, -1.0]))
-    made = replace(worm_rig, correctives=motion_correctives(worm_rig, subject, poses))
+    made = replace(theirs, correctives=motion_correctives(theirs, subject, poses))
     made, turns, places = for_programs(made, poses, trans, 2, "part2")
     write_skinned_glb(tmp_path / "a.glb", made, turns, places, 4.0)
     write_bvh(tmp_path / "a.bvh", made.skeleton, turns, places, 4.0, body=made.mesh)
     times, U = np.arange(6) / 4, turn_up(2).T
     off = np.linalg.norm(evaluated(tmp_path / "a.glb", times) - subject.vertices(poses, trans) @ U, axis=2)
-    assert off.mean() < 1e-3 and np.linalg.norm(rig_off(worm_rig, subject, poses), axis=2).mean() > 3 * off.mean()
+    assert off.mean() < 1e-3 and np.linalg.norm(rig_off(theirs, subject, poses), axis=2).mean() > 3 * off.mean()
     shown = evaluated(tmp_path / "a.glb", times, made.skeleton.names)
     joints = joint_places(made.skeleton, turns, places) @ U
     assert np.abs(shown - joints).max() < 1e-5

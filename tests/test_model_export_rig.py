@@ -1,7 +1,9 @@
 """Skinning weights, rigs and correctives: what the exported files are made of."""
 import numpy as np
 import pytest
-from model_bodies import random_poses, worm, worm_model, worm_skeleton
+from exported_worms import worm as worm_to_export  # noqa: F401 -- fixture
+from exported_worms import worm_rig  # noqa: F401 -- fixture
+from model_bodies import random_poses, worm, worm_skeleton
 
 from model.blend_weights import skin_weights, strongest
 from model.export import correctives
@@ -12,16 +14,6 @@ from model.skinning import SkinningModel
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
-
-
-@pytest.fixture(scope="module")
-def model():
-    return worm_model()
-
-
-@pytest.fixture(scope="module")
-def rig(model):
-    return make_rig(model, np.array([0.5, -1.0]), 3)
 
 
 def placed(skeleton, pose, trans):

@@ -1,6 +1,4 @@
-"""Meshes, points and folders: what is written comes back, others agree, and bad files say what is wrong."""
-import gzip
-import json
+"""Meshes and folders: what is written comes back, and others agree."""
 import struct
 import warnings
 
@@ -10,33 +8,14 @@ import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, quiet, refused
 
-from scanprep.geometry.files import (
-    MeshFileError,
-    PointCloud,
-    list_meshes,
-    read_mesh,
-    read_points,
-    read_registered,
-    write_mesh,
-    write_points,
-)
+from scanprep.geometry.files import list_meshes, read_mesh, read_registered, write_mesh
 from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, Person
 
-TETRAHEDRON = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 EXACT = {".ply": 0, ".ply.gz": 0, ".obj": 1e-11, ".off": 1e-11, ".glb": 1e-6}
-
-
-def body(rng, n=200):
-    """A closed surface with vertices and faces in an order of no meaning, about a metre across."""
-    points = rng.normal(size=(n, 3))
-    mesh = trimesh.convex.convex_hull(points / np.linalg.norm(points, axis=1, keepdims=True))
-    order = rng.permutation(len(mesh.vertices))
-    vertices = np.empty_like(mesh.vertices)
-    vertices[order] = mesh.vertices
-    return Mesh(vertices * (0.3, 0.4, 0.9), order[rng.permutation(mesh.faces)], rng.random((len(vertices), 3)))
 
 
 @st.composite
@@ -47,12 +26,6 @@ def meshes(draw):
     faces = draw(st.lists(st.lists(st.integers(0, n - 1), min_size=3, max_size=3, unique=True), min_size=1,
                           max_size=8))
     return Mesh(np.array(vertices), np.array(faces))
-
-
-def quiet(read, *args):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return read(*args)
 
 
 # ---- what is written comes back
@@ -160,13 +133,6 @@ def test_glb_places_every_mesh_by_its_node(tmp_path):
     assert distance.min(axis=1).max() < 1e-6 and distance.min(axis=0).max() < 1e-6
 
 
-# ---- the forms a format may take
-
-PLY_ROWS = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0.5 0.5 1\n"
-PLY_HEADER = ("ply\nformat ascii 1.0\ncomment made by hand\nelement vertex 5\nproperty float x\nproperty float y\n"
-              "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n")
-
-
 BLOCK = "v {0} 0 0\nv {0} 1 0\nv {0} 0 1\nf -3 -2 -1\n"
 
 
@@ -251,215 +217,6 @@ def test_an_unknown_unit_is_refused(tmp_path):
     write_mesh(tmp_path / "a.ply", TETRAHEDRON)
     with pytest.raises(ValueError, match=r"unit: expected one of m, mm, cm, in, got 'feet'"):
         read_mesh(tmp_path / "a.ply", unit="feet")
-
-
-# ---- bad files: one line with the name of the file, what was expected, what came
-
-def refused(path, *words, read=read_mesh):
-    with pytest.raises(MeshFileError) as caught:
-        quiet(read, path)
-    message = str(caught.value)
-    assert str(path) in message and "\n" not in message, message
-    for word in words:
-        assert word in message, message
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb"])
-def test_missing_empty_folder_and_foreign_files(tmp_path, suffix):
-    refused(tmp_path / f"none{suffix}", "no such file")
-    (tmp_path / f"empty{suffix}").touch()
-    refused(tmp_path / f"empty{suffix}")
-    (tmp_path / f"folder{suffix}").mkdir()
-    refused(tmp_path / f"folder{suffix}", "folder")
-    foreign = b"<html>this is not the file you are looking for</html>\n"
-    (tmp_path / f"foreign{suffix}").write_bytes(gzip.compress(foreign) if suffix.endswith("gz") else foreign)
-    refused(tmp_path / f"foreign{suffix}")
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".ply.gz", ".stl", ".off", ".glb"])
-def test_a_file_cut_off_anywhere_is_refused(tmp_path, suffix):
-    write_mesh(tmp_path / f"whole{suffix}", body(np.random.default_rng(6), 40))
-    data = (tmp_path / f"whole{suffix}").read_bytes()
-    for part in (0.02, 0.3, 0.6, 0.9, 0.99):
-        path = tmp_path / f"cut{suffix}"
-        path.write_bytes(data[:int(part * len(data))])
-        refused(path)
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_coordinates_that_are_not_finite_are_refused(tmp_path, suffix, bad):
-    vertices = np.where(TETRAHEDRON.vertices == 1.5, 1.25, TETRAHEDRON.vertices)
-    write_mesh(tmp_path / f"a{suffix}", TETRAHEDRON.with_vertices(vertices), "single")
-    data = (tmp_path / f"a{suffix}").read_bytes()
-    if suffix in (".obj", ".off"):
-        data = data.replace(b"1.25", str(bad).encode())
-    else:
-        data = data.replace(struct.pack("<f", 1.25), struct.pack("<f", bad))
-    (tmp_path / f"a{suffix}").write_bytes(data)
-    refused(tmp_path / f"a{suffix}", "not finite")
-
-
-STL = "solid\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n"
-
-
-@pytest.mark.parametrize(("name", "text", "words"), [
-    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 7\n3 0 1 2\n", ["face 0", "vertex 7", "0..4"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 -1\n3 0 1 2\n", ["face 0", "vertex -1"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS + "2 0 1\n3 0 1 2\n", ["face 0", "2 corners", "at least 3"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n", ["truncated", "2 rows of element face", "found 1"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n3 0 1 2\n3 0 1 2\n", ["5 vertex, 2 face", "1 more lines"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS.replace("0.5 0.5 1", "0.5 half 1") + "3 0 1 2\n3 0 1 2\n", ["line 15", "half"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS.replace("0.5 0.5 1", "0.5 0.5") + "3 0 1 2\n3 0 1 2\n", ["line 15", "0.5 0.5"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n3 0 1\n", ["line 17", "face"]),
-    ("a.ply", PLY_HEADER.replace("face 2", "face 0") + PLY_ROWS, ["expected a mesh", "no faces"]),
-    ("a.ply", PLY_HEADER.replace("vertex 5", "vertex 0").replace("face 2", "face 0"), ["no vertices"]),
-    ("a.ply", PLY_HEADER.replace("float z", "float w") + PLY_ROWS + "3 0 1 2\n3 0 1 2\n", ["x, y, z", "'w'"]),
-    ("a.ply", PLY_HEADER.replace("vertex 5", "vertex five"), ["line 4", "five"]),
-    ("a.ply", PLY_HEADER.replace("ascii", "binary_middle_endian"), ["line 2", "binary_middle_endian"]),
-    ("a.ply", PLY_HEADER.replace("end_header\n", ""), ["end_header"]),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 zero\nf 1 2 3\n", ["line 3", "v 0 1 zero"]),
-    ("a.obj", "v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", ["line 2", "v 1 0"]),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n\nf 1 2 4\n", ["line 5", "face 0", "vertex 3", "0..2"]),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", ["line 4", "counted from 1"]),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n", ["line 4", "face 0"]),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", ["line 4", "2 corners"]),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf a b c\n", ["line 5", "f a b c"]),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", ["no faces"]),
-    ("a.obj", "f 1 2 3\nv 0 0 0\nv 1 0 0\n", ["line 1", "face 0", "vertex 2", "0..1"]),                # cut off
-    ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ["line 6", "vertex 3", "0..2"]),
-    ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 x\n0 1 0\n3 0 1 2\n", ["line 4", "1 0 x"]),
-    ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", ["line 6", "3 0 1"]),
-    ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", ["truncated", "2 faces", "found 1"]),
-    ("a.off", "OFF\nthree 1 0\n", ["line 2", "three"]),
-    ("a.off", "OFF BINARY\n3 1 0\n", ["binary"]),
-    ("a.stl", STL.replace("vertex 1 0 0\n", "vertex 1 0\n"), ["line 5", "vertex 1 0"]),
-    ("a.stl", STL.replace("vertex 1 0 0\n", ""), ["3 vertex lines", "1 facets", "found 2"]),
-    ("a.stl", STL.replace("endsolid\n", ""), ["truncated", "endsolid"]),
-    ("a.xyz", "0 0 0\n1 0\n", ["line 2", "1 0"]),
-    ("a.xyz", "0 0 0\n1 0 x\n", ["line 2", "1 0 x"]),
-    ("a.xyz", "0 0 0\n1 0 nan\n", ["not finite", "point 1"]),
-    ("a.xyz", "# nothing\n", ["found none"]),
-    ("a.pcd", "VERSION 0.7\nFIELDS x y\nSIZE 4 4\nTYPE F F\nCOUNT 1 1\nPOINTS 1\nDATA ascii\n0 0\n", ["x, y, z"]),
-    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n0 0 0\n", ["truncated"]),
-    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA binary\nshort", ["truncated"]),
-    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA binary_compressed\n",
-     ["binary_compressed", "save the file as binary"]),
-    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n", ["agree"]),
-    ("a.pcd", "VERSION 0.7\nFIELDS x y z\n", ["DATA"]),
-    ("a.pcd", "hello\nworld\n", ["line 1", "hello"]),
-])
-def test_a_bad_file_says_where(tmp_path, name, text, words):
-    (tmp_path / name).write_text(text)
-    refused(tmp_path / name, *words, read=read_points if name.endswith(("xyz", "pcd")) else read_mesh)
-
-
-def test_a_glb_with_a_face_out_of_range_or_damaged_json(tmp_path):
-    write_mesh(tmp_path / "bad.glb", TETRAHEDRON)
-    data = (tmp_path / "bad.glb").read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    (tmp_path / "bad.glb").write_bytes(data[:20 + size + 8] + struct.pack("<I", 77) + data[20 + size + 12:])
-    refused(tmp_path / "bad.glb", "vertex 77", "0..3")
-    tree = json.loads(data[20:20 + size])
-    del tree["accessors"][1]["componentType"]
-    text = json.dumps(tree, separators=(",", ":")).encode().ljust(size)
-    (tmp_path / "bad.glb").write_bytes(data[:20] + text + data[20 + size:])
-    refused(tmp_path / "bad.glb", "componentType")
-    (tmp_path / "bad.glb").write_bytes(data[:20] + b"{" * size + data[20 + size:])
-    refused(tmp_path / "bad.glb", "JSON")
-
-
-def test_a_name_of_no_known_format(tmp_path):
-    (tmp_path / "a.fbx").touch()
-    refused(tmp_path / "a.fbx", ".ply", "'.fbx'")
-    (tmp_path / "a").touch()
-    refused(tmp_path / "a", ".ply", "found none")
-    with pytest.raises(MeshFileError, match=r"a\.fbx.*'\.fbx'"):
-        write_mesh(tmp_path / "a.fbx", TETRAHEDRON)
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".off", ".glb"])
-def test_a_damaged_file_is_read_or_refused_but_never_breaks(tmp_path, suffix, data):
-    write_mesh(tmp_path / f"whole{suffix}", TETRAHEDRON)
-    content = bytearray((tmp_path / f"whole{suffix}").read_bytes())
-    for _ in range(data.draw(st.integers(1, 4))):
-        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    (tmp_path / f"bad{suffix}").write_bytes(bytes(content))
-    try:
-        assert len(quiet(read_mesh, tmp_path / f"bad{suffix}").faces)
-    except MeshFileError as error:
-        assert f"bad{suffix}" in str(error) and "\n" not in str(error)
-
-
-def test_nothing_half_written_is_left_behind(tmp_path, monkeypatch):
-    write_mesh(tmp_path / "a.ply", TETRAHEDRON)
-    before = (tmp_path / "a.ply").read_bytes()
-    monkeypatch.setattr("pathlib.Path.write_bytes", _fail_half_way)
-    with pytest.raises(OSError, match="disk full"):
-        write_mesh(tmp_path / "a.ply", body(np.random.default_rng(7)))
-    assert (tmp_path / "a.ply").read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def _fail_half_way(path, data):
-    with open(path, "wb") as out:
-        out.write(data[:len(data) // 2])
-    raise OSError("disk full")
-
-
-# ---- points
-
-def cloud(rng, normals=True, colors=True):
-    n = rng.normal(size=(50, 3))
-    return PointCloud(rng.normal(size=(50, 3)), n / np.linalg.norm(n, axis=1, keepdims=True) if normals else None,
-                      rng.random((50, 3)) if colors else None)
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".ply.gz", ".pcd", ".xyz", ".txt"])
-@pytest.mark.parametrize(("normals", "colors"), [(True, True), (True, False), (False, True), (False, False)])
-def test_points_come_back(tmp_path, suffix, normals, colors):
-    points = cloud(np.random.default_rng(8), normals, colors)
-    write_points(tmp_path / f"a{suffix}", points)
-    back = read_points(tmp_path / f"a{suffix}")
-    np.testing.assert_allclose(back.points, points.points, atol=1e-9)
-    for mine, theirs, tolerance in ((back.normals, points.normals, 1e-6), (back.colors, points.colors, 0.5 / 255)):
-        assert (mine is None) == (theirs is None)
-        if mine is not None:
-            np.testing.assert_allclose(mine, theirs, atol=tolerance + 1e-9)
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".off", ".glb"])
-def test_the_vertices_of_a_mesh_are_points_with_its_normals(tmp_path, suffix):
-    write_mesh(tmp_path / f"a{suffix}", TETRAHEDRON)
-    points, mesh = read_points(tmp_path / f"a{suffix}"), read_mesh(tmp_path / f"a{suffix}")
-    np.testing.assert_array_equal(points.points, mesh.vertices)
-    np.testing.assert_allclose(points.normals, mesh.vertex_normals, atol=1e-6)
-
-
-def test_pcd_ascii_leaves_out_points_without_return_and_unpacks_colours(tmp_path):
-    (tmp_path / "a.pcd").write_text(
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 3\n"
-        "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA ascii\n0 0 1 16711680\nnan nan nan 0\n0.5 0 1 255\n")
-    points = read_points(tmp_path / "a.pcd")
-    np.testing.assert_array_equal(points.points, [[0, 0, 1], [0.5, 0, 1]])
-    np.testing.assert_array_equal(points.colors, [[1, 0, 0], [0, 0, 1]])
-
-
-def test_text_points_with_a_heading_commas_and_colours(tmp_path):
-    (tmp_path / "a.txt").write_text("//X,Y,Z,R,G,B\n0,0,0,255,0,0\n1,0,0.5,0,51,0\n")
-    points = read_points(tmp_path / "a.txt")
-    np.testing.assert_array_equal(points.points, [[0, 0, 0], [1, 0, 0.5]])
-    np.testing.assert_allclose(points.colors, [[1, 0, 0], [0, 0.2, 0]])
-    assert points.normals is None
-
-
-def test_points_have_units_too(tmp_path):
-    write_points(tmp_path / "a.xyz", PointCloud(np.array([[0, 0, 0], [0, 0, 1800.0]])))
-    with pytest.warns(UserWarning, match=r"a\.xyz.*unit='mm'"):
-        read_points(tmp_path / "a.xyz")
-    np.testing.assert_allclose(read_points(tmp_path / "a.xyz", unit="mm").points, [[0, 0, 0], [0, 0, 1.8]])
 
 
 # ---- folders

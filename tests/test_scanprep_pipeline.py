@@ -1,53 +1,36 @@
-"""A folder of scans: resumable, one bad scan stops no other, and the workers change nothing."""
+"""A folder of scans: resumable, and one bad scan stops no other."""
 import dataclasses
 import json
 import os
-import pickle
 import shutil
-import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from scan_folders import MARKS, QUICK, WITH_PICTURES, ball, contents, write_scans
+from scan_folders import MARKS, QUICK, ball, contents, write_scans
 from scipy.spatial.transform import Rotation
 
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
-from scanprep.batch import cluster
 from scanprep.batch.ownership import HOME, ForeignFileError
-from scanprep.batch.pool import Workers, run_jobs
-from scanprep.batch.room import Failure, Job
+from scanprep.batch.pool import Workers
 from scanprep.cleaning.clean_scan import CleanScanConfig
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.pipeline import scan as one_scan
-from scanprep.pipeline.prepare import RegisterScan, prepare
+from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
 from scanprep.registration.limbs import Doubt
 
 
-@pytest.fixture(scope="module")
-def template():
+@pytest.fixture(name="template", scope="module")
+def ball_template():
     return ball()
 
 
-@pytest.fixture
-def scans(tmp_path, template):
+@pytest.fixture(name="scans")
+def three_scans(tmp_path, template):
     return write_scans(tmp_path / "scans", template)
-
-
-@pytest.fixture(scope="module")
-def six(tmp_path_factory, template):
-    """Six scans, one of them broken, and the set that a single process makes of them without being disturbed."""
-    place = tmp_path_factory.mktemp("six")
-    scans = write_scans(place / "scans", template, 6)
-    (scans / "body3.ply").write_bytes((scans / "body3.ply").read_bytes()[:-50])
-    done = prepare(find_scans(scans), template, MARKS, place / "one" / "set", WITH_PICTURES)
-    assert len(done.figures) == 5 and len(done.failures) == 1
-    return scans, place / "one" / "set"
 
 
 def test_scans_and_what_is_known_of_them(scans):
@@ -140,32 +123,6 @@ def test_only_what_has_changed_is_done_again(scans, template, tmp_path):
     assert changed == {"meshes/body1.ply", "registration.csv", "report.html"}
 
 
-@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGINT])
-def test_killed_in_the_middle_and_started_again(six, template, tmp_path, sign):
-    scans, whole = six
-    command = [sys.executable, str(Path(__file__).with_name("scan_folders.py")), str(scans), str(tmp_path / "set")]
-    run = subprocess.Popen([*command, "2"], start_new_session=True)
-    deadline = time.monotonic() + 120
-    while len(done := finished(tmp_path / "set")) < 2:
-        assert run.poll() is None and time.monotonic() < deadline
-        time.sleep(0.005)
-    os.killpg(run.pid, sign)                    # as Ctrl-C does in a terminal: the workers too
-    assert run.wait(60) == (130 if sign == signal.SIGINT else -sign)
-    done = finished(tmp_path / "set")
-    assert 2 <= len(done) < 5, "killed too late to show anything"
-    if sign == signal.SIGINT:
-        assert 'id="scan-' in (tmp_path / "set" / "report.html").read_text()
-    stamps = {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done}
-    again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", WITH_PICTURES)
-    assert again.fresh == 5 - len(done)
-    assert {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done} == stamps
-    assert contents(tmp_path / "set") == contents(whole)
-
-
-def finished(folder):
-    return [p.name.removeprefix("scans%2F").removesuffix(".npz") for p in (folder / HOME / "done").glob("scans*.npz")]
-
-
 def test_interrupted_keeps_what_was_done(scans, template, tmp_path):
     def stop(done, total):
         if done == 1:
@@ -190,87 +147,6 @@ def test_two_runs_in_one_folder(scans, template, tmp_path):
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
     other.communicate()
     assert contents(tmp_path / "set") == before and not (tmp_path / "set" / HOME / "lock").exists()
-
-
-def test_processes_change_nothing(six, template, tmp_path):
-    scans, whole = six
-    two = dataclasses.replace(WITH_PICTURES, workers=Workers(2))
-    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", two)
-    assert "body3.ply" in done.failures[0]
-    assert contents(tmp_path / "set") == contents(whole)
-
-
-@pytest.mark.parametrize("processes, seen", [(True, True), (False, False)])
-def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, monkeypatch):
-    """Nor one whose workers do not see the files, which then travel along."""
-    from distributed import Client, LocalCluster
-
-    scans, whole = six
-    layout = {"n_workers": 2, "threads_per_worker": 1} if processes else {"n_workers": 1, "threads_per_worker": 3}
-    with LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
-        with Client(local, set_as_default=False) as client:
-            here = [task.scan for task in find_scans(scans)]
-            assert cluster._seen_there(client, here) and cluster._seen_there(client, [tmp_path / "none"])
-            monkeypatch.setattr(Path, "absolute", lambda path: Path("/elsewhere") / path.name)
-            assert not cluster._seen_there(client, here)
-            monkeypatch.undo()
-        if not seen:
-            monkeypatch.setattr(cluster, "_seen_there", lambda client, given: False)
-        config = dataclasses.replace(WITH_PICTURES, workers=Workers(0, local.scheduler_address))
-        prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
-    assert contents(tmp_path / "set") == contents(whole)
-
-
-def test_shipped_files_need_no_folder(scans, template):
-    task, shared = find_scans(scans)[0], pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), cluster._versions()))
-    there = dataclasses.replace(task, scan=Path("/no/such/body0.ply"), landmarks=Path("/no/such/body0.landmarks.json"))
-    files = {there.scan: task.scan.read_bytes(), there.landmarks: task.landmarks.read_bytes()}
-    assert cluster._files(task) == {task.scan: files[there.scan], task.landmarks: files[there.landmarks]}
-    figures, made = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
-    assert figures.name == "body0" and set(made) == {"meshes/body0.ply"} and figures.distance < 0.001
-    files[there.scan] = files[there.scan][:-9]
-    failed, made = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
-    assert failed.reason.startswith("/no/such/body0.ply: ") and not made
-
-
-def test_no_scheduler(scans, template, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "ANSWER", 1)
-    config = dataclasses.replace(QUICK, workers=Workers(scheduler="tcp://127.0.0.1:1"))
-    with pytest.raises(ValueError, match=r"none answers at tcp://127\.0\.0\.1:1"):
-        prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
-
-
-def test_workers_of_another_version(scans, template):
-    shared = pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), {"scapekit": "0.0.0", "numpy": "1"}))
-    with pytest.raises(RuntimeError, match="the worker has scapekit"):
-        cluster.do_there(shared, pickle.dumps(("body0", "", find_scans(scans)[0], None)))
-
-
-def test_a_scheduler_needs_nothing_of_ours():
-    """It unpacks the function and its arguments; ours would have to be installed there too."""
-    import cloudpickle
-
-    code = f"import pickle, sys\npickle.loads({cloudpickle.dumps(cluster._entrance())!r})\nassert not any(" \
-           "name.split('.')[0] == 'scanprep' for name in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd="/", capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-@dataclasses.dataclass(frozen=True)
-class Deadly:
-    """Dies of the second job."""
-
-    def __call__(self, given, room):
-        if given == 1:
-            os._exit(9)
-        return given
-
-
-def test_a_process_that_dies_stops_no_other_job(tmp_path):
-    jobs = [Job(f"body{k}", k, tmp_path / str(k)) for k in range(3)]
-    outcomes = {job.given: outcome for job, outcome in run_jobs(Deadly(), jobs, Workers(2))}
-    assert outcomes[0] == 0 and outcomes[2] == 2
-    assert isinstance(outcomes[1], Failure) and outcomes[1].reason.startswith("body1: the process at work on it died")
 
 
 def test_bad_scans_stop_no_other(scans, template, tmp_path):

@@ -1,0 +1,98 @@
+"""Motions of other skeletons, and how far two motions are apart."""
+from dataclasses import replace
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from people_bodies import small_people
+
+from model.export.bvh import write_bvh
+from model.export.rig import joint_places, make_rig
+from model.motion import amass
+from scanprep.geometry import rotations
+from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.people import random_pose
+
+FRAMES = 8
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])      # from the axes of the people to those of files
+OTHERS = {"pelvis": "Hips", "abdomen": "LowerBack", "chest": "Spine1", "head": "Head",
+          **{f"{s}_{ours}": side + theirs for s, side in (("l", "Left"), ("r", "Right")) for ours, theirs in
+             (("upper_arm", "Arm"), ("forearm", "ForeArm"), ("hand", "Hand"), ("thigh", "UpLeg"), ("shin", "Leg"),
+              ("foot", "Foot"))}}
+
+
+@lru_cache(maxsize=1)
+def random_poses():
+    rng = np.random.default_rng(5)
+    return np.array([random_pose(rng) for _ in range(FRAMES)])
+
+
+def degrees(a, b):
+    """The largest angle between poses."""
+    return np.degrees(np.linalg.norm(rotations.compose(-a.reshape(-1, 3), b.reshape(-1, 3)), axis=1)).max()
+
+
+def apart(a, b):
+    """Mean distance of surfaces (T, N, 3) whose middles are laid on each other in each frame, millimetres."""
+    a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
+    return 1000 * np.linalg.norm(a - b, axis=2).mean()
+
+
+def elsewhere(tmp_path, poses, trans, scale=39.37):
+    """The motion of the mean person as somebody else has it: arms level at rest, other names, one more joint in the
+    trunk, fingers, turned about the vertical, in another unit; the path of the BVH.
+    """
+    rig = make_rig(small_people(), np.zeros(1))
+    names, parents, J = list(rig.skeleton.names), rig.skeleton.parents, rig.skeleton.joints
+    A = np.tile(np.eye(3), (16, 1, 1))
+    for side, sign in (("l", 1), ("r", -1)):
+        arm = [names.index(f"{side}_{part}") for part in ("upper_arm", "forearm", "hand")]
+        bone = J[arm[1]] - J[arm[0]]
+        A[arm] = rotations.exp(np.array([0, -sign * np.arctan2(-bone[2], abs(bone[0])), 0]))
+    R = rig.skeleton.part_rotations(poses) @ np.swapaxes(A, -1, -2)
+    rest = joint_places(rig.skeleton, rig.skeleton.pose_of(A))
+    Q = rotations.exp(np.array([0, 1.1, 0])) @ Y_UP
+    chest, hand = names.index("chest"), names.index("l_hand")
+    middle = (rest[names.index("abdomen")] + rest[chest]) / 2
+    # the abdomen in two joints that turn alike, and a finger that turns on its own
+    order = [*range(chest), 16, *range(chest, 16), 17]
+    above = np.array([*parents, names.index("abdomen"), hand])
+    above[chest] = 16
+    rest = np.vstack([rest, middle, rest[hand] + [0.08, 0, 0]])
+    R = np.concatenate([R, R[:, [names.index("abdomen")]], R[:, [hand]] @ rotations.exp(np.array([0.4, 0, 0]))], axis=1)
+    number, called = np.argsort(order), [*(OTHERS[name] for name in names), "Spine", "LeftHandIndex1"]
+    tree = Skeleton(np.arange(18), np.array([-1 if above[j] < 0 else number[above[j]] for j in order]),
+                    (rest @ Q.T)[order], tuple(called[j] for j in order))
+    moved = (Q @ R @ Q.T)[:, order]
+    write_bvh(tmp_path / "theirs.bvh", replace(tree, joints=scale * tree.joints), tree.pose_of(moved),
+              scale * (trans @ Q.T), 24.0, "m", 1)
+    return tmp_path / "theirs.bvh"
+
+
+def of_amass(poses, up=2):
+    """The 22 joints of a motion of the mean person in a T-pose of its own, as AMASS has them: poses (T, 22, 3)."""
+    ours = make_rig(small_people(), np.zeros(1)).skeleton
+    names, rest = ours.names, amass.t_pose()
+    part = dict.fromkeys(("spine1", "spine2"), "abdomen") | {"pelvis": "pelvis", "head": "head"}
+    A = {}
+    for side, s in (("left", "l"), ("right", "r")):
+        for theirs, mine in (("hip", "thigh"), ("knee", "shin"), ("ankle", "foot"), ("foot", "foot"),
+                             ("shoulder", "upper_arm"), ("elbow", "forearm"), ("wrist", "hand")):
+            part[f"{side}_{theirs}"] = f"{s}_{mine}"
+        for chain in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
+            R = Y_UP
+            for a, b in pairwise(chain):
+                i, k = (names.index(part[f"{side}_{end}"]) for end in (a, b))
+                there = rest[amass.NAMES.index(f"{side}_{b}")] - rest[amass.NAMES.index(f"{side}_{a}")]
+                bone = R @ (ours.joints[k] - ours.joints[i])
+                axis = np.cross(bone, there)
+                angle = np.arctan2(np.linalg.norm(axis), bone @ there)
+                R = rotations.exp(angle * axis / np.linalg.norm(axis)) @ R
+                A[f"{side}_{a}"] = R
+            if chain[2] == "wrist":
+                A[f"{side}_wrist"] = R
+    world = ours.part_rotations(poses)
+    R = np.stack([world[:, names.index(part.get(name, "chest"))] @ A.get(name, Y_UP).T for name in amass.NAMES], axis=1)
+    if up == 1:
+        R = Y_UP @ R
+    return Skeleton(np.arange(22), amass.PARENTS, rest, amass.NAMES).pose_of(R)

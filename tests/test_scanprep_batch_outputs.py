@@ -1,0 +1,155 @@
+"""What commands write: whole or not at all, and nothing of the user's is lost."""
+import json
+import os
+
+import pytest
+from trees import tree
+
+from scanprep import command_line
+from scanprep.batch import workspace as room
+from scanprep.batch.opening import FileWorkspace, beside
+from scanprep.batch.ownership import HOME
+from scanprep.batch.workspace import Workspace
+from scanprep.cli import Output
+from scanprep.console import Metric, Outcome
+
+
+def write(output: Output, text: str = "text") -> Outcome:
+    """Write."""
+    if text == "fail":
+        output.write_text("half")
+        raise ValueError(f"{output}: failed")
+    output.write_text(text)
+    output.with_suffix(".more.txt").write_text(text)
+    return Outcome(output, [Metric("letters", len(text))])
+
+
+def write_alone(output: Output, text: str = "text") -> Outcome:
+    """Write nothing beside it."""
+    output.write_text(text)
+    return Outcome(output, [Metric("letters", len(text))])
+
+
+def write_folder(output: Output) -> Outcome:
+    """Write a folder."""
+    (output / "inner").mkdir(parents=True)
+    (output / "inner" / "a.txt").write_text("a")
+    return Outcome(output, [])
+
+
+def resumed(output: Output, text: str = "text", *, space: Workspace) -> Outcome:
+    """Write in steps."""
+    length = space.step("s", text, lambda folder: (folder / "a.txt").write_text(text))
+    return Outcome(output, [Metric("letters", length)])
+
+
+def learned(output: Output, text: str = "text", *, space: FileWorkspace) -> Outcome:
+    """Write a file in steps."""
+    length = space.step("s", text, lambda folder: len(text))
+    output.write_text(text)
+    return Outcome(output, [Metric("letters", length)])
+
+
+def command(function, output, *words):
+    return command_line.run(function, "scape x", ["--output", str(output), *words])
+
+
+def test_an_output_file_that_is_not_ours_stays(tmp_path, capsys):
+    out = tmp_path / "a.txt"
+    assert command(write, out) == 0 and out.read_text() == "text"
+    assert command(write, out, "--text", "other") == 0 and out.read_text() == "other"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.txt", "a.txt.report.json"]
+    report = json.loads((tmp_path / "a.txt.report.json").read_text())
+    assert set(report["written"]) == {"a.txt", "a.more.txt"}
+    for name in ("a.txt", "a.more.txt"):
+        before = {**tree(tmp_path), name: b"edited"}
+        (tmp_path / name).write_text("edited")
+        assert command(write, out, "--text", "third") == 1
+        assert f"{tmp_path / name}: in the way of the output" in capsys.readouterr().err
+        assert tree(tmp_path) == before
+        (tmp_path / name).write_text("other")
+
+
+@pytest.mark.parametrize("at", range(8))
+def test_a_command_killed_between_any_two_moves(tmp_path, monkeypatch, at):
+    out, calls, replace = tmp_path / "a.txt", [], os.replace
+    assert command(write, out) == 0
+
+    class Killed(BaseException):
+        pass
+
+    def moving(source, target):
+        calls.append(source)
+        if len(calls) == at + 1:
+            raise Killed
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", moving)
+    monkeypatch.setattr(room.shutil, "rmtree", lambda *args, **named: None)
+    try:
+        command(write, out, "--text", "other")
+    except Killed:
+        pass
+    monkeypatch.undo()
+    assert command(write, out, "--text", "other") == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.txt", "a.txt.report.json"]
+    assert out.read_text() == (tmp_path / "a.more.txt").read_text() == "other"
+
+
+def test_a_command_that_fails_writes_nothing(tmp_path, capsys):
+    assert command(write, tmp_path / "new" / "a.txt", "--text", "fail") == 1
+    assert capsys.readouterr().err == f"scape x: {tmp_path / 'new' / 'a.txt'}: failed\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_folder_that_is_not_ours_stays(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert command(write_folder, out) == 0 and command(write_folder, out) == 0
+    assert set(tree(out)) == {"inner/a.txt", "report.json"} and sorted(os.listdir(tmp_path)) == ["out"]
+    foreign = tmp_path / "mine"
+    (foreign / "inner").mkdir(parents=True)
+    (foreign / "note.txt").write_text("mine")
+    for function in (write_folder, resumed):
+        assert command(function, foreign) == 1
+        assert tree(foreign) == {"note.txt": b"mine"} and not (foreign / HOME).exists()
+    assert "in the way of the output" in capsys.readouterr().err
+
+
+def test_a_report_in_the_way_is_one_line(tmp_path, capsys):
+    assert command(resumed, tmp_path / "out") == 0
+    (tmp_path / "out" / "report.json").unlink()
+    (tmp_path / "out" / "report.json").mkdir()
+    assert command(resumed, tmp_path / "out") == 1
+    assert "report.json: in the way of the output" in capsys.readouterr().err
+
+
+def test_steps_of_a_file_are_kept_beside_it(tmp_path):
+    out = tmp_path / "m.npz"
+    assert command(learned, out) == 0
+    home = tmp_path / f".m.npz{HOME}"
+    when = (home / "done" / "s.npz").stat().st_mtime_ns
+    assert command(learned, out) == 0 and (home / "done" / "s.npz").stat().st_mtime_ns == when
+    assert command(learned, out, "--force") == 0 and (home / "done" / "s.npz").stat().st_mtime_ns != when
+    with beside(out) as space:
+        space.drop_record("s")
+    assert not home.exists() and out.exists()
+
+
+def test_files_that_differ_in_their_endings_keep_their_reports(tmp_path):
+    """A second output neither takes the report of the first nor, as not made by it, the file itself."""
+    for name in ("walk.glb", "walk.bvh", "walk.glb"):
+        assert command(write_alone, tmp_path / name, "--text", name) == 0
+    for name in ("walk.glb", "walk.bvh"):
+        assert (tmp_path / name).read_text() == name
+        assert set(json.loads((tmp_path / f"{name}.report.json").read_text())["written"]) == {name}
+    assert len(os.listdir(tmp_path)) == 4
+
+
+def test_a_report_without_the_ending_still_tells_what_is_ours(tmp_path):
+    """As they were named once: of the file that they name, and of no other."""
+    assert command(write_alone, tmp_path / "a.txt") == 0
+    (tmp_path / "a.txt.report.json").rename(tmp_path / "a.report.json")
+    (tmp_path / "a.md").write_text("mine")
+    assert command(write_alone, tmp_path / "a.md") == 1 and (tmp_path / "a.md").read_text() == "mine"
+    assert command(write_alone, tmp_path / "a.txt", "--text", "other") == 0
+    assert sorted(os.listdir(tmp_path)) == ["a.md", "a.txt", "a.txt.report.json"]

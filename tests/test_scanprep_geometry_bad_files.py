@@ -1,0 +1,157 @@
+"""Bad files of meshes: one line with the name of the file, what was expected, what came."""
+import gzip
+import json
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, quiet, refused
+
+from scanprep.geometry.files import MeshFileError, read_mesh, read_points, write_mesh
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb"])
+def test_missing_empty_folder_and_foreign_files(tmp_path, suffix):
+    refused(tmp_path / f"none{suffix}", "no such file")
+    (tmp_path / f"empty{suffix}").touch()
+    refused(tmp_path / f"empty{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    refused(tmp_path / f"folder{suffix}", "folder")
+    foreign = b"<html>this is not the file you are looking for</html>\n"
+    (tmp_path / f"foreign{suffix}").write_bytes(gzip.compress(foreign) if suffix.endswith("gz") else foreign)
+    refused(tmp_path / f"foreign{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".ply.gz", ".stl", ".off", ".glb"])
+def test_a_file_cut_off_anywhere_is_refused(tmp_path, suffix):
+    write_mesh(tmp_path / f"whole{suffix}", body(np.random.default_rng(6), 40))
+    data = (tmp_path / f"whole{suffix}").read_bytes()
+    for part in (0.02, 0.3, 0.6, 0.9, 0.99):
+        path = tmp_path / f"cut{suffix}"
+        path.write_bytes(data[:int(part * len(data))])
+        refused(path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_coordinates_that_are_not_finite_are_refused(tmp_path, suffix, bad):
+    vertices = np.where(TETRAHEDRON.vertices == 1.5, 1.25, TETRAHEDRON.vertices)
+    write_mesh(tmp_path / f"a{suffix}", TETRAHEDRON.with_vertices(vertices), "single")
+    data = (tmp_path / f"a{suffix}").read_bytes()
+    if suffix in (".obj", ".off"):
+        data = data.replace(b"1.25", str(bad).encode())
+    else:
+        data = data.replace(struct.pack("<f", 1.25), struct.pack("<f", bad))
+    (tmp_path / f"a{suffix}").write_bytes(data)
+    refused(tmp_path / f"a{suffix}", "not finite")
+
+
+STL = "solid\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n"
+
+
+@pytest.mark.parametrize(("name", "text", "words"), [
+    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 7\n3 0 1 2\n", ["face 0", "vertex 7", "0..4"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 -1\n3 0 1 2\n", ["face 0", "vertex -1"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS + "2 0 1\n3 0 1 2\n", ["face 0", "2 corners", "at least 3"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n", ["truncated", "2 rows of element face", "found 1"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n3 0 1 2\n3 0 1 2\n", ["5 vertex, 2 face", "1 more lines"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS.replace("0.5 0.5 1", "0.5 half 1") + "3 0 1 2\n3 0 1 2\n", ["line 15", "half"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS.replace("0.5 0.5 1", "0.5 0.5") + "3 0 1 2\n3 0 1 2\n", ["line 15", "0.5 0.5"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n3 0 1\n", ["line 17", "face"]),
+    ("a.ply", PLY_HEADER.replace("face 2", "face 0") + PLY_ROWS, ["expected a mesh", "no faces"]),
+    ("a.ply", PLY_HEADER.replace("vertex 5", "vertex 0").replace("face 2", "face 0"), ["no vertices"]),
+    ("a.ply", PLY_HEADER.replace("float z", "float w") + PLY_ROWS + "3 0 1 2\n3 0 1 2\n", ["x, y, z", "'w'"]),
+    ("a.ply", PLY_HEADER.replace("vertex 5", "vertex five"), ["line 4", "five"]),
+    ("a.ply", PLY_HEADER.replace("ascii", "binary_middle_endian"), ["line 2", "binary_middle_endian"]),
+    ("a.ply", PLY_HEADER.replace("end_header\n", ""), ["end_header"]),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 zero\nf 1 2 3\n", ["line 3", "v 0 1 zero"]),
+    ("a.obj", "v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", ["line 2", "v 1 0"]),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n\nf 1 2 4\n", ["line 5", "face 0", "vertex 3", "0..2"]),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", ["line 4", "counted from 1"]),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n", ["line 4", "face 0"]),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", ["line 4", "2 corners"]),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf a b c\n", ["line 5", "f a b c"]),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", ["no faces"]),
+    ("a.obj", "f 1 2 3\nv 0 0 0\nv 1 0 0\n", ["line 1", "face 0", "vertex 2", "0..1"]),                # cut off
+    ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ["line 6", "vertex 3", "0..2"]),
+    ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 x\n0 1 0\n3 0 1 2\n", ["line 4", "1 0 x"]),
+    ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", ["line 6", "3 0 1"]),
+    ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", ["truncated", "2 faces", "found 1"]),
+    ("a.off", "OFF\nthree 1 0\n", ["line 2", "three"]),
+    ("a.off", "OFF BINARY\n3 1 0\n", ["binary"]),
+    ("a.stl", STL.replace("vertex 1 0 0\n", "vertex 1 0\n"), ["line 5", "vertex 1 0"]),
+    ("a.stl", STL.replace("vertex 1 0 0\n", ""), ["3 vertex lines", "1 facets", "found 2"]),
+    ("a.stl", STL.replace("endsolid\n", ""), ["truncated", "endsolid"]),
+    ("a.xyz", "0 0 0\n1 0\n", ["line 2", "1 0"]),
+    ("a.xyz", "0 0 0\n1 0 x\n", ["line 2", "1 0 x"]),
+    ("a.xyz", "0 0 0\n1 0 nan\n", ["not finite", "point 1"]),
+    ("a.xyz", "# nothing\n", ["found none"]),
+    ("a.pcd", "VERSION 0.7\nFIELDS x y\nSIZE 4 4\nTYPE F F\nCOUNT 1 1\nPOINTS 1\nDATA ascii\n0 0\n", ["x, y, z"]),
+    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n0 0 0\n", ["truncated"]),
+    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA binary\nshort", ["truncated"]),
+    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA binary_compressed\n",
+     ["binary_compressed", "save the file as binary"]),
+    ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n", ["agree"]),
+    ("a.pcd", "VERSION 0.7\nFIELDS x y z\n", ["DATA"]),
+    ("a.pcd", "hello\nworld\n", ["line 1", "hello"]),
+])
+def test_a_bad_file_says_where(tmp_path, name, text, words):
+    (tmp_path / name).write_text(text)
+    refused(tmp_path / name, *words, read=read_points if name.endswith(("xyz", "pcd")) else read_mesh)
+
+
+def test_a_glb_with_a_face_out_of_range_or_damaged_json(tmp_path):
+    write_mesh(tmp_path / "bad.glb", TETRAHEDRON)
+    data = (tmp_path / "bad.glb").read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    (tmp_path / "bad.glb").write_bytes(data[:20 + size + 8] + struct.pack("<I", 77) + data[20 + size + 12:])
+    refused(tmp_path / "bad.glb", "vertex 77", "0..3")
+    tree = json.loads(data[20:20 + size])
+    del tree["accessors"][1]["componentType"]
+    text = json.dumps(tree, separators=(",", ":")).encode().ljust(size)
+    (tmp_path / "bad.glb").write_bytes(data[:20] + text + data[20 + size:])
+    refused(tmp_path / "bad.glb", "componentType")
+    (tmp_path / "bad.glb").write_bytes(data[:20] + b"{" * size + data[20 + size:])
+    refused(tmp_path / "bad.glb", "JSON")
+
+
+def test_a_name_of_no_known_format(tmp_path):
+    (tmp_path / "a.fbx").touch()
+    refused(tmp_path / "a.fbx", ".ply", "'.fbx'")
+    (tmp_path / "a").touch()
+    refused(tmp_path / "a", ".ply", "found none")
+    with pytest.raises(MeshFileError, match=r"a\.fbx.*'\.fbx'"):
+        write_mesh(tmp_path / "a.fbx", TETRAHEDRON)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".off", ".glb"])
+def test_a_damaged_file_is_read_or_refused_but_never_breaks(tmp_path, suffix, data):
+    write_mesh(tmp_path / f"whole{suffix}", TETRAHEDRON)
+    content = bytearray((tmp_path / f"whole{suffix}").read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    (tmp_path / f"bad{suffix}").write_bytes(bytes(content))
+    try:
+        assert len(quiet(read_mesh, tmp_path / f"bad{suffix}").faces)
+    except MeshFileError as error:
+        assert f"bad{suffix}" in str(error) and "\n" not in str(error)
+
+
+def test_nothing_half_written_is_left_behind(tmp_path, monkeypatch):
+    write_mesh(tmp_path / "a.ply", TETRAHEDRON)
+    before = (tmp_path / "a.ply").read_bytes()
+    monkeypatch.setattr("pathlib.Path.write_bytes", _fail_half_way)
+    with pytest.raises(OSError, match="disk full"):
+        write_mesh(tmp_path / "a.ply", body(np.random.default_rng(7)))
+    assert (tmp_path / "a.ply").read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def _fail_half_way(path, data):
+    with open(path, "wb") as out:
+        out.write(data[:len(data) // 2])
+    raise OSError("disk full")
