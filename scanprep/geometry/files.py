@@ -19,6 +19,7 @@ import numpy as np
 from . import format_glb, format_pcd, format_ply, format_stl, format_text, storage
 from .format_common import UNITS, Contents, MeshFileError, check_extent, load_bytes, metres_per_unit
 from .mesh import Mesh
+from .sanitise import sanitise
 from .seams import merged_mean, seams_closed
 
 __all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "name_of", "read_mesh",
@@ -185,11 +186,11 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
 
 
 def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
-    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
+    """A scan as a mesh, its triangles made sound (`sanitise`), or as points (n, 3) where the file has no triangles."""
     if Path(path).suffix.lower() in POINT_ENDINGS:
         return read_points(path, unit).points
     try:
-        return read_mesh(path, unit)
+        return sanitise(read_mesh(path, unit), str(path))
     except ValueError as error:
         if "no faces" in str(error):
             return read_points(path, unit).points

@@ -19,6 +19,7 @@ from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, name_of, read_mesh, read_scan, write_mesh, write_points
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
+from ..geometry.sanitise import sanitise
 from ..judgement import Judgement
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
@@ -149,7 +150,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
         unit: Unit of the mesh, the views and the cameras.
         config: Settings.
     """
-    before = read_mesh(mesh, unit)
+    before = sanitise(read_mesh(mesh, unit), str(mesh))
     seen = _read_views(views, unit) if views else ()
     holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
@@ -188,7 +189,7 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         if wrong:
             raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         return _reduce_set(mesh, output, faces, of_set)
-    before = read_mesh(mesh, unit)
+    before = sanitise(read_mesh(mesh, unit), str(mesh))
     keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)
