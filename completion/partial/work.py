@@ -18,7 +18,7 @@ from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.format_common import UNITS
-from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import size
@@ -97,7 +97,8 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
         depth = read_picture(inputs.scans, work.unit)
         files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
-        named = read_landmarks(inputs.landmarks, files.mesh, work.unit) if inputs.landmarks else {}
+        surface = files.mesh or (all_points(files.views) if files.views else None)
+        named = read_landmarks(inputs.landmarks, surface, work.unit) if inputs.landmarks else {}
         landmarks = _landmarks(work, inputs.landmarks, named)
         masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
     if depth is not None:
@@ -169,13 +170,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
 
 
 def _landmarks(work: Work, file: Path | None, named: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-    if file is None:
-        return None
-    try:
-        _, vertices, points = match_landmarks(work.marks, named)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-    return vertices, points
+    return None if file is None else shared_landmarks(file, work.marks, named)
 
 
 def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -> Completion:

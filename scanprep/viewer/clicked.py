@@ -4,7 +4,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +53,7 @@ class Clicked:
         if not file.name.endswith((".mrk.json", ".fcsv")):       # which may be in another frame: the mesh tells
             with contextlib.suppress(ValueError):
                 return read_landmarks(file, None, self.unit)
-        shape = self.body.shape
-        places = read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit)
+        places = read_landmarks(file, self.body.shape, self.unit)
         self.forget()
         return places
 
@@ -140,9 +139,8 @@ def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], bod
     corners = template.faces[nearest.faces]
     vertices = corners[np.arange(len(corners)), nearest.bary.argmax(axis=1)]
     of_name = dict(zip(on_template, vertices.tolist(), strict=True))
-    config = RegistrationConfig()              # without its last steps: two thirds of the time, 7 mm instead of 6
-    config = replace(config, graph=config.graph[:-1], final_fit=None)
     fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
-                                          np.array([on_scan[name] for name in common])), config, progress)
+                                          np.array([on_scan[name] for name in common])),
+                   RegistrationConfig.quick(), progress)
     moved = nearest.transferred(fit.mesh.vertices, template.faces)
     return {name: body.nearest(place) for name, place in zip(on_template, moved, strict=True)}
