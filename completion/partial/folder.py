@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import ClassVar
+from urllib.parse import quote
 
 import numpy as np
 
@@ -124,9 +125,9 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
     turning = worst_that_turn([folder / name / SCENE for name in names])
     for name, scene in zip(names, turning, strict=True):
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
-        shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
+        shown = f'<img src="{quote(name, errors="surrogateescape")}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
             page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
+        title = f'<a href="{quote(name, errors="surrogateescape")}/report.html"><b>{escape(name)}</b></a>'
         page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
     return page
 

@@ -102,9 +102,9 @@ def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError]
 
 
 def write(path: str | Path, data: bytes | str) -> None:
-    """Write a file, whole or not at all; text as UTF-8."""
+    """Write a file, whole or not at all; text as UTF-8, where it has bytes of a name that is none, they as `\\udce9`."""
     with writing(path) as beside:
-        beside.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+        beside.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import quote
 
 import numpy as np
 import tyro
@@ -113,7 +114,7 @@ def _folder_page(results: Results) -> Page:
         page.section("Failed").table([(line,) for line in results.failures.values()])
     page.section("Distance of markers or joint centres to where the body puts them, mean")
     for name in sorted(results.values, key=lambda name: -_error(results.values[name])):
-        page.markup(f'<p><a href="{escape(name)}/report.html">{escape(name)}</a>: '
+        page.markup(f'<p><a href="{quote(name, errors="surrogateescape")}/report.html">{escape(name)}</a>: '
                     f'{_error(results.values[name]):.1f} mm</p>')
     return page
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -140,9 +141,9 @@ def _drawn(figure: Any) -> bytes:
 
 def add_entry(page: Page, name: str, lines: Iterable[str]) -> None:
     """A person, or a sequence, leading to its own page."""
-    link, told = escape(name), "".join(f"<p>{escape(line)}</p>" for line in lines)
-    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{link}</b></a>{told}</div>'
-                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>')
+    link, label, told = quote(name, errors="surrogateescape"), escape(name), "".join(f"<p>{escape(line)}</p>" for line in lines)
+    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{label}</b></a>{told}</div>'
+                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{label}"></a></div>')
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
