@@ -263,7 +263,7 @@ def test_too_few_matches_show_both_lists():
 
 
 @pytest.mark.parametrize("ending", LANDMARK_ENDINGS)
-@pytest.mark.parametrize("scan", ["anna.ply", "anna.ply.gz", "anna.scan.xyz"])
+@pytest.mark.parametrize("scan", ["anna.ply", "anna.ply.gz", "anna.xyz"])
 def test_the_landmark_file_beside_a_scan_is_found(tmp_path, ending, scan):
     assert landmarks_beside(tmp_path / scan) is None
     for name in ("landmarks.json", f"annabel{ending}"):                      # those of others

@@ -15,7 +15,7 @@ from model.posing.cli import read_subject
 from scanprep.cli import Unit
 from scanprep.console import bar
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry.files import list_meshes, read_mesh
+from scanprep.geometry.files import list_meshes, name_of, read_mesh
 from scanprep.geometry.landmark_names import known_landmarks
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
@@ -102,11 +102,11 @@ def _bodies(path: Path, model: BodyModel | None, unit: Unit | None) -> Iterator[
 def _of_file(path: Path, model: BodyModel | None, unit: Unit | None) -> Body:
     """A mesh, or betas."""
     if path.suffix.lower() in (".json", ".npz"):
-        return _of_betas(path.name.split(".")[0], path, model)
+        return _of_betas(name_of(path), path, model)
     error = None
     if path.name == "completed.ply" and (path.parent / COMPLETED).exists():
         error = load_completion(path.parent).expected_error
-    return Body(path.name.split(".")[0], read_mesh(path, unit), path, expected_error=error)
+    return Body(name_of(path), read_mesh(path, unit), path, expected_error=error)
 
 
 def _of_betas(name: str, path: Path, model: BodyModel | None) -> Body:

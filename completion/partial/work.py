@@ -20,6 +20,7 @@ from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_p
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
@@ -224,7 +225,7 @@ def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
     if path.suffix.lower() in POINT_ENDINGS:
         return read_points(path, unit)
     try:
-        return read_mesh(path, unit)
+        return sanitise(read_mesh(path, unit), str(path))
     except ValueError as error:
         if "no faces" in str(error):
             return read_points(path, unit)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from . import storage
+from .files import name_of
 from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_per_unit
 from .landmark_names import paired_names
 from .landmark_reading import Entry, entries_of
@@ -90,11 +91,11 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
 
 
 def landmarks_beside(path: str | Path, folder: Path | None = None) -> Path | None:
-    """The landmark file of a scan or template: that of its name, up to the first dot, beside it or in a folder.
+    """The landmark file of a scan or template: that of its name (`name_of`), beside it or in a folder.
 
     A template called `template` has `landmarks.json` too, as in a registered set.
     """
-    folder, stem = folder or Path(path).parent, Path(path).name.split(".")[0]
+    folder, stem = folder or Path(path).parent, name_of(path)
     names = [stem + ending for ending in LANDMARK_ENDINGS] + ["landmarks.json"] * (stem == "template")
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
@@ -104,7 +105,7 @@ def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = Non
     """Named vertices of a template from the file given, or from the one beside it."""
     path = given or landmarks_beside(template)
     if path is None:
-        raise ValueError(f"{template}: expected its landmarks in {template.name.split('.')[0]}.landmarks.json beside "
+        raise ValueError(f"{template}: expected its landmarks in {name_of(template)}.landmarks.json beside "
                          f"it; name the file with {flag}")
     return read_landmark_vertices(path, mesh)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..depth_camera.picture import is_picture, read_depth
-from ..geometry.files import UNITS, read_scan
+from ..geometry.files import UNITS, name_of, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
@@ -43,7 +43,7 @@ class Clicked:
     def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
         """With the landmarks of its file, or of that of its name beside it; else one of this ending will be written."""
         file = file or landmarks_beside(path)
-        one = cls(path, file or path.with_name(path.name.split(".")[0] + ending), unit)
+        one = cls(path, file or path.with_name(name_of(path) + ending), unit)
         if file is not None:
             one.places = one._read(file)
         return one
