@@ -9,7 +9,6 @@ import numpy as np
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 
-
 NEIGHBOURS = 20                        # points that tell a normal, and to which it is oriented
 DEEPEST = 10                           # octree of Poisson reconstruction: cells of 2 mm on a person
 

@@ -1,7 +1,7 @@
 """From one scan of a subject, or range views, to the template of all registrations."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,6 +23,8 @@ from ..skeleton.symmetry import find_symmetry
 from .cloud import AWAY, mesh_of_cloud, mesh_of_view
 
 ONE_PIECE = 0.9                        # of the surface of a body that is one mesh hangs together
+MOST_FILLED = 0.05                     # of a surface, beyond which its shape is half a guess
+OFF = 0.01                             # metres from the template at which a landmark was clicked on something else
 UNEVEN = 0.03                          # of all triangles that one side may have more of than its area lets expect
 
 
@@ -66,7 +68,17 @@ class MadeTemplate:
     mesh: Mesh
     notes: tuple[str, ...]              # one sentence each
     filled: float                       # share of the surface that lies where nothing was scanned
+    handles: int                        # where the surface is joined to itself, as between thighs that touch
     balance: float | None               # share of the triangles on the left of the body; None where it has no sides
+
+
+    @property
+    def doubts(self) -> list[str]:
+        """What somebody should look at before scans are registered with it."""
+        return [*([f"{100 * self.filled:.0f}% of the surface is filled, nothing was scanned there"]
+                  if self.filled > MOST_FILLED else []),
+                *([f"the surface is joined to itself in {self.handles} places: thighs, armpits or fingers that touch"]
+                  if self.handles else [])]
 
 
 def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: TemplateConfig | None = None,
@@ -170,7 +182,19 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     edge = scanned.mean_edge
     far = cKDTree(scanned.vertices).query(small.corners.mean(axis=1))[0] > 2 * edge + 0.5 * small.mean_edge
     tell(4, 4)
-    return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), balance)
+    handles = 1 - (len(small.vertices) - len(small.edges) + len(small.faces)) // 2
+    return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), handles,
+                        balance)
+
+
+def carry_landmarks(places: Mapping[str, np.ndarray], mesh: Mesh) -> tuple[dict[str, int], dict[str, float]]:
+    """The vertices of a mesh nearest to landmarks (3,), and the distances, metres, of those that lie off it."""
+    if not places:
+        return {}, {}
+    away, vertices = cKDTree(mesh.vertices).query(np.array(list(places.values())))
+    reach = OFF + mesh.mean_edge
+    return (dict(zip(places, vertices.tolist(), strict=True)),
+            {name: float(d) for name, d in zip(places, away, strict=True) if d > reach})
 
 
 def left_share(mesh: Mesh) -> float | None:
