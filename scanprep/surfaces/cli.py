@@ -35,6 +35,7 @@ from ..judgement import Judgement
 from ..ranges import Faces, Share
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
 from ..repair.manifold import repair
+from .cloud import read_surface
 from .template import carry_landmarks, make_template, template_of_scan, views_without_cameras
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN ...")]
@@ -58,12 +59,15 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         landmarks: Landmarks of the scan; else the file of its name beside it.
         unit: Unit of the scans, their cameras and landmarks.
     """
+    if not scans:
+        raise ValueError("SCAN: expected a scan of the whole body, or views of it, got none")
     notes: tuple[str, ...] = ()
     rows, doubts, marks = list[Metric](), list[str](), dict[str, int]()
     if len(scans) == 1 and (scans[0] / "cameras.json").exists():
         seen = _read_views(scans[0], unit)
         with bar("making the template") as progress:
             made = make_template(seen, faces, progress=progress)
+        rows = [Metric("views", len(seen))]
     else:
         paths = [path for given in scans for path in (_files_of(given) if given.is_dir() else [given])]
         views = [_read_body(path, unit) for path in paths]
@@ -75,7 +79,8 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
             done = template_of_scan(scan, faces, landmarks=np.array(list(places.values())) if places else None,
                                     progress=progress)
         made, notes, doubts = done.mesh, done.notes, list(done.doubts)
-        rows = [Metric("filled, where nothing was scanned", 100 * done.filled, "% of the surface")]
+        rows = [Metric("files", len(paths)),
+                Metric("filled, where nothing was scanned", 100 * done.filled, "% of the surface")]
         if done.balance is not None:
             rows.append(Metric("triangles on the left side", 100 * done.balance, "%"))
         marks, far = carry_landmarks(places, made)
@@ -85,8 +90,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         write_landmarks(output.with_name(f"{name_of(output)}.landmarks.json"), marks)
     for note in notes:
         say(f"note: {note}")
-    return Outcome(output, [Metric("files", len(scans) if notes else len(list_meshes(scans[0]))), *rows,
-                            Metric("landmarks carried", len(marks)), *about_mesh(made)],
+    return Outcome(output, [*rows, Metric("landmarks carried", len(marks)), *about_mesh(made)],
                    judgement=Judgement.of(check=doubts))
 
 
@@ -239,7 +243,8 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
         unit: Unit of the mesh, the views and the cameras.
         config: Settings.
     """
-    before = sanitise(read_mesh(mesh, unit), str(mesh))
+    found = read_surface(mesh, unit)
+    before = found if found.is_edge_manifold else _manifold(found, mesh)
     seen = _read_views(views, unit) if views else ()
     holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
@@ -278,8 +283,11 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         if wrong:
             raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         return _reduce_set(mesh, output, faces, of_set)
-    before = sanitise(read_mesh(mesh, unit), str(mesh))
-    keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
+    given = sanitise(read_mesh(mesh, unit), str(mesh))
+    before, keep = _manifold(given, mesh), None
+    if landmarks:
+        places = {name: given.vertices[v] for name, v in read_landmark_vertices(landmarks, given, unit).items()}
+        keep = np.array(list(carry_landmarks(places, before)[0].values()))
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)
     write_mesh(output, after)

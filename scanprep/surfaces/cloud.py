@@ -1,10 +1,13 @@
 """Point clouds made meshes: what a scanner without triangles gives, for everything that needs a surface."""
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..geometry.files import PointCloud
+from ..geometry.files import PointCloud, read_points, read_scan
 from ..geometry.mesh import Mesh
 from ..repair.manifold import repair
 
@@ -50,6 +53,15 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
     if surface.with_vertices(surface.vertices - np.median(surface.vertices, axis=0)).volume < 0:
         surface = Mesh(surface.vertices, np.ascontiguousarray(surface.faces[:, ::-1]))
     return surface
+
+
+def read_surface(path: Path, unit: str | None = None) -> Mesh:
+    """The mesh of a scan, made sound; of a file without triangles the surface through its points, with a warning."""
+    found = read_scan(path, unit)
+    if isinstance(found, Mesh):
+        return found
+    warnings.warn(f"{path} has no triangles: its points are meshed, and left open where there are none", stacklevel=2)
+    return mesh_of_cloud(read_points(path, unit))
 
 
 def mesh_of_view(view: PointCloud | np.ndarray) -> tuple[Mesh, np.ndarray]:

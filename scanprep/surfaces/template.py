@@ -157,13 +157,16 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     """Smooth, fill and decimate an open surface."""
     tell, notes = progress or (lambda done, total: None), list[str]()
     tell(1, 4)
-    scanned = mesh = smooth(repair(mesh), config.smoothing)      # smooth rims make fair patches
+    mesh = repair(mesh)
+    # as wide as on merged views: on coarse scans as many rounds would round off fingers
+    rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
+    scanned = mesh = smooth(mesh, rounds)                        # smooth rims make fair patches
     holes = len(mesh.boundary_loops)
     if holes:
         notes.append(f"{holes} holes were filled")
     tell(2, 4)
     mesh = close(mesh, config.fill)
-    mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), config.smoothing)
+    mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), rounds)
     tell(3, 4)
     surface = Surface(mesh)
     if mesh.volume < 0:
@@ -179,8 +182,7 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     if template_problem(small):                                  # a triangle that decimation left without area
         small = close(small, config.fill)
     check_template(small, what)
-    edge = scanned.mean_edge
-    far = cKDTree(scanned.vertices).query(small.corners.mean(axis=1))[0] > 2 * edge + 0.5 * small.mean_edge
+    far = Surface(scanned).closest(small.corners.mean(axis=1)).distances > scanned.mean_edge
     tell(4, 4)
     handles = 1 - (len(small.vertices) - len(small.edges) + len(small.faces)) // 2
     return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), handles,
