@@ -17,13 +17,13 @@ from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, ju
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import Judgement
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
+from scanprep.surfaces.cloud import read_surface
 
 from ..files import load_model
 from ..motion.onto import read_motion
@@ -160,7 +160,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     with warnings.catch_warnings():
         if sought:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        scan, texture = sanitise(read_mesh(inputs.scan, unit), str(inputs.scan)), read_texture(inputs.scan, unit)
+        scan, texture = read_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
     metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
