@@ -22,11 +22,12 @@ Progress = Callable[[int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """One row of the closing table."""
+    """One row of the closing table; a `detail` stands in the page and in report.json only."""
 
     name: str
     value: float | int | str
     unit: str = ""
+    detail: bool = False
 
     def text(self) -> str:
         """The value as printed: three significant digits for a fraction, "none" where there is no value."""
@@ -51,6 +52,7 @@ class Outcome:
     judgement: Judgement | None = None
 
 
+MOST_ROWS = 12                       # of the closing table: what is read at a glance
 JUDGEMENT = "judgement"              # name of the row of figures that says what they are worth
 
 
@@ -111,20 +113,30 @@ def _display() -> Iterator[Any]:
             _open_displays.pop()
 
 
+def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]]:
+    """The rows that the closing table shows, in order and at most twelve, and the rest."""
+    metrics = list(metrics)
+    main = [m for m in metrics if not m.detail][:MOST_ROWS]
+    return main, [m for m in metrics if m not in main]
+
+
 def say(text: str) -> None:
     """One line on standard error, for what a user should know while a command runs."""
     sys.stderr.write(text + "\n")
 
 
 def show(metrics: list[Metric]) -> None:
-    """Print the closing table of metric, value, unit."""
+    """Print the closing table of figure, value, unit: what comes first, and how many more there are."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("metric", "value", "unit")
+    table = Table("figure", "value", "unit")
     table.columns[1].justify = "right"
-    for metric in metrics:
+    main, more = split_figures(metrics)
+    for metric in main:
         table.add_row(metric.name, metric.text(), metric.unit)
+    if more:
+        table.caption = f"{len(more)} more in report.json"
     Console().print(table)
 
 
