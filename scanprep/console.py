@@ -53,6 +53,11 @@ class Outcome:
 
 
 MOST_ROWS = 12                       # of the closing table: what is read at a glance
+def details(metrics: Iterable[Metric]) -> list[Metric]:
+    """The same rows for the page and report.json only."""
+    return [dataclasses.replace(m, detail=True) for m in metrics]
+
+
 JUDGEMENT = "judgement"              # name of the row of figures that says what they are worth
 
 

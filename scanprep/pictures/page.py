@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..console import Metric, split_figures
+from ..console import JUDGEMENT, Metric, judgement_of, split_figures
 from ..geometry.storage import write
 from ..judgement import Judgement
 from .scene import Pane, framed_alike, pack_scene, picture_panes
@@ -41,6 +41,7 @@ class Page:
     def __init__(self, title: str, lead: str = "") -> None:
         self.title, self.lead = title, lead
         self._parts: list[str] = []
+        self._verdict = ""
         self._styles: list[str] = []
         self._sections: list[str] = []
         self._scenes: list[bytes] = []
@@ -57,10 +58,10 @@ class Page:
         return self
 
     def verdict(self, judgement: Judgement, following: str = "") -> Page:
-        """What the result is worth, in one word with its reasons, and what to do next in one sentence."""
+        """On top of the page: what the result is worth in one word, why, and what to do next in one sentence."""
         reasons = f": {_with_code(judgement.why)}" if judgement.reasons else ""
         below = f"<br>{_with_code(following)}" if following else ""
-        self._parts.append(f'<p class="verdict {judgement.verdict}"><b>{judgement.verdict}</b>{reasons}{below}</p>')
+        self._verdict = f'<p class="verdict {judgement.verdict}"><b>{judgement.verdict}</b>{reasons}{below}</p>\n'
         return self
 
     def markup(self, html: str, style: str = "") -> Page:
@@ -96,8 +97,11 @@ class Page:
         return still.replace("<figure>", f'<figure data-scene="scene{len(self._scenes)}" data-height="{height}">', 1)
 
     def figures(self, metrics: Sequence[Metric], header: Sequence[str] = ("figure", "value", "unit")) -> Page:
-        """The table of figures that a command prints; what it leaves out is folded below it."""
-        main, more = split_figures(metrics)
+        """The table of figures that a command prints, what it leaves out folded below, and its verdict on top."""
+        judgement = judgement_of(metrics)
+        if judgement is not None:
+            self.verdict(judgement)
+        main, more = split_figures(m for m in metrics if m.name != JUDGEMENT)
         self.table([(m.name, m.text(), m.unit) for m in main], header)
         if more:
             self._parts.append("<details><summary>more figures</summary>")
@@ -132,7 +136,7 @@ class Page:
         return (f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
                 f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
                 f"<title>{escape(self.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
-                f"<header><h1>{escape(self.title)}</h1>{lead}{nav}</header>\n"
+                f"<header><h1>{escape(self.title)}</h1>{lead}{self._verdict}{nav}</header>\n"
                 + "\n".join(self._parts) + "\n</main>\n" + self._viewer() + "</body>\n</html>\n")
 
     def _viewer(self) -> str:
