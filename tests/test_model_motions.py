@@ -83,7 +83,7 @@ def test_another_skeleton_points_the_same_way_on_another_body(tmp_path):
     assert degrees(found.poses, poses) < 0.05, "whatever way the file is turned, it faces where the body did at rest"
     assert apart(mean.vertices(found.poses, found.trans), mean.vertices(poses)) < 0.01
     assert found.brought.scale == pytest.approx(2.54, rel=1e-3) and not found.brought.lacking
-    assert found.brought.matched["abdomen"] == "LowerBack to Spine" and found.brought.matched["l_shin"] == "LeftLeg"
+    assert found.brought.matched["abdomen"] == "LowerBack to Spine" and found.brought.matched["shin_left"] == "LeftLeg"
     heavy = model.subject(np.array([1.5, -1.0]))
     other = read_motion(path, model, heavy)
     assert apart(heavy.vertices(other.poses, other.trans), heavy.vertices(poses)) < 3      # bones at rest differ

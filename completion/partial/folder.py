@@ -15,6 +15,7 @@ from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, failures_of, judgement_of
+from scanprep.geometry.files import name_of
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import SCENE, worst_that_turn
 from scanprep.pictures.sheets import small_picture
@@ -72,7 +73,7 @@ def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> d
         raise ValueError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
     found = {}
     for task in find_scans(folder, landmarks):
-        mine = sorted(p for p in masks.iterdir() if p.name.split(".")[0] == task.name) if masks else []
+        mine = sorted(p for p in masks.iterdir() if name_of(p) == task.name) if masks else []
         found[task.name] = Inputs((task.scan,), task.landmarks, tuple(mine[:1]))
     return found
 

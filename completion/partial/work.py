@@ -18,8 +18,9 @@ from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.format_common import UNITS
-from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
@@ -96,7 +97,8 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
         depth = read_picture(inputs.scans, work.unit)
         files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
-        named = read_landmarks(inputs.landmarks, files.mesh, work.unit) if inputs.landmarks else {}
+        surface = files.mesh or (all_points(files.views) if files.views else None)
+        named = read_landmarks(inputs.landmarks, surface, work.unit) if inputs.landmarks else {}
         landmarks = _landmarks(work, inputs.landmarks, named)
         masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
     if depth is not None:
@@ -169,13 +171,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
 
 
 def _landmarks(work: Work, file: Path | None, named: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-    if file is None:
-        return None
-    try:
-        _, vertices, points = match_landmarks(work.marks, named)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-    return vertices, points
+    return None if file is None else shared_landmarks(file, work.marks, named)
 
 
 def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -> Completion:
@@ -230,7 +226,7 @@ def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
     if path.suffix.lower() in POINT_ENDINGS:
         return read_points(path, unit)
     try:
-        return read_mesh(path, unit)
+        return sanitise(read_mesh(path, unit), str(path))
     except ValueError as error:
         if "no faces" in str(error):
             return read_points(path, unit)

@@ -11,7 +11,7 @@ import numpy as np
 from model.priors import sample_poses
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
-from scanprep.geometry.files import write_mesh
+from scanprep.geometry.files import name_of, write_mesh
 from scanprep.pictures.camera import upright
 from scanprep.ranges import Beta, Positive
 
@@ -133,14 +133,14 @@ def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans:
 
 
 def _kind(output: Path) -> str:
-    ending = "".join(output.suffixes).lower()
-    if ending.endswith(_MESHES):
+    name = output.name.lower()
+    if name.endswith(_MESHES):
         return "mesh"
     if output.suffix.lower() in USD:
-        return "point cache" if ".points" in ending else "usd"
+        return "point cache" if name_of(name).endswith(".points") else "usd"
     if output.suffix.lower() in (".glb", ".bvh", ".npz"):
         return output.suffix.lower()[1:]
-    if output.suffix and not output.is_dir():
+    if name_of(output) != output.name and not output.is_dir():
         raise ValueError(f"{output}: expected a name ending in .glb, .bvh, .npz, .usd, {', '.join(_MESHES)}, "
                          "or a folder")
     return "folder"

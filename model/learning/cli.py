@@ -15,7 +15,7 @@ from scanprep.batch.workspace import KeptSteps
 from scanprep.cli import Output, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar, details
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry.files import list_meshes
+from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
@@ -159,7 +159,7 @@ def _read_sexes(folder: Path) -> list[str]:
         raise ValueError(f"{folder}: a plain folder does not say the sex; write {SEXES} in it, with the columns "
                          "name,sex")
     table = {row["name"]: row["sex"] for _, row in read_table(path, ("name", "sex"))}
-    names = [mesh.name.split(".")[0] for mesh in list_meshes(folder)]
+    names = [name_of(mesh) for mesh in list_meshes(folder)]
     if not any(name in table for name in names):
         raise ValueError(f"{path}: none of its names is a mesh of {folder}")
     return [table.get(name, "") for name in names]

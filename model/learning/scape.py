@@ -13,7 +13,7 @@ from scanprep.batch.pool import SideBySide
 from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
-from scanprep.skeleton.names import joint_in_words
+from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 

@@ -17,6 +17,7 @@ from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, ju
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import Judgement
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
@@ -159,7 +160,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     with warnings.catch_warnings():
         if sought:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        scan, texture = read_mesh(inputs.scan, unit), read_texture(inputs.scan, unit)
+        scan, texture = sanitise(read_mesh(inputs.scan, unit), str(inputs.scan)), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
     metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))

@@ -16,9 +16,10 @@ from ..decimation.decimate import DecimateConfig, decimate
 from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
-from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, read_scan, write_mesh, write_points
+from ..geometry.files import UNITS, PointCloud, list_meshes, name_of, read_mesh, read_scan, write_mesh, write_points
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
+from ..geometry.sanitise import sanitise
 from ..judgement import Judgement
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
@@ -89,8 +90,9 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         unit: Unit of the views, cameras and landmarks.
         config: Settings.
     """
-    seen, names = _read_views(views, unit), [path.stem for path in list_meshes(views)]
-    marks = [_view_landmarks(landmarks, name, mesh, unit) for name, (mesh, _) in zip(names, seen, strict=True)] \
+    seen, paths = _read_views(views, unit), list_meshes(views)
+    names = [name_of(path) for path in paths]
+    marks = [_view_landmarks(landmarks, path, mesh, unit) for path, (mesh, _) in zip(paths, seen, strict=True)] \
         if landmarks else None
     found = align_views(seen, config, landmarks=marks, features=features)
     for name, (mesh, _) in zip(names, found.views, strict=True):
@@ -109,10 +111,10 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         Judgement.of(views_problem(found)))
 
 
-def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
+def _view_landmarks(folder: Path, path: Path, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
     """The landmarks of one view; none where it has no file."""
-    path = landmarks_beside(name, folder)
-    return read_landmarks(path, view, unit) if path else {}
+    marks = landmarks_beside(path, folder)
+    return read_landmarks(marks, view, unit) if marks else {}
 
 
 def merge(views: ViewsArg, output: Output, unit: Unit | None = None,
@@ -148,7 +150,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
         unit: Unit of the mesh, the views and the cameras.
         config: Settings.
     """
-    before = read_mesh(mesh, unit)
+    before = sanitise(read_mesh(mesh, unit), str(mesh))
     seen = _read_views(views, unit) if views else ()
     holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
@@ -187,7 +189,7 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         if wrong:
             raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         return _reduce_set(mesh, output, faces, of_set)
-    before = read_mesh(mesh, unit)
+    before = sanitise(read_mesh(mesh, unit), str(mesh))
     keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)
@@ -210,9 +212,9 @@ def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]
     where = storage.read_json(given, "camera positions {name: [x, y, z]}")
     paths = list_meshes(folder)
     with storage.taking_apart(given, "camera positions {name: [x, y, z]} in JSON"):
-        missing = [path.stem for path in paths if path.stem not in where]
+        missing = [name_of(path) for path in paths if name_of(path) not in where]
         if missing:
             raise ValueError(f"none for {', '.join(missing)}")
         where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
-        places = [UNITS[unit or "m"] * storage.numbers(where, path.stem, 3) for path in paths]
+        places = [UNITS[unit or "m"] * storage.numbers(where, name_of(path), 3) for path in paths]
     return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]

@@ -4,13 +4,13 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from ..depth_camera.picture import is_picture, read_depth
-from ..geometry.files import UNITS, read_scan
+from ..geometry.files import UNITS, name_of, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
@@ -43,7 +43,7 @@ class Clicked:
     def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
         """With the landmarks of its file, or of that of its name beside it; else one of this ending will be written."""
         file = file or landmarks_beside(path)
-        one = cls(path, file or path.with_name(path.name.split(".")[0] + ending), unit)
+        one = cls(path, file or path.with_name(name_of(path) + ending), unit)
         if file is not None:
             one.places = one._read(file)
         return one
@@ -53,8 +53,7 @@ class Clicked:
         if not file.name.endswith((".mrk.json", ".fcsv")):       # which may be in another frame: the mesh tells
             with contextlib.suppress(ValueError):
                 return read_landmarks(file, None, self.unit)
-        shape = self.body.shape
-        places = read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit)
+        places = read_landmarks(file, self.body.shape, self.unit)
         self.forget()
         return places
 
@@ -140,9 +139,8 @@ def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], bod
     corners = template.faces[nearest.faces]
     vertices = corners[np.arange(len(corners)), nearest.bary.argmax(axis=1)]
     of_name = dict(zip(on_template, vertices.tolist(), strict=True))
-    config = RegistrationConfig()              # without its last steps: two thirds of the time, 7 mm instead of 6
-    config = replace(config, graph=config.graph[:-1], final_fit=None)
     fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
-                                          np.array([on_scan[name] for name in common])), config, progress)
+                                          np.array([on_scan[name] for name in common])),
+                   RegistrationConfig.quick(), progress)
     moved = nearest.transferred(fit.mesh.vertices, template.faces)
     return {name: body.nearest(place) for name, place in zip(on_template, moved, strict=True)}
