@@ -102,7 +102,7 @@ def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError]
 
 
 def write(path: str | Path, data: bytes | str) -> None:
-    """Write a file, whole or not at all; text as UTF-8, where it has bytes of a name that is none, they as `\\udce9`."""
+    """Write a file, whole or not at all; text as UTF-8, and as `\\udce9` what is none of it in the name of a file."""
     with writing(path) as beside:
         beside.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
