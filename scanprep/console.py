@@ -110,7 +110,8 @@ def _display() -> Iterator[Any]:
         yield _open_displays[-1]
         return
     columns = (progress.TextColumn("{task.description:<34}", markup=False), progress.BarColumn(),
-               progress.MofNCompleteColumn(), progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn())
+               progress.MofNCompleteColumn(), progress.TimeElapsedColumn(), progress.TextColumn("left"),
+               progress.TimeRemainingColumn())
     with progress.Progress(*columns, console=Console(stderr=True)) as shown:
         _open_displays.append(shown)
         try:
