@@ -192,7 +192,7 @@ def _notes(prog: str) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=r"(scanprep|model|completion)(\.|$)")
-        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {message}")
+        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {' '.join(str(message).split())}")
         yield
 
 

@@ -27,14 +27,15 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
         full: A large run: more scans, finer.
         seed: Another seed scans other people.
     """
-    from .figures import figures
+    from .figures import figures, judge
     from .page import write_page
 
     if quick and full:
         raise ValueError("--quick, --full: expected at most one of the two")
     run = Demo(space, replace(QUICK if quick else FULL if full else DemoConfig(), seed=seed), bar)
     metrics = figures(run)
+    judgement = judge(run, metrics)
     with bar("drawing the report") as progress, space.staging("page") as staged:
-        write_page(run, metrics, progress, staged.folder)
+        write_page(run, metrics, judgement, progress, staged.folder)
     say(f"open {out / 'report.html'} in a browser; {out / 'animation' / 'walk.glb'} in any 3D viewer")
-    return Outcome(out, metrics, {"demo": run.config})
+    return Outcome(out, metrics, {"demo": run.config}, judgement=judgement)

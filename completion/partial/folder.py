@@ -16,7 +16,7 @@ from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, failures_of, judgement_of
 from scanprep.geometry.files import name_of
-from scanprep.pictures.page import Page
+from scanprep.pictures.page import Page, link_to
 from scanprep.pictures.scene import SCENE, worst_that_turn
 from scanprep.pictures.sheets import small_picture
 from scanprep.pipeline.scans import find_scans
@@ -124,9 +124,9 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
     turning = worst_that_turn([folder / name / SCENE for name in names])
     for name, scene in zip(names, turning, strict=True):
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
-        shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
+        shown = f'<img src="{link_to(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
             page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
+        title = f'<a href="{link_to(name)}/report.html"><b>{escape(name)}</b></a>'
         page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
     return page
 

@@ -13,7 +13,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
-from scanprep.console import Metric, Outcome, judgement_row, write_report
+from scanprep.console import Metric, Outcome, details, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
@@ -123,11 +123,10 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
     metrics = [judgement_row(done.judgement), *figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
-    rows = [(m.name, m.value, m.unit) for m in metrics]
     name = ", ".join(path.name for path in inputs.scans)
     panes = completion_panes(views, done, work.body.template, masked, landmarks,
                              {vertex: name for name, vertex in work.marks.items()})
-    completion_page(panes, name, rows, picture, masked is not None).write(output / "report.html")
+    completion_page(panes, name, metrics, picture, masked is not None).write(output / "report.html")
     if work.command:
         storage.write(output / SCENE, small_scene(panes))
     return metrics
@@ -136,22 +135,24 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
 def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.ndarray, np.ndarray] | None,
             masked: np.ndarray | None) -> list[Metric]:
     """The rows of the closing table."""
-    rows = [Metric("distance of the scan to the completed mesh, RMS", MM * done.rms, "mm"),
-            Metric("scan points explained", 100 * done.explained, "%"),
-            Metric("vertices with data", 100 * float(done.seen.mean()), "%")]
+    rows = [Metric("share of the scan that lies on the body", 100 * done.explained, "%"),
+            Metric("share of the body that was measured", 100 * float(done.seen.mean()), "%")]
+    if done.expected_error is not None:
+        rows.insert(0, Metric("expected error of the body, mean", MM * float(np.nanmean(done.expected_error)), "mm"))
     if landmarks is None:
         rows.append(Metric("landmarks used", "none"))
     else:
         rows += [Metric("landmarks used", len(landmarks[0])),
-                 Metric("distance of landmarks, predicted mesh, RMS", MM * done.landmark_rms, "mm")]
+                 Metric("landmarks to the model's own body, RMS", MM * done.landmark_rms, "mm")]
     if len(inputs.scans) > 1:
         rows.append(Metric("views", len(inputs.scans)))
     if masked is not None:
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
-    return [*rows, Metric("converged", "yes" if done.converged else "no"), Metric("rounds", done.iterations),
-            Metric("model", work.model)]
+    return [*rows, Metric("what the scan leaves beside the body that was bent onto it, RMS", MM * done.rms, "mm"),
+            Metric("model", work.model), *details([Metric("settled", "yes" if done.converged else "no"),
+                                                   Metric("rounds", done.iterations)])]
 
 
 def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> np.ndarray | None:

@@ -13,7 +13,7 @@ from scanprep.batch.opening import FileWorkspace
 from scanprep.batch.room import Step, T, inside
 from scanprep.batch.workspace import KeptSteps
 from scanprep.cli import Output, Unit, read_poses
-from scanprep.console import Metric, Outcome, bar
+from scanprep.console import Metric, Outcome, bar, details
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
@@ -104,11 +104,11 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         kept.save(path)
         _draw(kept, path)
     return Outcome(output, [
-        Metric("kind", models["neutral"].kind), Metric("poses", len(posed)),
-        Metric("people", 0 if people is None else len(people)), Metric("triangles", len(body.faces)),
-        Metric("parts", len(tree.parents)), *about(models["neutral"]),
+        *about(models["neutral"]), Metric("poses", len(posed)),
+        Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
-        *_times(seconds, kept_steps.found)],
+        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)),
+                  *_times(seconds, kept_steps.found)])],
         {"scape": scape, "skinning": skinning, "mixed": mixed}, 
         judgement=judge_model(models["neutral"], people))
 

@@ -136,7 +136,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
             Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]
     picture = statue_picture(scan, statue, levels[-1])
     save_png(folder / "picture.png", picture)
-    statue_page(name, scan, statue, levels, [(m.name, m.value, m.unit) for m in rows], adaptive, in_motion(statue),
+    statue_page(name, scan, statue, levels, rows, adaptive, in_motion(statue),
                 picture).write(folder / "report.html")
     return rows
 
