@@ -71,7 +71,8 @@ def write_user_scan(folder: Path, name: str, truth: GroundTruth, config: Scanner
     seen = scan(truth.mesh, config, rng).merged
     write_mesh(folder / f"{name}{ending}", as_scanned(seen, rng))
     places = click_landmarks(truth, rng, seen=seen.vertices)
-    write_landmarks(folder / f"{name}.pp", {said: places[ours] for said, ours in CLICKED.items() if ours in places}, "mm")
+    clicked = {said: places[ours] for said, ours in CLICKED.items() if ours in places}
+    write_landmarks(folder / f"{name}.pp", clicked, "mm")
 
 
 def write_user_files(work: Path) -> None:
@@ -133,7 +134,8 @@ def carried_out(python: str, words: tuple[str, ...], work: Path) -> Step:
     judged = json.loads(report.read_text(encoding="utf-8"))["judgement"] if report.exists() else None
     verdict = f"{judged['verdict']}: {'; '.join(judged['reasons'])}" if judged else ""
     last = (done.stderr.strip().splitlines() or [""])[-1]
-    return Step("scape " + " ".join(f'"{w}"' if " " in w else w for w in words), minutes, done.returncode, verdict, last)
+    command = " ".join(f'"{word}"' if " " in word else word for word in ("scape", *words))
+    return Step(command, minutes, done.returncode, verdict, last)
 
 
 def fresh_python(work: Path) -> tuple[str, float]:
