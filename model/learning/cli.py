@@ -110,7 +110,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)),
                   *_times(seconds, kept_steps.found)])],
         {"scape": scape, "skinning": skinning, "mixed": mixed}, 
-        judgement=judge_model(models["neutral"], people))
+        judgement=judge_model(models["neutral"], people),
+        following=f"look at it: scape view {output}")
 
 
 def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: Step, progress: Progress) -> Skeleton:

@@ -80,7 +80,9 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
                              "humanoid is found by itself")
         with bar("fitting the statue") as progress:
             done = space.run(work, [Task("statue", ScanTask("statue", scan, features))], inside=progress).only
-        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done))
+        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}, then "
+                                 f"scape statue animate {output} walk.bvh -o walking")
     if features is not None and not features.is_dir():
         raise ValueError(f"--features: expected a folder for a folder of scans, got {features}")
     work = replace(work, command=f"scape statue fit {scan}")

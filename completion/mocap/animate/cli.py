@@ -81,7 +81,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     if markers.is_file():
         with bar("following the markers") as following:
             done = space.run(work, [Task("motion", markers)], inside=following).only
-        return Outcome(output, done, settings, judgement=judgement_of(done))
+        return Outcome(output, done, settings, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
     with bar("files") as progress:
         results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
     with space.staging("page") as staged:

@@ -93,7 +93,8 @@ def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str
         _page(actors, metrics, failures).write(staged.folder / "report.html")
         call.write(staged.folder / HOME)
     settings = {"mosh": call.config, "model": loaded.name, "layout": call.layout, "held out": call.hold_out}
-    return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures)
+    return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures,
+                   following=f"open {space.folder / 'report.html'}")
 
 
 def _keep_table(space: Workspace, actors: Sequence[Actor], subjects: str) -> None:
