@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import sys
 
+from scanprep.interrupts import leave_at_once
+
 COMMANDS = {
     "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
@@ -26,19 +28,17 @@ COMMANDS = {
 
 def main(argv: list[str] | None = None) -> int:
     """The command line."""
-    argv = sys.argv[1:] if argv is None else argv
-    try:                                    # Ctrl-C may come before the libraries are loaded
-        from scanprep.command_line import dispatch
+    if argv is None:
+        argv = sys.argv[1:]
+        leave_at_once()
+    if argv in (["--version"], ["-V"]):
+        from importlib.metadata import version
 
-        if argv in (["--version"], ["-V"]):
-            from importlib.metadata import version
+        sys.stdout.write(f"scapekit {version('scapekit')}\n")
+        return 0
+    from scanprep.command_line import dispatch
 
-            sys.stdout.write(f"scapekit {version('scapekit')}\n")
-            return 0
-        return dispatch(COMMANDS, "scape", argv, "From raw 3D body scans to moving people.")
-    except KeyboardInterrupt:
-        sys.stderr.write("scape: interrupted; nothing was written\n")
-        return 130
+    return dispatch(COMMANDS, "scape", argv, "From raw 3D body scans to moving people.")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from . import config_files, ranges
 from .arguments import Argument, UsageError, make_parser, near, read_line, sentences
 from .config_files import Flag
 from .console import JUDGEMENT, Metric, Outcome, say, show, write_report
+from .interrupts import tidy_up
 from .threads import one_thread
 
 OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
@@ -43,6 +44,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
                 return 0
             call = _Call(function, prog, argv)
             wrong = 1
+            tidy_up()
             outcome, report = call.carried_out(start)
         except KeyboardInterrupt:
             goes_on = call is not None and call.wants_space

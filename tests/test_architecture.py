@@ -18,7 +18,7 @@ WITH_EQUATIONS = {"SCAPE": 11, "Statues": 23, "MoSh": 27}  # the papers at hand,
 HEAVY = {"open3d", "pymeshlab", "matplotlib", "PIL", "trimesh", "ezc3d", "igl", "cholespy", "embreex", "pygltflib",
          "fast_simplification", "rich", "skimage", "sklearn"}
 ONE_FILE_EACH = {"pymeshlab", "open3d", "ezc3d"}
-SPEAKS = {"cli.py", "command_line.py", "console.py", "__main__.py"}
+SPEAKS = {"cli.py", "command_line.py", "console.py", "interrupts.py", "__main__.py"}
 
 
 @functools.cache
