@@ -67,6 +67,8 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
               Metric("time", time.perf_counter() - start, "s")])
     if outcome.output is not None:
         say(call.real(f"written: {outcome.output}" + (f" (figures in {report})" if report else "")))
+    if outcome.following and not failed:
+        say(f"next: {call.real(outcome.following)}")
     for failure in outcome.failures:
         say(call.real(f"{prog}: failed: {failure}"))
     return 1 if outcome.failures or failed else 0
@@ -211,7 +213,7 @@ def _notes(prog: str) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=r"(scanprep|model|completion)(\.|$)")
-        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {message}")
+        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {' '.join(str(message).split())}")
         yield
 
 

@@ -80,7 +80,9 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
     with bar("completing") as progress:
         done = space.run(work, [Task("completion", inputs)], inside=progress).only
-    return Outcome(output, done, {"complete": config, "model": name}, judgement=judgement_of(done))
+    return Outcome(output, done, {"complete": config, "model": name}, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}, then scape measure {output} "
+                                 f"-m {model or 'MODEL.npz'} -o measures.csv")
 
 
 def _folder(call: FolderCall, space: Workspace, workers: Workers) -> Outcome:

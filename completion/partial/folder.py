@@ -16,7 +16,8 @@ from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, failures_of, judgement_of
-from scanprep.pictures.page import Page
+from scanprep.geometry.files import name_of
+from scanprep.pictures.page import Page, link_to
 from scanprep.pictures.scene import SCENE, worst_that_turn
 from scanprep.pictures.sheets import small_picture
 from scanprep.pipeline.scans import find_scans
@@ -73,7 +74,7 @@ def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> d
         raise UsageError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
     found = {}
     for task in find_scans(folder, landmarks):
-        mine = sorted(p for p in masks.iterdir() if p.name.split(".")[0] == task.name) if masks else []
+        mine = sorted(p for p in masks.iterdir() if name_of(p) == task.name) if masks else []
         found[task.name] = Inputs((task.scan,), task.landmarks, tuple(mine[:1]))
     return found
 
@@ -124,9 +125,9 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
     turning = worst_that_turn([folder / name / SCENE for name in names])
     for name, scene in zip(names, turning, strict=True):
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
-        shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
+        shown = f'<img src="{link_to(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
             page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
+        title = f'<a href="{link_to(name)}/report.html"><b>{escape(name)}</b></a>'
         page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
     return page
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
-from scanprep.geometry.files import MeshFileError, PointCloud, read_points, write_mesh
+from scanprep.geometry.files import MeshFileError, PointCloud, name_of, read_points, write_mesh
 
 from ..motion import Progress
 from .sequence import TrackedFrame, Tracker, TrackerState, without_points
@@ -100,7 +100,7 @@ def _numbered(paths: list[Path]) -> dict[int, Path]:
     """Files by the last number in their names."""
     out: dict[int, Path] = {}
     for path in paths:
-        digits = re.findall(r"\d+", path.name.split(".")[0])
+        digits = re.findall(r"\d+", name_of(path))
         if not digits:
             raise ValueError(f"{path}: expected the number of the frame in its name")
         number = int(digits[-1])

@@ -13,7 +13,7 @@ from scanprep.cli import Output, Person, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
+from scanprep.geometry.landmarks import read_landmarks, shared_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
@@ -112,11 +112,7 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
 def _landmarks(model: BodyModel, path: Path | None, scan: Mesh | np.ndarray, unit: Unit | None) -> Landmarks | None:
     if path is None or not model.info.get("landmarks"):
         return None
-    found = read_landmarks(path, scan if isinstance(scan, Mesh) else None, unit)
-    try:
-        return match_landmarks(model.info["landmarks"], found)[1:]
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    return shared_landmarks(path, model.info["landmarks"], read_landmarks(path, scan, unit))
 
 
 def _starts(first: Path | None, model: BodyModel, names: Sequence[str]) -> list[np.ndarray | None]:

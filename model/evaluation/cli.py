@@ -70,8 +70,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     metrics += [Metric("note", note) for note in notes]
     _write_tables(output, loaded, found)
     with bar("drawing the page") as progress:
-        page = evaluation_page(model.stem, loaded, found, [(m.name, m.value, m.unit) for m in metrics
-                                                           if m.name != "note"], notes, progress)
+        page = evaluation_page(model.stem, loaded, found, [m for m in metrics if m.name != "note"], notes, progress)
     page.write(output / "report.html")
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
                                      "train_shapes": train_shapes, "subject": subject},

@@ -24,6 +24,7 @@ from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
+from scanprep.surfaces.cloud import read_surface
 
 from ..files import load_model
 from ..motion.onto import read_motion
@@ -80,7 +81,9 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
                              "humanoid is found by itself")
         with bar("fitting the statue") as progress:
             done = space.run(work, [Task("statue", ScanTask("statue", scan, features))], inside=progress).only
-        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done))
+        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}, then "
+                                 f"scape statue animate {output} walk.bvh -o walking")
     if features is not None and not features.is_dir():
         raise UsageError(f"--features: expected a folder for a folder of scans, got {features}")
     work = replace(work, command=f"scape statue fit {scan}")
@@ -136,7 +139,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
             Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]
     picture = statue_picture(scan, statue, levels[-1])
     save_png(folder / "picture.png", picture)
-    statue_page(name, scan, statue, levels, [(m.name, m.value, m.unit) for m in rows], adaptive, in_motion(statue),
+    statue_page(name, scan, statue, levels, rows, adaptive, in_motion(statue),
                 picture).write(folder / "report.html")
     return rows
 
@@ -160,7 +163,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     with warnings.catch_warnings():
         if sought:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        scan, texture = read_mesh(inputs.scan, unit), read_texture(inputs.scan, unit)
+        scan, texture = read_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
     metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))

@@ -64,7 +64,9 @@ def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], 
         call.write(staged.folder)
     return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(judge_set(space.folder)),
                                   Metric("unit assumed", call.config.scan.unit or "m")],
-                   {"prepare": call.config}, list(done.failures))
+                   {"prepare": call.config}, list(done.failures),
+                   following=f"open {space.folder / 'report.html'}, then "
+                             f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
 
 def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B008

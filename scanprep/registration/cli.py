@@ -18,7 +18,13 @@ from ..correspondence.correspondences import (
 )
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_mesh, read_scan, write_mesh
-from ..geometry.landmarks import landmarks_beside, match_landmarks, read_landmarks, read_template_landmarks
+from ..geometry.landmarks import (
+    landmarks_beside,
+    match_landmarks,
+    read_landmarks,
+    read_template_landmarks,
+    shared_landmarks,
+)
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from .limbs import limb_doubts
@@ -145,8 +151,8 @@ def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path 
     """Vertices of the template and points of the scan that carry the same names."""
     if landmarks is None:
         return None
-    found = read_landmarks(landmarks, data if isinstance(data, Mesh) else None, unit)
-    return match_landmarks(read_template_landmarks(template, body, template_landmarks), found)[1:]
+    found = read_landmarks(landmarks, data, unit)
+    return shared_landmarks(landmarks, read_template_landmarks(template, body, template_landmarks), found)
 
 
 def _led_by(landmarks: Path | None, pairs: Landmarks | None) -> list[Metric]:

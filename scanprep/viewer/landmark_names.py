@@ -4,10 +4,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..arguments import UsageError
+from ..geometry.landmark_names import TEN
 from ..geometry.sides import other_side
-
-TEN = ("top of head", "navel", "left middle finger", "right middle finger", "left toe", "right toe",
-       "left elbow outside", "right elbow outside", "left knee", "right knee")
 
 _MIDDLE = ("Sellion", "Supramenton", "Nuchale", "Suprasternale", "Substernale", "Cervicale", "10th Rib Midspine",
            "Waist, Preferred, Post.", "Crotch")

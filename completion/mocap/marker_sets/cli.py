@@ -16,7 +16,7 @@ from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmark_writing import marker_set
-from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
+from scanprep.geometry.landmarks import read_landmarks, read_template_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.registration.person import average_person
 from scanprep.skeleton.tree import Skeleton
@@ -129,10 +129,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
     if landmarks is not None:
         marks = synthetic_landmarks() if source is None and source_landmarks is None else read_template_landmarks(
             source or Path("average person"), ours, source_landmarks, "--source-landmarks")
-        try:
-            pairs = match_landmarks(marks, read_landmarks(landmarks, theirs, unit))[1:]
-        except ValueError as error:
-            raise ValueError(f"{landmarks}: {error}") from None
+        pairs = shared_landmarks(landmarks, marks, read_landmarks(landmarks, theirs, unit))
     with bar("registering") as progress:
         result = transfer_layout(found, ours, theirs, pairs, progress=progress)
     result.layout.save(output)
