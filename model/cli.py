@@ -48,6 +48,9 @@ def info(model: ModelArg) -> Outcome:
     """What a model holds and how it was made.
 
     Example: scape model info model.npz
+
+    Args:
+        model: Model file.
     """
     loaded = load_model(model)
     facts = [Metric(name.replace("_", " "), value) for name, value in loaded.info.items()

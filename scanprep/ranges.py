@@ -65,7 +65,8 @@ class Settings:
     """Base of settings: a frozen dataclass whose numbers are in their ranges, or it is not made."""
 
     def __post_init__(self) -> None:
-        for name, allowed in ranges(type(self)).items():
+        owner: Any = type(self)
+        for name, allowed in ranges(owner).items():
             allowed.check(getattr(self, name), name)
 
 

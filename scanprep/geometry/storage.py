@@ -198,7 +198,7 @@ def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool 
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"{path}: expected arrays of numbers or text, {name} holds objects")
     with writing(path) as beside, open(beside, "wb") as out:
-        (np.savez_compressed if compress else np.savez)(out, **arrays)
+        (np.savez_compressed if compress else np.savez)(out, **arrays)     # type: ignore[arg-type]
 
 
 def load_arrays(path: str | Path, what: str = "an .npz file", only: Collection[str] | None = None

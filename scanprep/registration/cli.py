@@ -42,6 +42,15 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
     """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
 
     Example: scape prep align front.ply back.ply -o front_aligned.ply
+
+    Args:
+        source: Mesh to move.
+        target: Mesh that stays.
+        output: Mesh to write, the moved one.
+        landmarks: Landmarks of the mesh that is moved.
+        target_landmarks: Those of the other, with the same names.
+        unit: Unit of both meshes and of their landmarks.
+        config: Settings.
     """
     moving, fixed = read_mesh(source, unit), read_mesh(target, unit)
     T = np.eye(4)

@@ -34,8 +34,11 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
-    Nothing is needed but a file: scape mosh walk.c3d -o out
-    With a model of your own: scape mosh 85_02.c3d 85_03.c3d -m model.npz --layout cmu41 -o out
+    Example: scape mosh walk.c3d -o out
+
+    Nothing is needed but a file. With a model of your own:
+
+    Example: scape mosh 85_02.c3d 85_03.c3d -m model.npz --layout cmu41 -o out
 
     Begin with report.html in the output. Each person has a folder with subject.json (betas), layout.json (where the
     markers sat), report.html, and in it a folder for each sequence: motion.npz and soft_tissue.npz, animation.glb,
