@@ -71,7 +71,6 @@ class MadeTemplate:
     handles: int                        # where the surface is joined to itself, as between thighs that touch
     balance: float | None               # share of the triangles on the left of the body; None where it has no sides
 
-
     @property
     def doubts(self) -> list[str]:
         """What somebody should look at before scans are registered with it."""
