@@ -102,7 +102,10 @@ def test_dots_are_coloured_by_values_with_a_legend(body):
     heat = Heat(np.array([0.0, 0.02, np.nan]), 0.0, 0.05, "off")
     read = SceneReader(pack_scene([pane(Dots(body.vertices[:3], heat, name="marks"))]))
     (shade,) = read.layer("marks")["shades"]
-    assert shade["legend"] == {"title": "off", "low": 0.0, "high": 0.05, "unit": "mm"}
+    assert shade["legend"] == {"title": "off", "low": 0.0, "high": 0.05, "unit": "mm", "more": False}
+    beyond = Heat(np.array([0.0, 0.06, np.nan]), 0.0, 0.05, "off")
+    (over,) = SceneReader(pack_scene([pane(Dots(body.vertices[:3], beyond, name="marks"))])).layer("marks")["shades"]
+    assert over["legend"]["more"]
     np.testing.assert_allclose(read.colors(shade, 3), 255 * heat.colors(), atol=2)
 
 
