@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import sys
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,7 +90,7 @@ def bar(what: str) -> Iterator[Progress]:
     Bars that are open at the same time stand below each other.
     """
     with _display() as shown:
-        task = shown.add_task(what, total=None, start=False, visible=False)
+        task = shown.add_task(visible(what), total=None, start=False, visible=False)
 
         def tell(done: int, total: int) -> None:
             shown.start_task(task)
@@ -110,14 +111,28 @@ def _display() -> Iterator[Any]:
     if _open_displays:
         yield _open_displays[-1]
         return
-    columns = (progress.TextColumn("{task.description:<34}"), progress.BarColumn(), progress.MofNCompleteColumn(),
-               progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn())
+    columns = (progress.TextColumn("{task.description:<34}", markup=False), progress.BarColumn(),
+               progress.MofNCompleteColumn(), progress.TimeElapsedColumn(), progress.TextColumn("left"),
+               progress.TimeRemainingColumn())
     with progress.Progress(*columns, console=Console(stderr=True)) as shown:
         _open_displays.append(shown)
         try:
             yield shown
         finally:
             _open_displays.pop()
+
+
+# categories of Unicode that are no text: control, format (also what turns the direction), lone surrogates, separators
+_NO_TEXT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+def visible(text: str) -> str:
+    """Text fit for a terminal: characters that steer it, as names of files may hold, are written as `\\x1b`.
+
+    Line breaks stay.
+    """
+    return "".join(c if c == "\n" or unicodedata.category(c) not in _NO_TEXT else
+                   c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
 
 
 def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]]:
@@ -128,20 +143,21 @@ def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]
 
 
 def say(text: str) -> None:
-    """One line on standard error, for what a user should know while a command runs."""
-    sys.stderr.write(text + "\n")
+    """A line on standard error, for what a user should know while a command runs."""
+    sys.stderr.write(visible(text) + "\n")
 
 
 def show(metrics: list[Metric]) -> None:
     """Print the closing table of figure, value, unit: what comes first, and how many more there are."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table("figure", "value", "unit")
     table.columns[1].justify = "right"
     main, more = split_figures(metrics)
-    for metric in main:
-        table.add_row(metric.name, metric.text(), metric.unit)
+    for metric in main:          # as text: names may hold what rich takes for markup
+        table.add_row(*(Text(visible(cell)) for cell in (metric.name, metric.text(), metric.unit)))
     if more:
         table.caption = f"{len(more)} more in report.json"
     Console().print(table)

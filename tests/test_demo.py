@@ -169,7 +169,7 @@ def test_goes_on_where_it_was(demo_folder, tmp_path, figures):
         return {p: p.stat().st_mtime_ns for p in kept}
 
     before = touched()
-    assert run(demo, "scape demo", ["--quick", "--out", str(folder)]) == 0
+    assert run(demo, "scape demo", ["--quick", "--output", str(folder)]) == 0
     assert before == touched()
     assert files(folder, "report.json") == files(demo_folder, "report.json")
     again = {m["metric"]: m["value"] for m in json.loads((folder / "report.json").read_text())["metrics"]}
@@ -256,7 +256,7 @@ def test_a_set_with_more_scans_becomes_one_with_fewer(tmp_path, monkeypatch):
 def test_a_bad_seed_leaves_the_folder_as_it_was(tmp_path, capsys):
     scans(tmp_path / "a", TINY)
     before = files(tmp_path / "a")
-    assert run(demo, "scape demo", ["--quick", "--seed", "-1", "--out", str(tmp_path / "a")]) in (1, 2)
+    assert run(demo, "scape demo", ["--quick", "--seed", "-1", "--output", str(tmp_path / "a")]) in (1, 2)
     assert "seed" in capsys.readouterr().err
     assert files(tmp_path / "a") == before
     scans(tmp_path / "a", TINY)
@@ -265,7 +265,7 @@ def test_a_bad_seed_leaves_the_folder_as_it_was(tmp_path, capsys):
 
 def test_what_is_not_ours_stays(tmp_path, capsys):
     (tmp_path / "report.html").write_text("mine")
-    assert run(demo, "scape demo", ["--quick", "--out", str(tmp_path)]) == 1
+    assert run(demo, "scape demo", ["--quick", "--output", str(tmp_path)]) == 1
     assert "report.html" in capsys.readouterr().err and [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
 from scanprep.console import Outcome, bar
 from scanprep.ranges import Seed
@@ -33,7 +34,7 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
     from .page import write_page
 
     if quick and full:
-        raise ValueError("--quick, --full: expected at most one of the two")
+        raise UsageError("--quick, --full: expected at most one of the two")
     run = Demo(space, replace(QUICK if quick else FULL if full else DemoConfig(), seed=seed), bar)
     metrics = figures(run)
     judgement = judge(run, metrics)

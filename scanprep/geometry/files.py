@@ -202,6 +202,11 @@ def write_points(path: str | Path, cloud: PointCloud) -> None:
     _write(Path(path), Contents(cloud.points, None, cloud.normals, cloud.colors), "double", _POINTS)
 
 
+def is_scan(path: Path) -> bool:
+    """Whether a name is that of a mesh or a point cloud."""
+    return _suffix(path) in {**_MESHES, **_POINTS}
+
+
 def list_meshes(folder: str | Path) -> list[Path]:
     """The mesh files of a folder, sorted by name, at least one; of a RegisteredSet those in its `meshes`."""
     folder = Path(folder)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -149,6 +150,11 @@ class Page:
     def write(self, path: str | Path) -> None:
         """Write the page, whole or not at all."""
         write(path, self.html())
+
+
+def link_to(name: str) -> str:
+    """The address of a file or folder beside a page, whatever its name holds."""
+    return quote(name, errors="surrogateescape")
 
 
 def _with_code(text: str) -> str:

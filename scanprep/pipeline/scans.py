@@ -4,6 +4,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..console import visible
 from ..geometry import storage, tables
 from ..geometry.files import MeshFileError, name_of
 from ..geometry.landmarks import landmarks_beside
@@ -58,6 +59,9 @@ def _list_scans(folder: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in sorted(filter(_is_scan, folder.iterdir())):
         name = name_of(path)
+        if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
+            raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
+                             "rename it")
         if name in found:
             raise ValueError(f"{folder}: expected one file a scan, found {found[name].name} and {path.name}, both "
                              f"of the name '{name}'; rename one, or merge them where they are views of one scan")

@@ -13,7 +13,7 @@ from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import storage
-from scanprep.pictures.page import Page
+from scanprep.pictures.page import Page, link_to
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
 from scanprep.pictures.sheets import webp_bytes
@@ -139,9 +139,10 @@ def _drawn(figure: Any) -> bytes:
 
 def add_entry(page: Page, name: str, lines: Iterable[str]) -> None:
     """A person, or a sequence, leading to its own page."""
-    link, told = escape(name), "".join(f"<p>{escape(line)}</p>" for line in lines)
-    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{link}</b></a>{told}</div>'
-                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>')
+    link, label = link_to(name), escape(name)
+    told = "".join(f"<p>{escape(line)}</p>" for line in lines)
+    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{label}</b></a>{told}</div>'
+                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{label}"></a></div>')
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
