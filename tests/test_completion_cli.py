@@ -93,7 +93,7 @@ def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
     assert len(scene.layer("landmarks")["labels"]) == 7 and set(scene.layer("landmarks")["labels"]) == set(MARKS)
     assert not scene.layer("predicted body")["visible"] and not scene.layer("scan over it")["visible"]
     assert page.count("<img") == 1 and [p.name for p in out.glob(".*")] == [".scapekit"]
-    assert "distance of the scan" in capsys.readouterr().out
+    assert "share of the scan" in capsys.readouterr().out
 
 
 def test_without_landmarks_it_says_so_and_goes_on(place, tmp_path, capsys):
