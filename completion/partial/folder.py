@@ -25,7 +25,7 @@ from scanprep.pipeline.scans import find_scans
 from ..cli import read_model
 from .colors import ColorConfig
 from .settings import CompletionConfig
-from .work import MEANS, Inputs, Work, marks_of_template
+from .work import EXPLAINED, MEANS, Inputs, Work, marks_of_template
 
 GRAVEST = ("failed", "check", "good", "new")                          # verdicts, and what was not completed yet
 PAGE = "page"                        # name of the result that keeps what failed, beside the page
@@ -135,5 +135,5 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
 def gravity(metrics: Sequence[Metric]) -> tuple[int, float]:
     """By which scans are sorted: failed ones first, and among equals those whose points the body explains worst."""
     judgement = judgement_of(metrics)
-    explained = next((float(m.value) for m in metrics if m.name == MEANS[1]), 0.0)
+    explained = next((float(m.value) for m in metrics if m.name == EXPLAINED), 0.0)
     return GRAVEST.index("new" if judgement is None else judgement.verdict), explained

@@ -35,7 +35,9 @@ from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
 from .worn import worn_markers, write_worn
 
-MEANS = ("distance of the scan to the completed mesh, RMS", "scan points explained", "vertices with data")
+EXPECTED, EXPLAINED = "expected error of the body, mean", "share of the scan that lies on the body"
+MEASURED, LEFT = "share of the body that was measured", "what the scan leaves beside the body that was bent onto it, RMS"
+MEANS = (EXPECTED, EXPLAINED, MEASURED, LEFT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +138,10 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
 def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.ndarray, np.ndarray] | None,
             masked: np.ndarray | None) -> list[Metric]:
     """The rows of the closing table."""
-    rows = [Metric("share of the scan that lies on the body", 100 * done.explained, "%"),
-            Metric("share of the body that was measured", 100 * float(done.seen.mean()), "%")]
+    rows = [Metric(EXPLAINED, 100 * done.explained, "%"),
+            Metric(MEASURED, 100 * float(done.seen.mean()), "%")]
     if done.expected_error is not None:
-        rows.insert(0, Metric("expected error of the body, mean", MM * float(np.nanmean(done.expected_error)), "mm"))
+        rows.insert(0, Metric(EXPECTED, MM * float(np.nanmean(done.expected_error)), "mm"))
     if landmarks is None:
         rows.append(Metric("landmarks used", "none"))
     else:
@@ -151,7 +153,7 @@ def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.nd
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
-    return [*rows, Metric("what the scan leaves beside the body that was bent onto it, RMS", MM * done.rms, "mm"),
+    return [*rows, Metric(LEFT, MM * done.rms, "mm"),
             Metric("model", work.model), *details([Metric("settled", "yes" if done.converged else "no"),
                                                    Metric("rounds", done.iterations)])]
 
