@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
+from scanprep.arguments import Place
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome
@@ -18,7 +18,7 @@ from .body import BodyModel
 from .files import load_model
 
 ANNY = "anny"                        # as `scape model import anny`
-ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.npz")]
+ModelArg = Annotated[Path, Place("MODEL.npz")]
 
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import tyro
 
+from .arguments import Alias, Called, Place
 from .command_line import dispatch
 from .console import Metric
 
@@ -17,10 +17,11 @@ if TYPE_CHECKING:               # imported where they are used: this module must
     from .geometry.mesh import Mesh
 
 Unit = Literal["m", "mm", "cm", "in"]
-ScanArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
-MeshArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")]
-SetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET")]
-Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+ScanArg = Annotated[Path, Place("SCAN")]
+MeshArg = Annotated[Path, Place("MESH")]
+SetArg = Annotated[Path, Place("SET")]
+Output = Annotated[Path, Alias("-o")]
+Person = Called("--person")         # whose scans; `--subject` is a body elsewhere: betas or a mesh
 MM = 1000.0
 
 COMMANDS = {

@@ -44,6 +44,7 @@ class Outcome:
     """What a command did: where it wrote, the figures, and what failed on the way.
 
     `judgement` says what the result is worth, where the command can tell; the files are there whatever it says.
+    `following` is what to do next, in one sentence.
     """
 
     output: Path | None
@@ -51,6 +52,7 @@ class Outcome:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
     judgement: Judgement | None = None
+    following: str = ""
 
 
 MOST_ROWS = 12                       # of the closing table: what is read at a glance

@@ -193,14 +193,14 @@ def exported(files, output, *arguments):
 
 
 def test_the_command_writes_what_the_name_says(files, model, rig, motion):
-    figures = exported(files, "a.glb", "--motion", str(files / "motion.npz"), "--up", "1", "--correctives", "2")
+    figures = exported(files, "a.glb", "--motion", str(files / "motion.npz"), "--up", "y", "--correctives", "2")
     glb = Glb((files / "a.glb").read_bytes())
     assert len(glb.json["meshes"][0]["extras"]["targetNames"]) == 8 == figures["shape targets"] + 2
     off = np.stack([glb.skinned(t) for t in range(5)]) - model.subject(BETAS).vertices(*motion)
     assert figures["distance from exact body, mean"] == pytest.approx(
         1000 * np.linalg.norm(off, axis=2).mean(), rel=1e-3)
     assert figures["frames"] == 5 and figures["joints"] == 4
-    exported(files, "a.bvh", "--betas", "0.5", "-1", "--unit", "m", "--up", "1")
+    exported(files, "a.bvh", "--betas", "0.5", "-1", "--unit", "m", "--up", "y")
     places = Bvh((files / "a.bvh").read_text()).positions(0)
     assert np.allclose([places[name] for name in rig.skeleton.names], rig.skeleton.joints, atol=1e-5)
     figures = exported(files, "a.npz")
@@ -222,7 +222,7 @@ def test_the_command_writes_what_the_name_says(files, model, rig, motion):
     (["-o", "b.ply", "--fps", "24"], "--fps: it says nothing about a mesh"),
     (["-o", "nothing"], "name it with --motion"),
     (["-o", "b.glb", "--own-body", "--betas", "1"], "the template's own body has no betas"),
-    (["-o", "b.glb", "--own-body", "--shapes", "2"], "shapes: the template's own body has none"),
+    (["-o", "b.glb", "--own-body", "--morphs", "2"], "shapes: the template's own body has none"),
     (["-o", "b.bvh", "--motion", "model.npz"], "expected a motion, it lacks poses and trans")])
 def test_the_command_refuses_in_one_line(files, arguments, words, capsys, monkeypatch):
     monkeypatch.chdir(files)

@@ -37,7 +37,7 @@ def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Ca
     """Write `report.html`, the animated GLB and pictures into a folder."""
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on synthetic people, whose true shape, pose and correspondence are known.")
-    page.verdict(judgement, "Your own scans next: `scape prep run scans --template template.ply -o set`.")
+    page.verdict(judgement, "Next, your own scans: `scape prep run scans --template template.ply -o set`")
     page.figures(metrics, ("measured against the truth", "value", "unit"))
     stages: tuple[Callable[[Demo, Page], None], ...] = (
         _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),

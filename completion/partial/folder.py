@@ -11,6 +11,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
@@ -70,7 +71,7 @@ def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyMod
 def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> dict[str, Inputs]:
     """The scans of a folder by name, with their landmarks, in their folder or its own, and masks of their names."""
     if masks is not None and not masks.is_dir():
-        raise ValueError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
+        raise UsageError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
     found = {}
     for task in find_scans(folder, landmarks):
         mine = sorted(p for p in masks.iterdir() if name_of(p) == task.name) if masks else []

@@ -11,6 +11,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
@@ -103,7 +104,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
         masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
-            raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
+            raise UsageError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
         files = person_in(depth, work.body.template, landmarks)
     scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
@@ -162,7 +163,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
     if len(paths) == 1:
         return read_mask(paths[0], all_points(files.views), unit)
     if len(paths) != len(files.views):
-        raise ValueError(f"--mask: expected one file, or one for each of the {len(files.views)} views, "
+        raise UsageError(f"--mask: expected one file, or one for each of the {len(files.views)} views, "
                          f"got {len(paths)}")
     starts = np.cumsum([0, *map(point_count, files.views)])
     points = all_points(files.views)

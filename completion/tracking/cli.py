@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
 from model.linear import Subject
 from model.posing.cli import read_subject
+from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
@@ -23,7 +23,7 @@ from .folder import FrameFolder, follow_folder
 from .sequence import Tracker, as_motion, tracking_problem
 from .settings import TrackConfig
 
-FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
+FramesArg = Annotated[Path, Place("FRAMES")]
 
 
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.arguments import UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
@@ -76,13 +77,15 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
     work = Work(humanoid() if control is None else read_control(control), config, unit)
     if not scan.is_dir():
         if features is None and control is not None:
-            raise ValueError("--control: expected --features with the joints of that control model; only the generic "
+            raise UsageError("--control: expected --features with the joints of that control model; only the generic "
                              "humanoid is found by itself")
         with bar("fitting the statue") as progress:
             done = space.run(work, [Task("statue", ScanTask("statue", scan, features))], inside=progress).only
-        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done))
+        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}, then "
+                                 f"scape statue animate {output} walk.bvh -o walking")
     if features is not None and not features.is_dir():
-        raise ValueError(f"--features: expected a folder for a folder of scans, got {features}")
+        raise UsageError(f"--features: expected a folder for a folder of scans, got {features}")
     work = replace(work, command=f"scape statue fit {scan}")
     found = [one if features else replace(one, landmarks=None) for one in find_scans(scan, features)]
     with bar("fitting statues") as progress:
@@ -264,7 +267,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     detailed = Reconstruction(control, loaded.map, fine)
     if model is None:
         if registered is not None:
-            raise ValueError("--registered: expected --model with it")
+            raise UsageError("--registered: expected --model with it")
         moved = read_statue_motion(loaded, motion)
         bodies, rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
         output.mkdir(parents=True, exist_ok=True)

@@ -189,8 +189,16 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
          header: dict[str, Any] | None = None, compress: bool = True) -> None:
     """Write arrays and a JSON header into one `.npz` file: what it holds and the number of its layout, for `load`."""
     text = json.dumps({"kind": kind, "version": version, **(header or {})})
+    save_arrays(path, {HEADER: np.array(text), **arrays}, compress)
+
+
+def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
+    """Write arrays into one `.npz` file; ValueError for one of objects, which only a pickle would hold."""
+    for name, array in arrays.items():                     # before NumPy 2.3 savez cannot refuse them itself
+        if np.asarray(array).dtype.hasobject:
+            raise ValueError(f"{path}: expected arrays of numbers or text, {name} holds objects")
     with writing(path) as beside, open(beside, "wb") as out:
-        (np.savez_compressed if compress else np.savez)(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
+        (np.savez_compressed if compress else np.savez)(out, **arrays)
 
 
 def load_arrays(path: str | Path, what: str = "an .npz file", only: Collection[str] | None = None

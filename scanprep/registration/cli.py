@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
+from ..arguments import Place
 from ..cli import MM, MeshArg, Output, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import find_correspondences
@@ -33,7 +33,7 @@ from .person import person_parts
 from .repair import repaired
 from .schedule import RegistrationConfig
 
-TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
+TargetArg = Annotated[Path, Place("TARGET")]
 
 
 def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from ..alignment.views import AlignViewsConfig, align_views, views_problem
+from ..arguments import Called, Place, UsageError
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar, say
@@ -38,8 +38,8 @@ from ..repair.manifold import repair
 from .cloud import read_surface
 from .template import carry_landmarks, make_template, template_of_scan, views_without_cameras
 
-ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN ...")]
-ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
+ScansArg = Annotated[tuple[Path, ...], Place("SCAN ...")]
+ViewsArg = Annotated[Path, Place("VIEWS")]
 
 
 def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: Path | None = None,
@@ -169,8 +169,8 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
           for why, points in pieces.items())], {"clean": config})
 
 
-def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None, features: bool = False,
-                  unit: Unit | None = None,
+def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None,
+                  features: Annotated[bool, Called("--by-shape")] = False, unit: Unit | None = None,
                   config: AlignViewsConfig = AlignViewsConfig()  # noqa: B008
                   ) -> Outcome:
     """Bring range views into one frame, all of them together.
@@ -284,7 +284,7 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         wrong = [name for name, given in (("landmarks", landmarks), ("unit", unit),
                                           ("method", config.method != DecimateConfig().method)) if given]
         if wrong:
-            raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
+            raise UsageError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         return _reduce_set(mesh, output, faces, of_set)
     given = sanitise(read_mesh(mesh, unit), str(mesh))
     before, keep = _manifold(given, mesh), None

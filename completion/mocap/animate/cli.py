@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
 from model.linear import Subject
 from model.posing.cli import read_subject
+from scanprep.arguments import Place
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
@@ -27,7 +27,7 @@ from ..subject.person import PersonConfig
 from .motions import ENDINGS, MEAN_DISTANCE, is_motion, motion_among
 from .work import MEAN_ERROR, BetasTo, Work
 
-MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
+MarkersArg = Annotated[Path, Place("MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
@@ -81,7 +81,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     if markers.is_file():
         with bar("following the markers") as following:
             done = space.run(work, [Task("motion", markers)], inside=following).only
-        return Outcome(output, done, settings, judgement=judgement_of(done))
+        return Outcome(output, done, settings, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
     with bar("files") as progress:
         results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
     with space.staging("page") as staged:

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM
 from scanprep.console import Metric, details, judgement_row
@@ -158,7 +159,7 @@ def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
     if isinstance(given, dict):
         return given
     if motion.betas is None:
-        raise ValueError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")
+        raise UsageError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")
     return {0.0: motion.betas, float(motion.times[-1]): given}
 
 

@@ -3,11 +3,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.arguments import Called
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
@@ -31,7 +32,7 @@ from .linear import check_bodies, example_poses, in_poses
 
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
-           keep: str | None = None, poses: int = 0, unit: Unit | None = None,
+           keep: str | None = None, poses: Annotated[int, Called("--poses-each")] = 0, unit: Unit | None = None,
            config: DesignConfig = DesignConfig()) -> Outcome:      # noqa: B008
     """Choose the markers from which bodies are estimated best.
 

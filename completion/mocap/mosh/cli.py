@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
+from scanprep.arguments import Alias, Place
 from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import HOME, Task, Workspace
 from scanprep.cli import Output, Unit
@@ -23,8 +23,8 @@ from .recordings import TABLE, Actor, Grouping, write_table
 from .report import add_entry
 from .work import ERRORS, FIXED, Work
 
-MarkersArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MARKERS [MARKERS ...]")]
-Models = Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(aliases=["-m"])]
+MarkersArg = Annotated[tuple[Path, ...], Place("MARKERS [MARKERS ...]")]
+Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
@@ -93,7 +93,8 @@ def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str
         _page(actors, metrics, failures).write(staged.folder / "report.html")
         call.write(staged.folder / HOME)
     settings = {"mosh": call.config, "model": loaded.name, "layout": call.layout, "held out": call.hold_out}
-    return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures)
+    return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures,
+                   following=f"open {space.folder / 'report.html'}")
 
 
 def _keep_table(space: Workspace, actors: Sequence[Actor], subjects: str) -> None:

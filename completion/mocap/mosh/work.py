@@ -12,6 +12,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.learning.sexes import SexGuess
+from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
@@ -120,7 +121,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     try:
         layout = usual.without(work.hold_out) if work.hold_out else usual
     except ValueError as error:
-        raise ValueError(f"--hold-out: {error}") from None
+        raise UsageError(f"--hold-out: {error}") from None
     model, guess = work.model, None
 
     def progress(done: int, total: int) -> None:
