@@ -161,6 +161,13 @@ def test_an_arm_seen_in_steps_stays_and_a_thing_beyond_its_hand_goes():
     assert [row.reason for row in dense.components] == [LARGEST, FAR, *[FAR] * 5]      # no camera takes such steps
 
 
+def test_what_a_depth_camera_did_not_see_is_not_taken_for_the_body(person):
+    rng = np.random.default_rng(3)
+    unseen = np.column_stack([rng.uniform(-15, 15, (200, 2)), np.full(200, 65.535)])
+    clean = clean_scan(np.concatenate([person.vertices, unseen]))
+    assert clean.kept[:-200].all() and not clean.kept[-200:].any()
+
+
 def test_views_side_by_side_are_one_piece():
     one = ball(4)
     left, right = (one.submesh(s * one.corners[:, :, 0].mean(axis=1) > -0.01)[0] for s in (1, -1))
