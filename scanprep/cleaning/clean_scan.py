@@ -211,7 +211,7 @@ def _body_of(points: np.ndarray, piece: np.ndarray, config: CleanScanConfig, lan
 
 
 def _near_pieces(clouds: list[np.ndarray], main: int, gap: float) -> np.ndarray:
-    """(n,) bool: the pieces (m, 3) that a chain of pieces, each within `gap` metres of the next, joins to the main one."""
+    """(n,) bool: pieces (m, 3) that a chain of pieces, each within `gap` metres of the next, joins to the main one."""
     near = np.arange(len(clouds)) == main
     last = near.copy()
     while last.any():
