@@ -16,6 +16,7 @@ from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 MUTUAL, SPARSE = 4, 3.0              # neighbours of a point where points are few, and how far off, in links
+STEPS = 5.0                          # spacings between the steps of a depth camera on a surface that it sees slantwise
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 
 
@@ -26,7 +27,8 @@ class CleanScanConfig(Settings):
     Attributes
     ----------
     gap : float, metres
-        Pieces closer than this to the body belong to it: hands and feet that the scanner saw apart.
+        Pieces closer than this to the body, or to one that belongs to it, belong to it too: hands and feet that the
+        scanner saw apart. Of a coarse scan at least `STEPS` times its spacing.
     min_points : int
         Smaller pieces are specks, wherever they are.
     planes : int
@@ -105,7 +107,8 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     points = mesh.vertices
     if not len(points):
         raise ValueError("scan: expected points, got none")
-    link = max(0.012, config.spacings * spacing(points))            # whether triangles join them or not
+    step = spacing(points)
+    link = max(0.012, config.spacings * step)                       # whether triangles join them or not
     label, planes = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):
@@ -119,13 +122,15 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     row_of[large] = np.arange(len(large))
     label[rest] = len(planes) + row_of[piece]
     body = cKDTree(points[rest[piece == main]])
+    near = _near_pieces([points[rest[piece == number]] for number in large], int(np.flatnonzero(large == main)[0]),
+                        max(config.gap, STEPS * step))
     rows = []
     for number in range(int(label.max()) + 1):
         mine = label == number
-        old = large[number - len(planes)] if len(planes) <= number < len(planes) + len(large) else None
-        gap = 0.0 if old == main else _gap(body, points[mine])
-        reason = (FLOOR if number < len(planes) else SPECKS if old is None else why if old == main
-                  else NEAR if gap <= max(config.gap, link) else FAR)
+        old = number - len(planes) if len(planes) <= number < len(planes) + len(large) else None
+        reason = (FLOOR if number < len(planes) else SPECKS if old is None else why if large[old] == main
+                  else NEAR if near[old] else FAR)
+        gap = 0.0 if reason == why else _gap(body, points[mine])
         rows.append(_component(mesh, mine, gap, reason in (why, NEAR), reason))
     kept = np.array([row.kept for row in rows])[label]
     floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
@@ -202,6 +207,17 @@ def _body_of(points: np.ndarray, piece: np.ndarray, config: CleanScanConfig, lan
         large = np.ones(len(piece), dtype=bool)
     found = piece[large][cKDTree(points[large]).query(np.reshape(landmarks, (-1, 3)))[1]]
     return int(np.bincount(found).argmax()), LANDMARKS
+
+
+def _near_pieces(clouds: list[np.ndarray], main: int, gap: float) -> np.ndarray:
+    """(n,) bool: pieces (m, 3) that a chain of pieces, each within `gap` metres of the next, joins to the main one."""
+    near = np.arange(len(clouds)) == main
+    last = near.copy()
+    while last.any():
+        tree = cKDTree(np.concatenate([clouds[i] for i in np.flatnonzero(last)]))
+        last = np.array([not seen and _gap(tree, cloud) <= gap for seen, cloud in zip(near, clouds, strict=True)])
+        near |= last
+    return near
 
 
 def _gap(body: cKDTree, points: np.ndarray) -> float:

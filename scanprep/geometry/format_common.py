@@ -14,6 +14,7 @@ import numpy as np
 from . import storage
 
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
+MOST_INSIDE = 0.1                     # of the extent: where nine points in ten span less, the others are no body
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 
@@ -77,6 +78,12 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
             raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
         return UNITS[unit]
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if extent > 10:                          # 65.535 m is what many a depth camera writes where it saw nothing
+        inner = float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())
+        if inner < MOST_INSIDE * extent:
+            warnings.warn(f"{path}: a few points lie far off the rest, which spans {inner:.3g} m and alone tells the "
+                          "unit; scape prep clean drops them", stacklevel=3)
+            extent = inner
     if extent > 10:
         likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
         warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "

@@ -159,10 +159,13 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
         write_mesh(output, found.scan)
     else:
         write_points(output, PointCloud(found.scan, None, None))
+    pieces: dict[str, list[int]] = {}                       # one row for a reason: a noisy cloud has hundreds of pieces
+    for piece in found.components:
+        pieces.setdefault(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", []).append(piece.points)
     return Outcome(output, [
         Metric("points before", len(found.kept)), Metric("points", int(found.kept.sum())),
-        *(Metric(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", piece.points, "points")
-          for piece in found.components)], {"clean": config})
+        *(Metric(f"{why}, {len(points)} pieces" if len(points) > 1 else why, sum(points), "points")
+          for why, points in pieces.items())], {"clean": config})
 
 
 def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None,
