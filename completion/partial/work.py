@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
-from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
+from scanprep.geometry.files import POINT_ENDINGS, PointCloud, common_unit, read_mesh, read_points
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from scanprep.geometry.mesh import Mesh
@@ -92,14 +91,12 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
 
     The first says what the completion is worth.
     """
-    with warnings.catch_warnings():
-        if work.config.free_scale:
-            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        depth = read_picture(inputs.scans, work.unit)
-        files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
-        named = read_landmarks(inputs.landmarks, files.mesh, work.unit) if inputs.landmarks else {}
-        landmarks = _landmarks(work, inputs.landmarks, named)
-        masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
+    unit = "m" if work.config.free_scale else work.unit            # then as it stands in the files
+    depth = read_picture(inputs.scans, work.unit)
+    files = read_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
+    named = read_landmarks(inputs.landmarks, files.mesh, unit) if inputs.landmarks else {}
+    landmarks = _landmarks(work, inputs.landmarks, named)
+    masked = read_masks(inputs.masks, files, unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
             raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
@@ -190,7 +187,8 @@ def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -
 
 
 def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
-    """Read the views of a scan."""
+    """Read the views of a scan, which share one unit."""
+    unit = common_unit(paths, unit) if len(paths) > 1 else unit
     views = tuple(read_view(path, unit) for path in paths)
     return ScanFiles(views, tuple(read_texture(path, unit) if isinstance(view, Mesh) else None
                                   for path, view in zip(paths, views, strict=True)))

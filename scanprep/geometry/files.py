@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gzip
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -21,8 +21,8 @@ from .mesh import Mesh
 from .sanitise import sanitise
 from .seams import merged_mean, seams_closed
 
-__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "read_mesh", "read_points",
-           "read_registered", "read_scan", "write_mesh", "write_points"]
+__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "common_unit", "list_meshes", "read_mesh",
+           "read_points", "read_registered", "read_scan", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
@@ -51,8 +51,8 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     path : str or Path
         PLY, OBJ, STL, OFF or GLB, also packed as `.ply.gz`.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. When it is not given metres are assumed, with a UserWarning where the mesh would be
-        larger than 10 m or smaller than 0.1 m.
+        Unit of the file. When it is not given: the one other than metres in which the mesh is as large as a person,
+        with a UserWarning; else metres, with one where it would be larger than 10 m or smaller than 0.1 m.
 
     Returns
     -------
@@ -171,6 +171,22 @@ def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
         raise
 
 
+def common_unit(paths: Sequence[Path], unit: str | None = None) -> str | None:
+    """One unit for files that belong together, as views, frames or registered meshes do.
+
+    That given, else that of the first file that can be read, where it tells one (`likely_unit`), with a UserWarning.
+    A smaller part of a person, or a child, is then in the unit of the others.
+    """
+    for path in () if unit is not None else paths:
+        try:
+            points = read_points(path, unit="m").points
+        except MeshFileError:                # whoever reads it says so
+            continue
+        scale = metres_per_unit(path, points, None)
+        return next((name for name in UNITS if UNITS[name] == scale), None) if scale != 1 else None
+    return unit
+
+
 def write_points(path: str | Path, cloud: PointCloud) -> None:
     """Write points in metres, whole or not at all: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
     _write(Path(path), Contents(cloud.points, None, cloud.normals, cloud.colors), "double", _POINTS)
@@ -200,7 +216,7 @@ class Registered(NamedTuple):
 def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
     """Every mesh of a folder, or of a RegisteredSet, sorted by name; MeshFileError where one has other triangles."""
     paths = list_meshes(folder)
-    meshes = []
+    unit, meshes = common_unit(paths, unit), []
     for path in paths:
         meshes.append(read_mesh(path, unit))
         check_same_topology(path, meshes[-1], paths[0], meshes[0])

@@ -16,7 +16,7 @@ from ..decimation.decimate import DecimateConfig, decimate
 from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
-from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, read_scan, write_mesh, write_points
+from ..geometry.files import UNITS, PointCloud, common_unit, list_meshes, read_mesh, read_scan, write_mesh, write_points
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.sanitise import sanitise
@@ -215,5 +215,6 @@ def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]
         if missing:
             raise ValueError(f"none for {', '.join(missing)}")
         where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
+        unit = common_unit(paths, unit)
         places = [UNITS[unit or "m"] * storage.numbers(where, path.stem, 3) for path in paths]
     return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]
