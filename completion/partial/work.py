@@ -15,11 +15,10 @@ from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
-from scanprep.geometry.files import POINT_ENDINGS, PointCloud, common_unit, read_mesh, read_points
+from scanprep.geometry.files import POINT_ENDINGS, PointCloud, common_unit, read_points, read_scan_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
@@ -228,7 +227,7 @@ def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
     if path.suffix.lower() in POINT_ENDINGS:
         return read_points(path, unit)
     try:
-        return sanitise(read_mesh(path, unit), str(path))
+        return read_scan_mesh(path, unit)
     except ValueError as error:
         if "no faces" in str(error):
             return read_points(path, unit)

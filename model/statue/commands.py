@@ -13,10 +13,9 @@ from scanprep.batch.workspace import Task, Workspace
 from scanprep.cleaning.clean_scan import clean_scan
 from scanprep.cli import MM, Output, ScanArg, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, judgement_row, write_report
-from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.files import read_mesh, read_scan_mesh, write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import Judgement
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
@@ -157,7 +156,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     """
     sought = unit is None and inputs.landmarks is None
     unit = "m" if sought else unit
-    scan, texture = sanitise(read_mesh(inputs.scan, unit), str(inputs.scan)), read_texture(inputs.scan, unit)
+    scan, texture = read_scan_mesh(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
     metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))

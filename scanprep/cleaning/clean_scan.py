@@ -16,7 +16,7 @@ from ..ranges import FLAG, Settings
 from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
-MUTUAL, SPARSE = 4, 3.0              # neighbours of a point where points are few, and how far off, in links
+MUTUAL, SPARSE = 6, 3.0              # neighbours of a point where points are few, and how far off, in links
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 
 

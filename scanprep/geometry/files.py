@@ -20,9 +20,10 @@ from .format_common import UNITS, Contents, MeshFileError, check_extent, load_by
 from .mesh import Mesh
 from .sanitise import sanitise
 from .seams import merged_mean, seams_closed
+from .thinning import thin_scan
 
 __all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "common_unit", "list_meshes", "read_mesh",
-           "read_points", "read_registered", "read_scan", "write_mesh", "write_points"]
+           "read_points", "read_registered", "read_scan", "read_scan_mesh", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
@@ -159,12 +160,17 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     return PointCloud(points, normals, contents.colors)
 
 
+def read_scan_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """A mesh as a scan: thinned where it is finer than any work needs, its triangles made sound; both with a warning."""
+    return sanitise(thin_scan(read_mesh(path, unit), str(path)), str(path))
+
+
 def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
     """A scan as a mesh, its triangles made sound (`sanitise`), or as points (n, 3) where the file has no triangles."""
     if Path(path).suffix.lower() in POINT_ENDINGS:
         return read_points(path, unit).points
     try:
-        return sanitise(read_mesh(path, unit), str(path))
+        return read_scan_mesh(path, unit)
     except ValueError as error:
         if "no faces" in str(error):
             return read_points(path, unit).points

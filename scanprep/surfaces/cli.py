@@ -16,10 +16,19 @@ from ..decimation.decimate import DecimateConfig, decimate
 from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
-from ..geometry.files import UNITS, PointCloud, common_unit, list_meshes, read_mesh, read_scan, write_mesh, write_points
+from ..geometry.files import (
+    UNITS,
+    PointCloud,
+    common_unit,
+    list_meshes,
+    read_mesh,
+    read_scan,
+    read_scan_mesh,
+    write_mesh,
+    write_points,
+)
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
-from ..geometry.sanitise import sanitise
 from ..judgement import Judgement
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
@@ -149,7 +158,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
         unit: Unit of the mesh, the views and the cameras.
         config: Settings.
     """
-    before = sanitise(read_mesh(mesh, unit), str(mesh))
+    before = read_scan_mesh(mesh, unit)
     seen = _read_views(views, unit) if views else ()
     holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
@@ -188,7 +197,7 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         if wrong:
             raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         return _reduce_set(mesh, output, faces, of_set)
-    before = sanitise(read_mesh(mesh, unit), str(mesh))
+    before = read_scan_mesh(mesh, unit)
     keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)
