@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, quiet, refused
 
-from scanprep.geometry.files import UNITS, list_meshes, read_mesh, read_registered, write_mesh
+from scanprep.geometry.files import UNITS, list_meshes, name_of, read_mesh, read_registered, write_mesh
 from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, Person
@@ -26,6 +26,16 @@ def meshes(draw):
     faces = draw(st.lists(st.lists(st.integers(0, n - 1), min_size=3, max_size=3, unique=True), min_size=1,
                           max_size=8))
     return Mesh(np.array(vertices), np.array(faces))
+
+
+# ---- names
+
+@pytest.mark.parametrize(("file", "name"), [
+    ("anna.ply", "anna"), ("2024.05.01 anna.ply", "2024.05.01 anna"), ("2024.05.01.PLY.GZ", "2024.05.01"),
+    ("anna.v2.3mf", "anna.v2"), ("anna", "anna"), ("2024.05.01 anna", "2024.05.01 anna"), ("2024.05", "2024.05"),
+    ("a.b.landmarks.json", "a.b"), ("a.mrk.json", "a"), ("a.b.json", "a.b"), (".ply", ".ply")])
+def test_a_name_keeps_its_dots(tmp_path, file, name):
+    assert name_of(file) == name_of(tmp_path / "c.d" / file) == name
 
 
 # ---- what is written comes back

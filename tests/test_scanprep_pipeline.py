@@ -46,6 +46,15 @@ def test_scans_and_what_is_known_of_them(scans):
     assert [t.name for t in find_scans(scans)] == ["body0", "body1", "body2", "cloud"]
 
 
+def test_dots_belong_to_the_names_of_scans(scans, tmp_path):
+    for file in ("2024.05.01 anna", "2024.05.02 anna"):
+        shutil.copy(scans / "body0.ply", tmp_path / f"{file}.ply")
+        shutil.copy(next(scans.rglob("body0.landmarks.json")), tmp_path / f"{file}.landmarks.json")
+    tasks = find_scans(tmp_path)
+    assert [t.name for t in tasks] == [t.subject for t in tasks] == ["2024.05.01 anna", "2024.05.02 anna"]
+    assert [t.landmarks.name for t in tasks] == [f"{t.name}.landmarks.json" for t in tasks]
+
+
 def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, template, monkeypatch):
     """What a scan was registered with is what its limbs are tried again with, and the table says that they were."""
     given, person = [], object()

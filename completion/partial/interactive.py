@@ -17,6 +17,7 @@ from model.linear import Subject
 from scanprep.batch.opening import workspace
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.depth_camera.picture import DepthPicture
+from scanprep.geometry.files import name_of
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.scene import Pane, pack_scene
 from scanprep.viewer.app import Send
@@ -85,7 +86,7 @@ class CompleteApp(PickApp):
 
     def _clicked(self, path: Path) -> Clicked:
         """A scan; of one that was dropped the landmarks are saved with the results."""
-        file = self.output / (path.name.split(".")[0] + ENDING) if self.dropped.holds(path) else None
+        file = self.output / (name_of(path) + ENDING) if self.dropped.holds(path) else None
         one = Clicked.found(path, ENDING, self.work.unit, file if file and file.exists() else None)
         one.file = file or one.file
         one.surface = self._surface(path)
@@ -119,7 +120,7 @@ class CompleteApp(PickApp):
         """The template, the scan, and the whole body once there is one."""
         panes = [self.template.pane("the model")]
         if self.scan is not None:
-            panes.append(self.scan.pane(self.scan.path.name))
+            panes.append(self.scan_pane())
             if (result := self._result_pane()) is not None:
                 panes.append(replace(result, label="the whole body"))
         return Message("scene", {}, pack_scene(panes))
@@ -306,7 +307,7 @@ class CompleteApp(PickApp):
 
     def folder_of(self, scan: Clicked) -> Path:
         """Where the body of a scan is saved."""
-        return self.output if len(self.scans) == 1 else self.output / scan.path.name.split(".")[0]
+        return self.output if len(self.scans) == 1 else self.output / name_of(scan.path)
 
     def _write(self, scan: Clicked, made: Made, folder: Path) -> list[Metric]:
         """All files of a completion into a folder; the figures."""

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
-from scanprep.geometry.files import MeshFileError, PointCloud, common_unit, read_points, write_mesh
+from scanprep.geometry.files import MeshFileError, PointCloud, common_unit, name_of, read_points, write_mesh
 
 from ..motion import Progress
 from .sequence import TrackedFrame, Tracker, TrackerState, without_points
@@ -75,7 +76,7 @@ def _by_folder(folder: Path) -> dict[str, dict[int, Path]]:
 
 def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
     if "{camera}" not in pattern or "{frame}" not in pattern:
-        raise ValueError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
+        raise UsageError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
     expression = re.escape(pattern).replace(r"\{camera\}", "(?P<camera>.+?)").replace(r"\{frame\}", r"(?P<frame>\d+)")
     found: dict[str, dict[int, Path]] = {}
     for path in sorted(folder.rglob("*")):
@@ -100,7 +101,7 @@ def _numbered(paths: list[Path]) -> dict[int, Path]:
     """Files by the last number in their names."""
     out: dict[int, Path] = {}
     for path in paths:
-        digits = re.findall(r"\d+", path.name.split(".")[0])
+        digits = re.findall(r"\d+", name_of(path))
         if not digits:
             raise ValueError(f"{path}: expected the number of the frame in its name")
         number = int(digits[-1])

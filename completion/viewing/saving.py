@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanprep.geometry.files import write_mesh
+from scanprep.geometry.files import name_of, write_mesh
 
 from ..motion import Motion
 from .controls import Controls, Shown
@@ -15,7 +15,7 @@ def save_bodies(controls: Controls, folder: Path) -> list[Path]:
     """Every body that is shown as `NAME_body.ply`, made the exact way."""
     written = []
     for one in whole(controls):
-        path = free_name(folder / f"{Path(one.name).stem}_body.ply")
+        path = free_name(folder / f"{name_of(one.name)}_body.ply")
         write_mesh(path, one.body.mesh(controls.betas_of(one.body), controls.pose_of(one.body), controls.trans))
         written.append(path)
     return written
@@ -25,7 +25,7 @@ def save_poses(controls: Controls, folder: Path) -> list[Path]:
     """Pose, place and shape of every body as `NAME_pose.npz`, a motion of one frame."""
     written = []
     for one in whole(controls):
-        path = free_name(folder / f"{Path(one.name).stem}_pose.npz")
+        path = free_name(folder / f"{name_of(one.name)}_pose.npz")
         Motion(controls.pose_of(one.body)[None], controls.trans[None], controls.betas_of(one.body), 1.0,
                np.zeros((1, 0))).save(path)
         written.append(path)

@@ -225,8 +225,8 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     local = np.searchsorted(used, cells)
     values = distance[used]
     values[np.abs(values) < 1e-4 * voxel] = 1e-4 * voxel   # a surface through a corner would make flat triangles
-    vertices, faces, _ = igl.marching_cubes(values, np.ascontiguousarray(points[used]),
-                                            np.ascontiguousarray(local, dtype=np.int64), 0.0)
+    vertices, faces = igl.marching_cubes(values, np.ascontiguousarray(points[used]),
+                                         np.ascontiguousarray(local, dtype=np.int64), 0.0)[:2]
     return Mesh(vertices, faces)
 
 

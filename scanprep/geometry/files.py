@@ -7,6 +7,7 @@ say their unit, so the caller does or metres are assumed, with a warning where t
 from __future__ import annotations
 
 import gzip
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,12 +23,37 @@ from .sanitise import sanitise
 from .seams import merged_mean, seams_closed
 from .thinning import thin_scan
 
-__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "common_unit", "list_meshes", "read_mesh",
+__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "common_unit", "list_meshes", "name_of", "read_mesh",
            "read_points", "read_registered", "read_scan", "read_scan_mesh", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
 POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
+
+
+# an ending has a letter and no space: `.05` and `.01 anna` belong to the name; some endings are two
+_ENDING = re.compile(r"\.[0-9a-z]*[a-z][0-9a-z]*(\.gz)?$|\.(landmarks|mrk|betas)\.json$", re.IGNORECASE)
+
+
+def name_of(path: str | Path) -> str:
+    """What the thing in a file is called: the name of the file without its ending, all other dots kept.
+
+    Parameters
+    ----------
+    path : str or Path
+        Of a scan, mesh, picture, landmark file ...; a packed one (`.ply.gz`) counts as what it holds.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> name_of("scans/2024.05.01 anna.ply"), name_of("anna.v2.ply.gz"), name_of("anna.landmarks.json")
+    ('2024.05.01 anna', 'anna.v2', 'anna')
+    """
+    name = Path(path).name
+    return _ENDING.sub("", name) or name
 
 
 class _Format(NamedTuple):
@@ -161,7 +187,7 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
 
 
 def read_scan_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """A mesh as a scan: thinned where it is finer than any work needs, its triangles made sound; both with a warning."""
+    """A mesh as a scan: thinned where it is finer than any work needs, its triangles made sound; both are told."""
     return sanitise(thin_scan(read_mesh(path, unit), str(path)), str(path))
 
 
@@ -198,6 +224,11 @@ def write_points(path: str | Path, cloud: PointCloud) -> None:
     _write(Path(path), Contents(cloud.points, None, cloud.normals, cloud.colors), "double", _POINTS)
 
 
+def is_scan(path: Path) -> bool:
+    """Whether a name is that of a mesh or a point cloud."""
+    return _suffix(path) in {**_MESHES, **_POINTS}
+
+
 def list_meshes(folder: str | Path) -> list[Path]:
     """The mesh files of a folder, sorted by name, at least one; of a RegisteredSet those in its `meshes`."""
     folder = Path(folder)
@@ -227,7 +258,7 @@ def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
         meshes.append(read_mesh(path, unit))
         check_same_topology(path, meshes[-1], paths[0], meshes[0])
     return Registered(meshes[0].faces, np.stack([m.vertices for m in meshes]),
-                      tuple(Path(p.stem).stem if p.suffix.lower() == ".gz" else p.stem for p in paths))
+                      tuple(map(name_of, paths)))
 
 
 def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
-from ..geometry.thinning import fewer_triangles
 from .colors import Heat
 from .shading import Solid
 
@@ -18,7 +18,14 @@ def thinned(solid: Solid, most: int = MOST) -> Solid:
     mesh = solid.mesh
     if len(mesh.faces) <= most:
         return solid
-    small, nearest = fewer_triangles(mesh, most)
+    import fast_simplification
+
+    middle = mesh.vertices.mean(axis=0)
+    points, faces = fast_simplification.simplify((mesh.vertices - middle).astype(np.float32),
+                                                 mesh.faces.astype(np.int32), target_count=most)
+    points = points.astype(float) + middle
+    nearest = cKDTree(mesh.vertices).query(points)[1]
+    small = Mesh(points, faces.astype(np.int64), None if mesh.colors is None else mesh.colors[nearest])
 
     def at(shade: np.ndarray | Heat) -> np.ndarray | Heat:
         if isinstance(shade, Heat):

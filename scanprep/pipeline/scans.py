@@ -4,8 +4,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..console import visible
 from ..geometry import storage, tables
-from ..geometry.files import MeshFileError
+from ..geometry.files import MeshFileError, name_of
 from ..geometry.landmarks import landmarks_beside
 
 SCAN_ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".xyz", ".pcd", ".pts")
@@ -28,8 +29,8 @@ class ScanTask:
 def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:
     """The scans of a folder sorted by name, their landmark files, and what `scans.csv` says of them.
 
-    The name is the part of the file name before its first dot; a landmark file has the same name, in `landmarks`, in
-    the folder `landmarks` inside, or beside the scan. Where `scans.csv` (name, subject, pose, sex) does not say whose
+    The name is that of the file without its ending; a landmark file has the same name, in `landmarks`, in the folder
+    `landmarks` inside, or beside the scan. Where `scans.csv` (name, subject, pose, sex) does not say whose
     scan it is, it is of `subject`, or of a person of its own. ValueError for no scans, or two of one name.
     """
     folder = Path(folder)
@@ -57,7 +58,10 @@ def _list_scans(folder: Path) -> dict[str, Path]:
         raise MeshFileError(f"{folder}: {problem}")
     found: dict[str, Path] = {}
     for path in sorted(filter(_is_scan, folder.iterdir())):
-        name = path.name.split(".")[0]
+        name = name_of(path)
+        if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
+            raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
+                             "rename it")
         if name in found:
             raise ValueError(f"{folder}: expected one file a scan, found {found[name].name} and {path.name}, both "
                              f"of the name '{name}'; rename one, or merge them where they are views of one scan")
