@@ -213,8 +213,13 @@ def _notes(prog: str) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=r"(scanprep|model|completion)(\.|$)")
-        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {' '.join(str(message).split())}")
+        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {_as_flags(str(message))}")
         yield
+
+
+def _as_flags(text: str) -> str:
+    """A message of the library on one line, with its argument for units as the flag of the command line."""
+    return re.sub(r"\bunit='(\w+)'", r"--unit \1", " ".join(text.split()))
 
 
 def _told(error: Exception) -> str:

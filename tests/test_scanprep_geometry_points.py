@@ -54,7 +54,7 @@ def test_text_points_with_a_heading_commas_and_colours(tmp_path):
 def test_points_have_units_too(tmp_path):
     write_points(tmp_path / "a.xyz", PointCloud(np.array([[0, 0, 0], [0, 0, 1800.0]])))
     with pytest.warns(UserWarning, match=r"a\.xyz.*unit='mm'"):
-        read_points(tmp_path / "a.xyz")
+        np.testing.assert_allclose(read_points(tmp_path / "a.xyz").points, [[0, 0, 0], [0, 0, 1.8]])
     np.testing.assert_allclose(read_points(tmp_path / "a.xyz", unit="mm").points, [[0, 0, 0], [0, 0, 1.8]])
 
 

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,11 +16,10 @@ from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
-from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
+from scanprep.geometry.files import POINT_ENDINGS, PointCloud, common_unit, read_points, read_scan_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
@@ -95,15 +93,13 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
 
     The first says what the completion is worth.
     """
-    with warnings.catch_warnings():
-        if work.config.free_scale:
-            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        depth = read_picture(inputs.scans, work.unit)
-        files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
-        surface = files.mesh or (all_points(files.views) if files.views else None)
-        named = read_landmarks(inputs.landmarks, surface, work.unit) if inputs.landmarks else {}
-        landmarks = _landmarks(work, inputs.landmarks, named)
-        masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
+    unit = "m" if work.config.free_scale else work.unit            # then as it stands in the files
+    depth = read_picture(inputs.scans, work.unit)
+    files = read_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
+    surface = files.mesh or (all_points(files.views) if files.views else None)
+    named = read_landmarks(inputs.landmarks, surface, unit) if inputs.landmarks else {}
+    landmarks = _landmarks(work, inputs.landmarks, named)
+    masked = read_masks(inputs.masks, files, unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
             raise UsageError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
@@ -189,7 +185,8 @@ def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -
 
 
 def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
-    """Read the views of a scan."""
+    """Read the views of a scan, which share one unit."""
+    unit = common_unit(paths, unit) if len(paths) > 1 else unit
     views = tuple(read_view(path, unit) for path in paths)
     return ScanFiles(views, tuple(read_texture(path, unit) if isinstance(view, Mesh) else None
                                   for path, view in zip(paths, views, strict=True)))
@@ -229,7 +226,7 @@ def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
     if path.suffix.lower() in POINT_ENDINGS:
         return read_points(path, unit)
     try:
-        return sanitise(read_mesh(path, unit), str(path))
+        return read_scan_mesh(path, unit)
     except ValueError as error:
         if "no faces" in str(error):
             return read_points(path, unit)

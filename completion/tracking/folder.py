@@ -10,7 +10,7 @@ import numpy as np
 
 from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
-from scanprep.geometry.files import MeshFileError, PointCloud, name_of, read_points, write_mesh
+from scanprep.geometry.files import MeshFileError, PointCloud, common_unit, name_of, read_points, write_mesh
 
 from ..motion import Progress
 from .sequence import TrackedFrame, Tracker, TrackerState, without_points
@@ -36,6 +36,7 @@ class FrameFolder:
         self._paths = cameras
         self.numbers = _numbers({n for files in cameras.values() for n in files})
         self.names = tuple(f"{n}" for n in self.numbers)
+        self.unit = common_unit([path for files in cameras.values() for path in files.values()], self.unit)
 
     def __len__(self) -> int:
         return len(self.numbers)

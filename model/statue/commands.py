@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -160,10 +159,8 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     Without a unit it is metres where features are given, which may be on anything, else that of a person.
     """
     sought = unit is None and inputs.landmarks is None
-    with warnings.catch_warnings():
-        if sought:
-            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        scan, texture = read_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
+    unit = "m" if sought else unit
+    scan, texture = read_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
     metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))

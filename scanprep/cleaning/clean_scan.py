@@ -15,7 +15,7 @@ from ..ranges import Settings
 from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
-MUTUAL, SPARSE = 4, 3.0              # neighbours of a point where points are few, and how far off, in links
+MUTUAL, SPARSE = 6, 3.0              # neighbours of a point where points are few, and how far off, in links
 STEPS = 5.0                          # spacings between the steps of a depth camera on a surface that it sees slantwise
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 

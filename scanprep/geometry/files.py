@@ -9,7 +9,7 @@ from __future__ import annotations
 import gzip
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -21,9 +21,10 @@ from .format_common import UNITS, Contents, MeshFileError, check_extent, load_by
 from .mesh import Mesh
 from .sanitise import sanitise
 from .seams import merged_mean, seams_closed
+from .thinning import thin_scan
 
-__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "name_of", "read_mesh",
-           "read_points", "read_registered", "read_scan", "write_mesh", "write_points"]
+__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "common_unit", "list_meshes", "name_of", "read_mesh",
+           "read_points", "read_registered", "read_scan", "read_scan_mesh", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
@@ -77,8 +78,8 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     path : str or Path
         PLY, OBJ, STL, OFF or GLB, also packed as `.ply.gz`.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. When it is not given metres are assumed, with a UserWarning where the mesh would be
-        larger than 10 m or smaller than 0.1 m.
+        Unit of the file. When it is not given: the one other than metres in which the mesh is as large as a person,
+        with a UserWarning; else metres, with one where it would be larger than 10 m or smaller than 0.1 m.
 
     Returns
     -------
@@ -185,16 +186,37 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     return PointCloud(points, normals, contents.colors)
 
 
+def read_scan_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """A mesh as a scan: thinned where it is finer than any work needs, its triangles made sound; both are told."""
+    return sanitise(thin_scan(read_mesh(path, unit), str(path)), str(path))
+
+
 def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
     """A scan as a mesh, its triangles made sound (`sanitise`), or as points (n, 3) where the file has no triangles."""
     if Path(path).suffix.lower() in POINT_ENDINGS:
         return read_points(path, unit).points
     try:
-        return sanitise(read_mesh(path, unit), str(path))
+        return read_scan_mesh(path, unit)
     except ValueError as error:
         if "no faces" in str(error):
             return read_points(path, unit).points
         raise
+
+
+def common_unit(paths: Sequence[Path], unit: str | None = None) -> str | None:
+    """One unit for files that belong together, as views, frames or registered meshes do.
+
+    That given, else that of the first file that can be read, where it tells one (`likely_unit`), with a UserWarning.
+    A smaller part of a person, or a child, is then in the unit of the others.
+    """
+    for path in () if unit is not None else paths:
+        try:
+            points = read_points(path, unit="m").points
+        except MeshFileError:                # whoever reads it says so
+            continue
+        scale = metres_per_unit(path, points, None)
+        return next((name for name in UNITS if UNITS[name] == scale), None) if scale != 1 else None
+    return unit
 
 
 def write_points(path: str | Path, cloud: PointCloud) -> None:
@@ -231,7 +253,7 @@ class Registered(NamedTuple):
 def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
     """Every mesh of a folder, or of a RegisteredSet, sorted by name; MeshFileError where one has other triangles."""
     paths = list_meshes(folder)
-    meshes = []
+    unit, meshes = common_unit(paths, unit), []
     for path in paths:
         meshes.append(read_mesh(path, unit))
         check_same_topology(path, meshes[-1], paths[0], meshes[0])

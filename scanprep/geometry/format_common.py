@@ -16,6 +16,7 @@ from . import storage
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
 MOST_INSIDE = 0.1                     # of the extent: where nine points in ten span less, the others are no body
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+PERSON = 1.3, 2.3                    # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
 
 
 class MeshFileError(storage.StorageError):
@@ -68,10 +69,18 @@ def check_extent(path: Path, what: str, points: np.ndarray) -> None:
                             f"expected coordinates below {FARTHEST:g}")
 
 
+def likely_unit(extent: float) -> str | None:
+    """The unit in which `extent` is that of a person, other than metres; None where none is or several may be."""
+    likely = [unit for unit in ("mm", "cm", "in") if PERSON[0] <= extent * UNITS[unit] <= PERSON[1]]
+    return likely[0] if len(likely) == 1 else None
+
+
 def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
     """What to multiply the coordinates of a file with to have metres.
 
-    Warns where metres are assumed and would make the points span more than 10 m or less than `smallest`.
+    Where no unit is given and the points span as much as a person in one other than metres, it is that one. Else they
+    are metres, with a warning where they would span more than 10 m or less than `smallest`. Only how far the points
+    span counts, not how far from the origin they lie.
     """
     if unit is not None:
         if unit not in UNITS:
@@ -84,10 +93,15 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
             warnings.warn(f"{path}: a few points lie far off the rest, which spans {inner:.3g} m and alone tells the "
                           "unit; scape prep clean drops them", stacklevel=3)
             extent = inner
+    likely = likely_unit(extent)
+    if likely is not None:
+        warnings.warn(f"{path}: read with unit='{likely}', in which it is {extent * UNITS[likely]:.2f} m from end to "
+                      f"end; if these are metres, say unit='m'", stacklevel=3)
+        return UNITS[likely]
     if extent > 10:
-        likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
-        warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "
-                      f"it looks like unit='{likely}' ({extent * UNITS[likely]:.3g} m)", stacklevel=3)
+        nearest = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
+        warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; if it is not, say its unit: with "
+                      f"unit='{nearest}' it is {extent * UNITS[nearest]:.3g} m", stacklevel=3)
     elif 0 < extent < smallest:
         warnings.warn(f"{path}: {extent:.2g} m from end to end when read as metres; it looks as if millimetres "
                       f"had been divided by 1000 twice ({extent * 1000:.3g} m)", stacklevel=3)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.format_common import UNITS
+from ..geometry.format_common import metres_per_unit
 from ..geometry.format_glb import VERTICES, Glb, chunks_of, some_normal, tallest, turn_up, up_of
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
@@ -74,7 +74,10 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
         warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
                       "its colours are left out", stacklevel=2)
         return None
-    vertices = UNITS[unit or "m"] * np.asarray(loaded.vertices)
+    vertices = np.asarray(loaded.vertices, dtype=np.float64)
+    with warnings.catch_warnings():          # whoever reads the mesh tells its unit
+        warnings.simplefilter("ignore", UserWarning)
+        vertices = metres_per_unit(path, vertices, unit) * vertices
     if path.suffix.lower() == ".glb":
         vertices = vertices @ turn_up(up_of(chunks_of(path, path.read_bytes())[0]))
     mesh = Mesh(vertices, np.asarray(loaded.faces))

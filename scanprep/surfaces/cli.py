@@ -19,18 +19,19 @@ from ..geometry import storage
 from ..geometry.files import (
     UNITS,
     PointCloud,
+    common_unit,
     is_scan,
     list_meshes,
     name_of,
     read_mesh,
     read_points,
     read_scan,
+    read_scan_mesh,
     write_mesh,
     write_points,
 )
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh, template_problem
-from ..geometry.sanitise import sanitise
 from ..judgement import Judgement
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
@@ -285,7 +286,7 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         if wrong:
             raise UsageError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         return _reduce_set(mesh, output, faces, of_set)
-    given = sanitise(read_mesh(mesh, unit), str(mesh))
+    given = read_scan_mesh(mesh, unit)
     before, keep = _manifold(given, mesh), None
     if landmarks:
         places = {name: given.vertices[v] for name, v in read_landmark_vertices(landmarks, given, unit).items()}
@@ -315,5 +316,6 @@ def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]
         if missing:
             raise ValueError(f"none for {', '.join(missing)}")
         where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
+        unit = common_unit(paths, unit)
         places = [UNITS[unit or "m"] * storage.numbers(where, name_of(path), 3) for path in paths]
     return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]
