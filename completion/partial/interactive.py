@@ -307,7 +307,7 @@ class CompleteApp(PickApp):
 
     def folder_of(self, scan: Clicked) -> Path:
         """Where the body of a scan is saved."""
-        return self.output if len(self.scans) == 1 else self.output / scan.name_of(path)
+        return self.output if len(self.scans) == 1 else self.output / name_of(scan.path)
 
     def _write(self, scan: Clicked, made: Made, folder: Path) -> list[Metric]:
         """All files of a completion into a folder; the figures."""
