@@ -20,7 +20,8 @@ PLY = "ply\nformat {} 1.0\nelement vertex 4\n{}element {} {}\nproperty list {} i
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 RGB = "property {0} red\nproperty {0} green\nproperty {0} blue\n"
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])
-STL = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
+STL = ("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+       "endsolid a\n")
 
 
 def same(mesh, other, atol=1e-6):
@@ -83,7 +84,8 @@ def test_a_range_grid_is_joined_where_neighbours_are_near(tmp_path):
 @pytest.mark.parametrize("properties", [True, False])
 def test_a_ply_with_an_empty_element_of_faces_is_a_cloud(tmp_path, properties):
     text = PLY.format("ascii", XYZ, "face", 0, "uchar") + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
-    (tmp_path / "a.ply").write_text(text if properties else text.replace("property list uchar int vertex_indices\n", ""))
+    text = text if properties else text.replace("property list uchar int vertex_indices\n", "")
+    (tmp_path / "a.ply").write_text(text)
     np.testing.assert_array_equal(read_scan(tmp_path / "a.ply"), SQUARE)
 
 
@@ -281,13 +283,15 @@ def test_instances_of_gltf_are_all_there(tmp_path):
 
 def test_skinned_meshes_stand_where_their_joints_carry_them(tmp_path):
     """Stored in centimetres on two joints, one of them turned; a rigid mesh beside it in metres."""
-    joints, shares = np.array([[0, 0, 0, 0]] * 3 + [[1, 0, 0, 0]], "<u2"), np.tile(np.array([[1, 0, 0, 0]], "<f4"), (4, 1))
+    joints, shares = np.zeros((4, 4), "<u2"), np.tile(np.array([[1, 0, 0, 0]], "<f4"), (4, 1))
+    joints[3, 0] = 1
+    turned = Rotation.from_euler("x", 90, degrees=True).as_quat().tolist()
     inverse = np.tile(np.diag([0.01, 0.01, 0.01, 1]).T.ravel().astype("<f4"), (2, 1))
     skinned = {"attributes": {"POSITION": 2, "JOINTS_0": 3, "WEIGHTS_0": 4}, "indices": 1}
     tree, _ = gltf({"scenes": [{"nodes": [0, 1, 2]}], "skins": [{"joints": [2, 3], "inverseBindMatrices": 5}],
                     "meshes": [{"primitives": [skinned]}, {"primitives": [PRIMITIVE]}],
                     "nodes": [{"mesh": 0, "skin": 0, "translation": [9, 9, 9]}, {"mesh": 1, "translation": [3, 0, 0]},
-                              {"children": [3]}, {"rotation": Rotation.from_euler("x", 90, degrees=True).as_quat().tolist()}]},
+                              {"children": [3]}, {"rotation": turned}]},
                    [CORNERS, LINE, 100 * CORNERS, joints, shares, inverse])
     (tmp_path / "a.gltf").write_text(json.dumps(tree))
     mesh = quiet(read_mesh, tmp_path / "a.gltf")
