@@ -16,7 +16,7 @@ from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
-from scanprep.geometry.files import POINT_ENDINGS, PointCloud, common_unit, read_points, read_scan_mesh
+from scanprep.geometry.files import PointCloud, common_unit, read_view
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
@@ -219,15 +219,3 @@ def marks_of_template(model: BodyModel, given: Path | None, name: str, wanted: b
     if wanted and not kept:
         raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
     return {name: int(vertex) for name, vertex in kept.items()}
-
-
-def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
-    """A mesh, or the points of a file without triangles with the normals and colours that it has."""
-    if path.suffix.lower() in POINT_ENDINGS:
-        return read_points(path, unit)
-    try:
-        return read_scan_mesh(path, unit)
-    except ValueError as error:
-        if "no faces" in str(error):
-            return read_points(path, unit)
-        raise

@@ -23,6 +23,10 @@ class MeshFileError(storage.StorageError):
     """A file of a mesh, points or landmarks that cannot be read: which one, what was expected, what came."""
 
 
+class EmptyFileError(MeshFileError):
+    """A file without a single vertex: of a camera, that it saw nothing."""
+
+
 @dataclass(frozen=True, eq=False)
 class Contents:
     """What a file of any format holds, in the file's own unit and order."""
@@ -32,19 +36,16 @@ class Contents:
     normals: np.ndarray | None = None       # (N, 3)
     colors: np.ndarray | None = None        # (N, 3) in [0, 1]
     objects: tuple[tuple[str, int], ...] = ()       # name and triangles of each, where the format has objects
+    of_file: np.ndarray | None = None       # (M,) which vertex each of the file is here, -1 of one that was left out
 
 
 def load_bytes(path: Path) -> bytes:
     """The whole file, unpacked when its name ends in `.gz`; MeshFileError for one that is missing, damaged or empty."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        what = {FileNotFoundError: "no such file", IsADirectoryError: "expected a file, found a folder"}
-        raise MeshFileError(f"{path}: {what.get(type(error), f'cannot be read ({error.strerror or error})')}") from None
+    data = storage.read_bytes(path, error=MeshFileError)
     if path.suffix.lower() == ".gz":
         data = _unpacked(path, data)
     if not data:
-        raise MeshFileError(f"{path}: the file is empty")
+        raise EmptyFileError(f"{path}: the file is empty")
     return data
 
 
@@ -196,6 +197,13 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     return faces
 
 
+def strip_triangles(strip: np.ndarray) -> np.ndarray:
+    """(F, 3) the triangles of a strip of vertices (n,), all turned the same way; those that repeat one are left out."""
+    faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return np.asarray(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
+
+
 def _folded(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
     """The polygons some of whose triangles (F, 3), `of` (F,) them, face away from the whole."""
     c = vertices[faces]
@@ -241,10 +249,15 @@ def _edge_key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
     return np.minimum(a, b) * count + np.maximum(a, b)
 
 
-def as_colors(values: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """Colours in [0, 1] of values stored as integers of full scale or as floats in [0, 1]."""
-    scale = np.iinfo(kind).max if kind.kind in "iu" else 1.0
-    return np.clip(np.asarray(values, dtype=np.float64) / scale, 0, 1)
+def as_colors(values: np.ndarray, whole: bool = False) -> np.ndarray:
+    """Colours (N, 3) in [0, 1] of a file that does not say which value is white.
+
+    It is 1, or 255 where a value is beyond that or all must be `whole` numbers, or 65535 where one is beyond 255.
+    Some programs write floats a little above 1 for highlights, so 255 begins at 2.
+    """
+    largest = np.nanmax(values, initial=0)
+    white = 1 if largest <= 2 and not whole else 255 if largest <= 255 else 65535
+    return np.clip(np.asarray(values, dtype=np.float64) / white, 0, 1)
 
 
 def as_seen(linear: np.ndarray) -> np.ndarray:

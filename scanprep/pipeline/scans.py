@@ -6,10 +6,9 @@ from pathlib import Path
 
 from ..console import visible
 from ..geometry import storage, tables
-from ..geometry.files import MeshFileError, name_of
+from ..geometry.files import SCAN_ENDINGS, MeshFileError, ending_of, name_of
 from ..geometry.landmarks import landmarks_beside
 
-SCAN_ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".xyz", ".pcd", ".pts")
 TABLE = "scans.csv"
 ABOUT = {"digest": False}         # what is only told in tables: no registration depends on it
 
@@ -74,8 +73,7 @@ def _list_scans(folder: Path) -> dict[str, Path]:
 
 
 def _is_scan(path: Path) -> bool:
-    name = path.name.lower()
-    return name.endswith(SCAN_ENDINGS) and not name.startswith(".") and path.is_file()
+    return ending_of(path) in SCAN_ENDINGS and not path.name.startswith(".") and path.is_file()
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:
