@@ -27,7 +27,7 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
         full: A large run: more scans, finer.
         seed: Another seed scans other people.
     """
-    from .figures import figures
+    from .figures import figures, judge_demo
     from .page import write_page
 
     if quick and full:
@@ -37,4 +37,4 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
     with bar("drawing the report") as progress, space.staging("page") as staged:
         write_page(run, metrics, progress, staged.folder)
     say(f"open {out / 'report.html'} in a browser; {out / 'animation' / 'walk.glb'} in any 3D viewer")
-    return Outcome(out, metrics, {"demo": run.config})
+    return Outcome(out, metrics, {"demo": run.config}, judgement=judge_demo(run))

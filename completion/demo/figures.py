@@ -4,8 +4,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.learning.scape import judge_model
 from scanprep.console import Metric
+from scanprep.judgement import Judgement, judge_many
+from scanprep.pipeline.page import judge_set
 
+from ..mocap.pose.robust import motion_doubts
 from .chain import Demo
 from .truth import adjusted_rand, joint_errors, mean_over_area, surface_error
 
@@ -15,6 +19,14 @@ MM = 1000.0
 def figures(demo: Demo) -> list[Metric]:
     """Run what has not been run, and measure it against the ground truth."""
     return [*_registration(demo), *_skeleton(demo), *_poses(demo), *_completion(demo), *_animation(demo)]
+
+
+def judge_demo(demo: Demo) -> Judgement:
+    """What the results of the chain are worth, by what each says of itself; the truth is in the figures."""
+    set_of_scans = judge_many({one.name: one.judgement for one in judge_set(demo.folder / "set")})
+    motion = Judgement.of(check=motion_doubts([demo.motion], [demo.walk[0]], demo.template))
+    return judge_many({"registration": set_of_scans, "model": judge_model(demo.model),
+                       "completion": demo.completion.judgement, "animation": motion})
 
 
 def _registration(demo: Demo) -> list[Metric]:

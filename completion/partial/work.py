@@ -13,7 +13,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
-from scanprep.console import Metric, Outcome, judgement_row, write_report
+from scanprep.console import Metric, Outcome, judgement_of, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
@@ -54,7 +54,8 @@ class Work:
         start = time.perf_counter()
         metrics = complete_files(self, inputs, room)
         if self.command:
-            write_report(Outcome(room.folder, metrics, {"complete": self.config}), self.command,
+            write_report(Outcome(room.folder, metrics, {"complete": self.config}, judgement=judgement_of(metrics)),
+                         self.command,
                          time.perf_counter() - start)
         return metrics
 

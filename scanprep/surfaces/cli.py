@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 
 from ..alignment.views import AlignViewsConfig, align_views, views_problem
-from ..cleaning.clean_scan import CleanScanConfig, clean_scan
+from ..cleaning.clean_scan import CleanScanConfig, clean_scan, cleaning_doubts
 from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
@@ -18,7 +18,7 @@ from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, name_of, read_mesh, read_scan, write_mesh, write_points
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
-from ..geometry.mesh import Mesh
+from ..geometry.mesh import Mesh, template_problem
 from ..geometry.sanitise import sanitise
 from ..judgement import Judgement
 from ..ranges import Faces
@@ -43,7 +43,8 @@ def template_of_views(views: ViewsArg, output: Output, faces: Faces = 14000, uni
     with bar("making the template") as progress:
         made = make_template(seen, faces, progress=progress)
     write_mesh(output, made)
-    return Outcome(output, [Metric("views", len(seen)), *about_mesh(made)])
+    return Outcome(output, [Metric("views", len(seen)), *about_mesh(made)],
+                   judgement=_as_template(made))
 
 
 def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Unit | None = None,
@@ -70,7 +71,7 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
     return Outcome(output, [
         Metric("points before", len(found.kept)), Metric("points", int(found.kept.sum())),
         *(Metric(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", piece.points, "points")
-          for piece in found.components)], {"clean": config})
+          for piece in found.components)], {"clean": config}, judgement=Judgement.of(check=cleaning_doubts(found)))
 
 
 def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None, features: bool = False,
@@ -108,7 +109,7 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
         {"views": config}, [f"{name}: its place is uncertain" for name in uncertain],
-        Judgement.of(views_problem(found)))
+        judgement=Judgement.of(views_problem(found)))
 
 
 def _view_landmarks(folder: Path, path: Path, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
@@ -133,7 +134,8 @@ def merge(views: ViewsArg, output: Output, unit: Unit | None = None,
     with bar("merging views") as progress:
         merged = merge_views(seen, config, progress)
     write_mesh(output, merged)
-    return Outcome(output, [Metric("views", len(seen)), *about_mesh(merged)], {"merge": config})
+    return Outcome(output, [Metric("views", len(seen)), *about_mesh(merged)], {"merge": config},
+                   judgement=Judgement.of(None if len(merged.faces) else "the views have no surface in common"))
 
 
 def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | None = None,
@@ -160,11 +162,12 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
             report = fill_report(before, config, progress, seen)
             after, holes = report.mesh, report.holes
     write_mesh(output, after)
+    left_open = [f"{len(after.boundary_loops)} holes are still open"] if len(after.boundary_loops) else []
     return Outcome(output, [
         Metric("holes before", len(before.boundary_loops)),
         *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
         Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
-        *about_mesh(after)], {"fill": config})
+        *about_mesh(after)], {"fill": config}, judgement=Judgement.of(check=left_open))
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
@@ -194,7 +197,8 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)
     write_mesh(output, after)
-    return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
+    return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config},
+                   judgement=_as_template(after))
 
 
 def _reduce_set(folder: Path, output: Path, faces: int, config: DecimateSetConfig) -> Outcome:
@@ -203,7 +207,13 @@ def _reduce_set(folder: Path, output: Path, faces: int, config: DecimateSetConfi
         after = write_decimated_set(before, output, faces, config, progress)
     return Outcome(output, [
         Metric("meshes", len(after.entries)), Metric("triangles before", len(before.template.faces)),
-        *about_mesh(after.template)], {"decimate": config})
+        *about_mesh(after.template)], {"decimate": config}, judgement=_as_template(after.template))
+
+
+def _as_template(mesh: Mesh) -> Judgement:
+    """Whether a mesh can be brought onto scans."""
+    problem = template_problem(mesh)
+    return Judgement.of(check=[] if problem is None else [f"not usable as a template: {problem}"])
 
 
 def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
