@@ -29,7 +29,7 @@ def write_shell(shell: ShellArg) -> Outcome:
     parser = argparse.ArgumentParser(prog="scape")
     _add(parser, COMMANDS, "scape")
     sys.stdout.write(shtab.complete(parser, shell) + "\n")
-    return Outcome(None, [])
+    return Outcome(None, [], judgement=None)
 
 
 def _add(parser: argparse.ArgumentParser, commands: Mapping[str, tuple[str, str]], prog: str) -> None:

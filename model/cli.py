@@ -13,6 +13,7 @@ from scanprep.console import Metric, Outcome
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_registered
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 
 from .body import BodyModel
 from .files import load_model
@@ -52,13 +53,15 @@ def info(model: ModelArg) -> Outcome:
     Args:
         model: Model file.
     """
+    from .learning.scape import judge_model
+
     loaded = load_model(model)
     facts = [Metric(name.replace("_", " "), value) for name, value in loaded.info.items()
              if isinstance(value, str | int | float) and name not in TOLD]
     return Outcome(None, [
         Metric("kind", loaded.kind), *about(loaded), Metric("parts", ", ".join(loaded.skeleton.names)),
         Metric("vertices", len(loaded.template.vertices)), Metric("triangles", len(loaded.template.faces)),
-        Metric("landmarks", len(loaded.info.get("landmarks", {}))), *facts])
+        Metric("landmarks", len(loaded.info.get("landmarks", {}))), *facts], judgement=judge_model(loaded))
 
 
 def about(model: BodyModel) -> list[Metric]:
@@ -97,7 +100,8 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
             Metric("pose columns", len(found.correctives)), Metric("pose features", found.features.lift.kind),
             Metric("height of the template", float(np.ptp(found.template.vertices, axis=0).max()), "m"),
             Metric("parts", ", ".join(found.skeleton.names))]
-    return Outcome(output, rows + [Metric("note", note) for note in found.info["notes"].split("; ") if note])
+    return Outcome(output, rows + [Metric("note", note) for note in found.info["notes"].split("; ") if note],
+                   judgement=Judgement())
 
 
 def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_person: bool = False

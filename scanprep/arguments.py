@@ -276,10 +276,10 @@ def read_line(prog: str, text: str, arguments: Sequence[Argument], argv: Sequenc
         word = word.partition("=")[0]
         raise UsageError(f"{word}: no such flag{near(word, (flag for a in arguments for flag in a.flags))}")
     missing = [a.flag for a in arguments if a.required and getattr(given, a.name, None) in (None, [])]
-    first = next((a for a in arguments if a.place), None)
-    if missing and first and first.flag not in missing and not first.place.metavar.startswith("[") and not getattr(
-            given, first.name, None):
-        missing.insert(0, first.flag)                   # it has a default, for the browser alone
+    for first in [a for a in arguments if a.place][:1]:
+        optional = first.place is not None and first.place.metavar.startswith("[")
+        if missing and first.flag not in missing and not optional and not getattr(given, first.name, None):
+            missing.insert(0, first.flag)               # it has a default, for the browser alone
     if missing:
         raise UsageError(f"expected {' and '.join(missing)}, as in: {parser.format_usage()[7:].strip()}")
     return {a.name: a.value(getattr(given, a.name)) if hasattr(given, a.name) else a.default for a in arguments}

@@ -12,7 +12,7 @@ import sys
 import time
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -160,8 +160,9 @@ class Arguments:
     def as_flags(self, text: str) -> str:
         """A message of a function with flags in place of the names of its arguments."""
         for argument in self.listed:
-            text = re.sub(rf"(?<![\w.\-]){argument.name}(?:=['\"]?([\w.]*)['\"]?|(?=: expected))",
-                          lambda found, flag=argument.flag: f"{flag} {found[1] or ''}".rstrip(), text)
+            name = rf"(?<![\w.\-]){argument.name}"
+            text = re.sub(rf"{name}=['\"]?([\w.]+)['\"]?", rf"{argument.flag} \1", text)
+            text = re.sub(rf"{name}(?:=|(?=: expected))", argument.flag, text)
         return text
 
 
@@ -176,6 +177,9 @@ class _Call:
         self.given = self.arguments.settings.taken_from(self.arguments.read(argv))
         self.force = self.given.pop(FORCE, False)
         self.output: Path | None = self.given.get(self.output_name or "")
+        # what stands at its place is the thing itself that a command works on; flags name what is taken along
+        self.inputs = _paths(self.given.get(argument.name) for argument in self.arguments.listed if argument.place)
+        self.used = _paths(value for name, value in self.given.items() if name != self.output_name)
         self._staged: Path | None = None
 
     def real(self, text: str) -> str:
@@ -183,15 +187,24 @@ class _Call:
         staged, output = self._staged, self.output
         return text if staged is None or output is None else text.replace(str(staged), str(output.parent))
 
+    def judged(self, outcome: Outcome) -> Outcome:
+        """An outcome whose judgement has what was told of the files that it was made of."""
+        if outcome.judgement is None:
+            return outcome
+        return dataclasses.replace(outcome, judgement=outcome.judgement.joined(self.before))
+
     def carried_out(self, start: float) -> tuple[Outcome, Path | None]:
         """What the function did, and where its report is."""
         from .batch.opening import beside, workspace
+        from .judgement import carry_judgements
 
+        # before anything is written: an output may be one of the inputs
+        self.before = carry_judgements(self.inputs, self.used)
         if self.output is None:
-            return self.function(**self.given), None
+            return self.judged(self.function(**self.given)), None
         if self.wants_space and not self.beside:
             with workspace(self.output, self.force) as space:
-                outcome = self.function(**self.given, space=space)
+                outcome = self.judged(self.function(**self.given, space=space))
                 with space.staging("report") as staged:
                     report = write_report(dataclasses.replace(outcome, output=staged.folder), self.command,
                                           time.perf_counter() - start)
@@ -199,12 +212,18 @@ class _Call:
         with beside(self.output, self.force) as space, space.staging("output") as staged:
             self._staged = staged.folder
             given = {**self.given, str(self.output_name): staged.folder / self.output.name}
-            outcome = self.function(**given, **({SPACE: space} if self.wants_space else {}))
+            outcome = self.judged(self.function(**given, **({SPACE: space} if self.wants_space else {})))
             made = outcome.output or staged.folder / self.output.name
             top = made if made.is_dir() else made.parent
             written = {p.relative_to(top).as_posix(): space.digests.of_file(p) for p in sorted(top.rglob("*"))
                        if p.is_file()}
             return outcome, write_report(outcome, self.command, time.perf_counter() - start, written)
+
+
+def _paths(values: Iterable[Any]) -> list[Path]:
+    """The files and folders among the values of arguments."""
+    found = [path for value in values for path in (value if isinstance(value, tuple) else (value,))]
+    return [path for path in found if isinstance(path, Path) and path.exists()]
 
 
 @contextlib.contextmanager

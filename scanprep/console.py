@@ -43,19 +43,21 @@ class Metric:
 class Outcome:
     """What a command did: where it wrote, the figures, and what failed on the way.
 
-    `judgement` says what the result is worth, where the command can tell; the files are there whatever it says.
-    `following` is what to do next, in one sentence.
+    `judgement` says what the result is worth; the files are there whatever it says. None is for commands that make
+    none, and show or write down only what a user does. `following` is what to do next, in one sentence.
     """
 
     output: Path | None
     metrics: list[Metric]
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
-    judgement: Judgement | None = None
+    judgement: Judgement | None = dataclasses.field(kw_only=True)
     following: str = ""
 
 
 MOST_ROWS = 12                       # of the closing table: what is read at a glance
+
+
 def details(metrics: Iterable[Metric]) -> list[Metric]:
     """The same rows for the page and report.json only."""
     return [dataclasses.replace(m, detail=True) for m in metrics]
@@ -74,6 +76,14 @@ def judgement_of(metrics: Iterable[Metric]) -> Judgement | None:
     from .judgement import Judgement
 
     return next((Judgement.read(str(m.value)) for m in metrics if m.name == JUDGEMENT), None)
+
+
+def judgement_of_many(results: Results) -> Judgement:
+    """What many results are worth together."""
+    from .judgement import judge_many
+
+    judged = {name: judgement_of(rows) for name, rows in results.values.items()}
+    return judge_many({name: one for name, one in judged.items() if one is not None}, len(results.failures))
 
 
 def failures_of(results: Results) -> list[str]:

@@ -1,9 +1,10 @@
 """What a result is worth, in one word and with its reasons; and what the functions that judge have in common."""
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,6 +13,16 @@ from .geometry.mesh import Mesh
 Verdict = Literal["good", "check", "failed"]
 
 HAND = 0.06                 # of a body's size, the root of its area: a hand's width, 8 cm on a man
+
+# ANSUR II, 6,068 soldiers: 1.41 to 1.99 m, 36 to 144 kg, 15 to 43 kg/m²; one litre of a person weighs about a kilogram.
+# Everybody is more varied than soldiers: an adult beyond 1.40 to 2.10 m or 35 to 200 litres is one in ten thousand.
+ADULTS, VOLUMES = (1.40, 2.10), (35.0, 200.0)          # metres, litres
+ANYBODY = (1.00, 2.30)                                 # metres: a child of four; five men alive are taller than that
+BUILD, ANY_BUILD = (13.0, 55.0), (9.0, 90.0)           # litres per square metre of stature, of people and of anybody
+# Betas of K components are sqrt(K) long on average. `mosh` of good recordings finds up to 2.8 times that, 12 of 18;
+# recordings scaled by 1.6 and 2.54 end at 4.7 and 11 times.
+LONG, TOO_LONG = 3.0, 4.0
+NAMED = 3                                              # results that one judgement of many names
 
 
 @dataclass(frozen=True)
@@ -44,8 +55,124 @@ class Judgement:
         """All reasons in one line."""
         return "; ".join(self.reasons)
 
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """The reasons where it failed."""
+        return self.reasons if self.verdict == "failed" else ()
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The reasons where it is to be looked at."""
+        return self.reasons if self.verdict == "check" else ()
+
+    def joined(self, *others: Judgement) -> Judgement:
+        """The judgement of something of which all these speak: the gravest verdict, its reasons first."""
+        every = (self, *others)
+        return Judgement.of([reason for one in every for reason in one.problems],
+                            [reason for one in every for reason in one.doubts])
+
     def __str__(self) -> str:
         return f"{self.verdict}: {self.why}" if self.reasons else self.verdict
+
+
+def judge_many(results: Mapping[str, Judgement], failures: int = 0) -> Judgement:
+    """What many results are worth together.
+
+    It failed where none of them means anything; it is to be looked at where one does not, or is to be looked at, or
+    where so many `failures` made no result at all.
+    """
+    bad = {name: one for name, one in results.items() if one.verdict != "good"}
+    failed = failures + sum(one.verdict == "failed" for one in bad.values())
+    gravest = sorted(bad.items(), key=lambda item: item[1].verdict != "failed")
+    reasons = [f"{name}: {one.reasons[0]}" for name, one in gravest[:NAMED]]
+    reasons += [f"{len(bad) - NAMED} more of {len(results)} are to be looked at"] if len(bad) > NAMED else []
+    if failed:
+        reasons.insert(0, f"{failed} of {len(results) + failures} failed")
+    whole = failed == len(results) + failures
+    return Judgement.of(reasons) if failed and whole else Judgement.of(check=reasons)
+
+
+def read_judgement(result: Path) -> Judgement | None:
+    """What the report beside a result says of it; None without a report, or where the file is no longer that result.
+
+    `result` is a file that a command wrote, or a folder, or a file in such a folder.
+    """
+    from .batch.digests import Digests
+    from .batch.ownership import report_path
+    from .geometry import storage
+
+    beside = report_path(result)
+    report = beside if beside.is_file() or result.is_dir() else result.parent / "report.json"
+    try:
+        told: Any = storage.read_json(report, "a report")
+        found = told["judgement"]
+        written = told.get("written", {}).get(result.name)
+        judgement = Judgement(found["verdict"], tuple(str(reason) for reason in found["reasons"]))
+    except (storage.StorageError, AttributeError, KeyError, TypeError):
+        return None
+    changed = written is not None and written != Digests().of_file(result)
+    return None if changed or judgement.verdict not in ("good", "check", "failed") else judgement
+
+
+def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judgement:
+    """What results made of others have from them: a failure of any, a doubt of the `inputs` that they are made of.
+
+    `used` are things that are taken along, as a model: what is doubtful in them is not in all that is made with them.
+    """
+    problems, doubts = [], []
+    for path in dict.fromkeys(inputs):
+        one = read_judgement(path)
+        problems += [f"{path}: its own report says that it failed: {one.why}"] if one and one.problems else []
+        doubts += [f"{path}: its own report says to look at it: {one.why}"] if one and one.doubts else []
+        within = {p.parent.name: read_judgement(p.parent) for p in sorted(path.glob("*/report.json"))} \
+            if one is None and path.is_dir() else {}
+        known = {name: judgement for name, judgement in within.items() if judgement is not None}
+        told = judge_many(known)
+        problems += [f"{path}: {reason}" for reason in told.problems]
+        doubts += [f"{path}: {reason}" for reason in told.doubts]
+    for path in dict.fromkeys(used):
+        one = read_judgement(path)
+        problems += [f"{path}: its own report says that it failed: {one.why}"] if one and one.problems else []
+    return Judgement.of(problems, doubts)
+
+
+def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray | None = None) -> Judgement:
+    """Whether a body is one that a person can have, with the likely cause where it is not.
+
+    Parameters
+    ----------
+    stature : float, metres
+    volume : float, litres, optional
+    betas : (K,) float, standard deviations, optional
+
+    Examples
+    --------
+    >>> beyond_people(1.75, 74.0, np.ones(10)).verdict
+    'good'
+    >>> beyond_people(2.61, 290.0).reasons[0]
+    'the person is 2.61 m tall: the wrong unit or scale? (--unit)'
+    """
+    failed, check = [], []
+    if not ANYBODY[0] <= stature <= ANYBODY[1]:
+        failed.append(f"the person is {stature:.2f} m tall: the wrong unit or scale? (--unit)")
+    elif not ADULTS[0] <= stature <= ADULTS[1]:
+        check.append(f"the person is {stature:.2f} m tall: {'a child' if stature < ADULTS[0] else 'a giant'}, or the "
+                     "wrong scale?")
+    if volume is not None and not failed:
+        build = volume / stature**2
+        words = f"the person has {volume:.0f} litres at {stature:.2f} m"
+        if not ANY_BUILD[0] <= build <= ANY_BUILD[1]:
+            failed.append(f"{words}, as nobody has: something else than a person, or several?")
+        elif not BUILD[0] <= build <= BUILD[1] or (stature >= ADULTS[0] and not VOLUMES[0] <= volume <= VOLUMES[1]):
+            check.append(f"{words}: clothes, a second person, or the wrong scale?")
+    if betas is not None and len(betas):
+        length, usual = float(np.linalg.norm(betas)), float(np.sqrt(len(betas)))
+        words = f"the shape is {length:.0f} standard deviations from the mean, {usual:.0f} are usual"
+        if length > TOO_LONG * usual:
+            failed.append(f"{words}: something else than a person, or the wrong scale?")
+        elif length > LONG * usual:
+            check.append(words)
+    return Judgement.of(failed, check)
 
 
 def size(body: Mesh) -> float:

@@ -21,7 +21,7 @@ from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.storage import write_json
 from scanprep.geometry.tables import write_table
-from scanprep.judgement import Judgement
+from scanprep.judgement import Judgement, beyond_people
 
 from ..cli import ModelOrNone, read_model
 from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
@@ -124,11 +124,15 @@ def judged(names: Sequence[str], found: Sequence[Measurements]) -> Judgement:
         elif out:
             doubts.append(f"{name}: {out[0]} is {mine.values[out[0]]:.3g} m")
         doubts += [f"{name}: {turned}; name the model with -m" for turned in mine.turned[:1]]
+        if "stature" in mine.values:
+            known = beyond_people(mine.values["stature"])
+            absurd += [f"{name}: {reason}" for reason in known.problems]
+            doubts += [f"{name}: {reason}" for reason in known.doubts]
         missing = [word for word in mine.missing if word in CATALOGUE]
         if missing:
             doubts.append(f"{name}: no {missing[0].replace('_', ' ')}, {mine.missing[missing[0]]}"
                           + (f", and {len(missing) - 1} others" if len(missing) > 1 else ""))
-    if absurd and len(absurd) == len(names):
+    if absurd and len({line.partition(": ")[0] for line in absurd}) == len(names):
         return Judgement.of(absurd[:TOLD])
     told = [*absurd, *doubts]
     more = [f"{len(told) - TOLD} more, see the table"] if len(told) > TOLD else []

@@ -11,6 +11,7 @@ from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, judgement_of, say
 from scanprep.geometry.landmarks import landmarks_beside
+from scanprep.judgement import judge_many
 from scanprep.pipeline.scans import find_scans
 
 from ..cli import ModelOrNone, read_model
@@ -105,7 +106,7 @@ def _mended(call: FolderCall, space: Workspace) -> Outcome:
     results = kept_results(space, list(app.tasks))
     saved = Metric("bodies saved", len(app.fresh))
     if not results.values and not results.failures:
-        return Outcome(None, [saved])
+        return Outcome(None, [saved], judgement=None)
     outcome = told(call, app.plain.model, results, space, len(app.tasks))
     return replace(outcome, metrics=[saved, *outcome.metrics])
 
@@ -126,10 +127,11 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
     app = CompleteApp(loaded, Work(body_of(loaded, subject, unit), name, marks, config, unit), files, output, labels)
     serve(app)
     if not app.saved:
-        return Outcome(None, [Metric("bodies saved", 0)], {"complete": config, "model": name})
+        return Outcome(None, [Metric("bodies saved", 0)], {"complete": config, "model": name}, judgement=None)
     return Outcome(output, [Metric("bodies saved", len(app.saved)),
                             *(Metric(scan.name, app.made[scan].completion.judgement.verdict) for scan in app.saved)],
-                   {"complete": config, "model": name})
+                   {"complete": config, "model": name}, judgement=judge_many(
+                       {scan.name: app.made[scan].completion.judgement for scan in app.saved}))
 
 
 def _only(masks: tuple[Path, ...]) -> Path | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.people import person_judgement
 from model.priors import stiff_joints
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
@@ -44,6 +45,7 @@ PART_SHOWN = 0.5                     # share of a part within the picture, below
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
 UNLIKELY = 150.0                     # squared deviations of a pose from those that are known, all joints together
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
+MONSTROUS = np.radians(75)           # from any known way to hold a joint; right bodies reach 50, wrong ones 94
 LEFT_OVER = 0.03                     # share of a scan without a body near that is clutter, or a limb elsewhere
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 UNJUDGED = Judgement.of(check=["no judgement was made"])
@@ -165,9 +167,23 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     done = Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()), landmark_rms,
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance))
-    problem = completion_problem(done, given.cloud.points, config.free_scale)
+    problems = [problem for problem in (completion_problem(done, given.cloud.points, config.free_scale),
+                                        contorted(fit, solved.x)) if problem]
     found = doubts(fit, solved.x, error, seen) + left_over(fit, done.explained) + ambiguous(fit, solved.x, rival)
-    return replace(done, judgement=Judgement.of(problem, found))
+    judgement = Judgement.of(problems, found)
+    if isinstance(body, BodyModel):
+        judgement = judgement.joined(person_judgement(body, betas))
+    return replace(done, judgement=judgement)
+
+
+def contorted(fit: ScanFit, x: np.ndarray) -> str | None:
+    """Why the pose of unknowns (P,) is none that a body takes; None where it may be."""
+    names, away = fit.body.skeleton.names, fit.body.joints_from_known(fit.body.split(x)[0])
+    worst = int(away.argmax())
+    if away[worst] <= MONSTROUS:
+        return None
+    return (f"the {joint_in_words(names[worst])} is {np.degrees(away[worst]):.0f} degrees from any way that it is "
+            "known to be held: landmarks of other places, left and right exchanged, or something else than a person?")
 
 
 def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:

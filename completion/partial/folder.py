@@ -15,7 +15,7 @@ from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
-from scanprep.console import Metric, Outcome, failures_of, judgement_of
+from scanprep.console import Metric, Outcome, failures_of, judgement_of, judgement_of_many
 from scanprep.geometry.files import name_of
 from scanprep.pictures.page import Page, link_to
 from scanprep.pictures.scene import SCENE, worst_that_turn
@@ -92,7 +92,8 @@ def written(call: FolderCall, model: str, results: Results, space: Workspace, co
 def told(call: FolderCall, model: str, results: Results, space: Workspace, count: int) -> Outcome:
     """The figures of so many scans; `model` is its name."""
     return Outcome(space.folder, summary(results.values, len(results.fresh), count),
-                   {"complete": call.config, "model": model}, failures_of(results))
+                   {"complete": call.config, "model": model}, failures_of(results),
+                   judgement=judgement_of_many(results))
 
 
 def kept_results(space: Workspace, names: Sequence[str]) -> Results:

@@ -315,8 +315,8 @@ class CompleteApp(PickApp):
                              made.completion, pairs_of(made.places, self.work.marks), made.masked, folder)
         rows += write_worn(folder, made.completion, worn_markers(scan.places, self.work.marks))
         rows += [Metric("completed", "in the browser"), Metric("shape", "known" if made.known else "found")]
-        write_report(Outcome(folder, rows, {"complete": self.work.config}), "scape complete --interactive",
-                     made.seconds)
+        outcome = Outcome(folder, rows, {"complete": self.work.config}, judgement=made.completion.judgement)
+        write_report(outcome, "scape complete --interactive", made.seconds)
         return rows
 
     def close(self) -> None:

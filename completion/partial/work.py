@@ -13,7 +13,7 @@ from model.linear import Subject
 from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
-from scanprep.console import Metric, Outcome, details, judgement_row, write_report
+from scanprep.console import Metric, Outcome, details, judgement_of, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, common_unit, read_view
@@ -34,7 +34,8 @@ from .settings import CompletionConfig
 from .worn import worn_markers, write_worn
 
 EXPECTED, EXPLAINED = "expected error of the body, mean", "share of the scan that lies on the body"
-MEASURED, LEFT = "share of the body that was measured", "what the scan leaves beside the body that was bent onto it, RMS"
+MEASURED = "share of the body that was measured"
+LEFT = "what the scan leaves beside the body that was bent onto it, RMS"
 MEANS = (EXPECTED, EXPLAINED, MEASURED, LEFT)
 
 
@@ -55,7 +56,8 @@ class Work:
         start = time.perf_counter()
         metrics = complete_files(self, inputs, room)
         if self.command:
-            write_report(Outcome(room.folder, metrics, {"complete": self.config}), self.command,
+            write_report(Outcome(room.folder, metrics, {"complete": self.config}, judgement=judgement_of(metrics)),
+                         self.command,
                          time.perf_counter() - start)
         return metrics
 

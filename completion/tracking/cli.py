@@ -81,7 +81,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, metrics, frames.name), write)
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
-                   Judgement.of(wrong_size(found, person) or tracking_problem(motion)))
+                   judgement=Judgement.of(wrong_size(found, person) or tracking_problem(motion)))
 
 
 def wrong_size(frames: FrameFolder, person: Subject) -> str | None:

@@ -47,4 +47,4 @@ def view_files(files: FilesArg = (), model: ModelOrNone = None, over: bool = Fal
         say(f"scape view: note: {problem}")
     show(Pages(app), serve or None, serve is None)
     return Outcome(None, [Metric("things", len(app.entries)), Metric("shown at last", len(app.shown)),
-                          Metric("files saved", len(app.written))])
+                          Metric("files saved", len(app.written))], judgement=None)

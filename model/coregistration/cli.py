@@ -76,7 +76,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     with space.staging("set") as staged:
         write_coregistered(staged.folder, loaded, kept, done)
     return Outcome(output, _figures(done, names), {"coregistration": config}, [*failures, *done.failures.values()],
-                   Judgement.of(coregistration_problem(done, read)))
+                   judgement=Judgement.of(coregistration_problem(done, read)))
 
 
 def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask], done: Coregistration) -> None:

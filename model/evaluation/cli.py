@@ -116,7 +116,8 @@ def sample(model: ModelArg, output: Output,
     return Outcome(output, [
         Metric("bodies", count), Metric("shape components", drawn.betas.shape[1]),
         Metric("largest extent, smallest body", float(extent.min()), "m"),
-        Metric("largest extent, largest body", float(extent.max()), "m")], {"seed": seed, "pose_too": pose_too})
+        Metric("largest extent, largest body", float(extent.max()), "m")], {"seed": seed, "pose_too": pose_too},
+        judgement=Judgement())
 
 
 def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:

@@ -13,6 +13,7 @@ from scanprep.arguments import Called, UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import name_of, write_mesh
+from scanprep.judgement import Judgement
 from scanprep.pictures.camera import upright
 from scanprep.ranges import Beta, Positive
 
@@ -22,6 +23,7 @@ from ..files import load_model
 from ..linear import Subject
 from ..motion.amass import write_amass
 from ..motion.onto import BodyMotion, read_motion
+from ..people import person_judgement
 from .bvh import write_bvh
 from .conventions import for_programs, standing
 from .correctives import motion_correctives, off_exact, pose_features, spaced, write_body_npz
@@ -81,26 +83,27 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
                             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
                             "names": names, "ground": ground, "front": front, "fps": fps})
     loaded = load_model(model)
+    judgement = person_judgement(loaded, np.array(betas)) if betas else Judgement()
     if kind == "npz" and motion is None:
-        return Outcome(output, _npz(output, loaded))
+        return Outcome(output, _npz(output, loaded), judgement=judgement)
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
     moves = None if motion is None else read_motion(motion, loaded, chosen)
     if moves is not None and fps is not None:
         moves = moves.at_rate(fps)
     if kind == "npz":
         assert moves is not None
-        return Outcome(output, _amass(output, model, loaded, moves))
+        return Outcome(output, _amass(output, model, loaded, moves), judgement=judgement)
     person = _person(model, loaded, betas, own_body, moves)
     if kind == "folder":
-        return Outcome(output, _folder(output, loaded, person, moves))
+        return Outcome(output, _folder(output, loaded, person, moves), judgement=judgement)
     if kind == "point cache":
-        return Outcome(output, _points(output, loaded, person, moves, axis))
+        return Outcome(output, _points(output, loaded, person, moves, axis), judgement=judgement)
     if kind == "mesh":
         rest = np.zeros((len(loaded.skeleton.parents), 3))
         body = loaded.template.with_vertices(loaded.vertices(rest, person))
         body = standing(body, body, axis, ground, front)
         write_mesh(output, body)
-        return Outcome(output, [Metric("vertices", len(body.vertices)), _size(output)])
+        return Outcome(output, [Metric("vertices", len(body.vertices)), _size(output)], judgement=judgement)
     if shapes is None:
         # morph targets where nobody says how many
         shapes = 0 if person is None or kind == "bvh" else min(10, loaded.n_betas)
@@ -117,7 +120,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     else:
         write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
     return Outcome(output, [_size(output), *moves.told, *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
-                            Metric("frames", len(poses)), *told])
+                            Metric("frames", len(poses)), *told], judgement=judgement)
 
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,

@@ -24,6 +24,7 @@ from ..files import load_model
 from ..linear import Subject
 from ..motion.files import betas_for
 from ..motion.onto import read_motion
+from ..people import person_judgement
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
@@ -149,7 +150,8 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     body = loaded.template.with_vertices(vertices)
     write_mesh(output, standing(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
     return Outcome(output, [Metric("vertices", len(vertices)),
-                            Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")])
+                            Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")],
+                   judgement=person_judgement(loaded, np.array(betas)) if betas else Judgement())
 
 
 def _read_turns(path: Path) -> dict[str, np.ndarray]:

@@ -1,6 +1,7 @@
 """`scape model resample`: a model with fewer or more triangles."""
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,14 @@ from scanprep.arguments import UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import read_mesh
+from scanprep.judgement import Judgement
 from scanprep.ranges import Faces
 
 from ..cli import ModelArg
 from ..files import load_model
 from .change import ResolutionConfig, change_resolution, resample, resolution_gap
 
+FAR = 0.01                           # metres; half the vertices of a man move his surface by 1 mm
 MEASURED = 20                        # poses in which the two models are compared
 
 
@@ -51,4 +54,11 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         Metric("triangles", len(mesh.faces)),
         *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", 1000.0 * float(value), "mm")
           for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
-        {"resample": config})
+        {"resample": config}, judgement=_judge_gaps(dict(gaps)))
+
+
+def _judge_gaps(gaps: Mapping[str, np.ndarray]) -> Judgement:
+    """Whether bodies are where those of the model before are; a hand's width from them they are something else."""
+    off = {who: float(gap.mean()) for who, gap in gaps.items()}
+    return Judgement.of(check=[f"{who} in random poses lies {1000 * mean:.0f} mm from where it was" for who, mean in
+                               off.items() if mean > FAR])

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,18 +12,28 @@ from scanprep.arguments import UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
-from scanprep.cleaning.clean_scan import clean_scan
+from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.cli import MM, Output, ScanArg, Unit
-from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, judgement_row, write_report
+from scanprep.console import (
+    Metric,
+    Outcome,
+    bar,
+    failures_of,
+    judgement_of,
+    judgement_of_many,
+    judgement_row,
+    write_report,
+)
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import Judgement
+from scanprep.judgement import NAMED, Judgement, beyond_people
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
+from scanprep.skeleton.roles import in_words
 from scanprep.surfaces.cloud import read_surface
 
 from ..files import load_model
@@ -50,6 +61,9 @@ from .registration.automatic import likely_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
 
+CRUMPLED = 0.02              # inverted triangles of a frame; the walk of a person has 0.005, folds of elbows and groins
+FOLDED, TORN = 0.06, 0.25    # share of the control mesh that is folded; persons who stand have up to 0.014
+LACKING, EMPTY = 0.75, 0.4   # share that is measured; persons seen from all sides have 0.94, one half of one 0.5
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
@@ -90,7 +104,7 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
     with bar("fitting statues") as progress:
         results = space.run(work, [Task(one.name, one, one.name) for one in found], workers, progress)
     return Outcome(output, [Metric("scans", len(found)), Metric("statues", len(results.values))], {"statue": config},
-                   failures_of(results))
+                   failures_of(results), judgement=judgement_of_many(results))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +119,7 @@ class Work:
     def __call__(self, inputs: ScanTask, room: Room) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
-        scan, texture, rows = read_scan(inputs, self.unit)
+        scan, texture, rows, doubts = read_scan(inputs, self.unit)
         joints = points = None
         if inputs.landmarks is not None:
             joints, points = read_features(inputs.landmarks, self.control, scan, self.unit)
@@ -115,14 +129,16 @@ class Work:
             image = room.step("texture", (self, inputs), lambda: bake_texture(
                 statue.control, statue.map, scan_look(texture or scan)))
             statue = replace(statue, texture=image)
-        metrics = write_statue(room.folder, inputs.scan.name, scan, statue, rows)
+        metrics = write_statue(room.folder, inputs.scan.name, scan, statue, rows, doubts)
         if self.command:
-            write_report(Outcome(room.folder, metrics, {"statue": self.config}), self.command,
+            write_report(Outcome(room.folder, metrics, {"statue": self.config}, judgement=judgement_of(metrics)),
+                         self.command,
                          time.perf_counter() - start)
         return metrics
 
 
-def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows: list[Metric]) -> list[Metric]:
+def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows: list[Metric],
+                 doubts: Sequence[str] = ()) -> list[Metric]:
     """Write a statue with its files for other programs and its page; the figures."""
     save_statue(folder, statue)
     levels, fine = measured_levels(statue, scan)
@@ -131,8 +147,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     write_body(folder, statue)
     write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, statue.upright_axis)
     stored = sum((folder / file).stat().st_size for file in ("control.npz", "displacement.png", "coverage.png"))
-    problem = statue_problem(statue)
-    rows = [judgement_row(Judgement.of(problem)), *rows, *_of_the_fit(statue),
+    rows = [judgement_row(judge_statue(statue, scan, doubts)), *rows, *_of_the_fit(statue),
             *_of_the_map(statue, scan, levels, adaptive, fine),
             Metric("control model and map on disk", stored / 1e6, "MB"),
             Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]
@@ -143,18 +158,28 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     return rows
 
 
-def statue_problem(statue: Statue) -> str | None:
-    """Why a statue means nothing; None where it means something."""
+def judge_statue(statue: FittedStatue, scan: Mesh, left_out: Sequence[str] = ()) -> Judgement:
+    """What a statue is worth, with the likely cause where it is not good; `left_out` are doubts of the cleaning."""
     shares = coverage_shares(statue.control, statue.map)
-    if shares["folded"] <= 0.25 and shares["measured"] >= 0.1:
-        return None
-    return (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
-            f"{100 * shares['measured']:.0f}% has data one-to-one; the control model is not where the person is; "
-            "features given by hand (--features) may help")
+    told = (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
+            f"{100 * shares['measured']:.0f}% has data one-to-one")
+    failed, check = [], list(left_out)
+    if shares["folded"] > TORN or shares["measured"] < EMPTY:
+        failed.append(f"{told}; a part of a person only, or the control model is not where the person is: features "
+                      "given by hand (--features) may help")
+    elif shares["folded"] > FOLDED or shares["measured"] < LACKING:
+        check.append(told)
+    lacking = parts_without_data(statue)
+    check += [f"the scan has no data on {', '.join(in_words(name) for name in lacking[:NAMED])}"] if lacking else []
+    check += [statue.posed.problem] if statue.posed and statue.posed.problem else []
+    found = Judgement.of(failed, check)
+    if statue.control.skeleton.names != humanoid().skeleton.names:
+        return found
+    return found.joined(beyond_people(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
 
 
-def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric]]:
-    """The body of a scan and its texture in metres, and what was left out.
+def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
+    """The body of a scan and its texture in metres, what was left out, and whether that is doubtful.
 
     Without a unit it is metres where features are given, which may be on anything, else that of a person.
     """
@@ -164,6 +189,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     rows = [Metric("scan, triangles", len(scan.faces))]
     metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
+    doubts = cleaning_doubts(cleaned)
     body = cleaned.mesh
     if sought:                               # once more of the body alone: a floor may be of any size
         likely = likely_unit(body.vertices / metre)
@@ -172,7 +198,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     left = 1 - float(cleaned.kept.mean())
     if left > 0:
         rows.append(Metric("left out as floor, furniture, specks", 100 * left, "% of the points"))
-    return body, texture and texture.scaled(metre), rows
+    return body, texture and texture.scaled(metre), rows, doubts
 
 
 def _of_the_fit(statue: FittedStatue) -> list[Metric]:
@@ -236,7 +262,7 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
         moved = np.linalg.norm(mesh.vertices - before, axis=1)
         rows += [Metric("vertices moved by the edited image", int((moved > 1e-6).sum())),
                  Metric("largest of these moves", MM * float(moved.max()), "mm")]
-    return Outcome(output, rows)
+    return Outcome(output, rows, judgement=Judgement())
 
 
 def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | None = None,
@@ -290,7 +316,14 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
                 progress(t + 1, len(bodies))
     inverted = [len(inverted_triangles(control, body, fine, detailed(body))) for body in shown]
     return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", rate, "1/s"), *rows,
-                            Metric("inverted triangles in a frame, most", max(inverted))], {"level": level})
+                            Metric("inverted triangles in a frame, most", max(inverted))], {"level": level},
+                   judgement=_judge_motion(max(inverted) / len(fine.faces)))
+
+
+def _judge_motion(inverted: float) -> Judgement:
+    """Whether the skin of a moving statue stays whole, by the share of triangles inverted in the worst frame."""
+    return Judgement.of(check=[f"{100 * inverted:.1f}% of the triangles are inverted in a frame: the pose is beyond "
+                               "what the skin can follow"] if inverted > CRUMPLED else [])
 
 
 def _following(statue: Statue, motion: Path, model: Path, registered: Path | None) -> tuple[np.ndarray, float]:

@@ -17,6 +17,8 @@ from .floor import Plane, find_plane, floor_points
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 MUTUAL, SPARSE = 6, 3.0              # neighbours of a point where points are few, and how far off, in links
 STEPS = 5.0                          # spacings between the steps of a depth camera on a surface that it sees slantwise
+# a piece left out that is so large against the body, and has so many of its points, may be a person: a child has half
+SECOND = (0.5, 0.25)
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 
 
@@ -72,6 +74,16 @@ class CleanedScan:
     def mesh(self) -> Mesh:
         """The body as a mesh; without triangles when a point cloud was given."""
         return _as_mesh(self.scan)
+
+
+def cleaning_doubts(found: CleanedScan) -> list[str]:
+    """Why a cleaned scan is to be looked at: a piece that may be a second person was taken for furniture."""
+    body = max((max(piece.size) for piece in found.components if piece.kept), default=0.0)
+    points = max((piece.points for piece in found.components if piece.kept), default=0)
+    others = [piece for piece in found.components if piece.reason == FAR
+              and max(piece.size) >= SECOND[0] * body and piece.points >= SECOND[1] * points]
+    return [f"a piece {max(piece.size):.2f} m large with {piece.points} points was left out: a second person?"
+            for piece in others[:1]]
 
 
 def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,

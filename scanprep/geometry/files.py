@@ -32,8 +32,8 @@ from .seams import merged_mean, seams_closed
 from .thinning import thin_scan
 
 __all__ = ["ENDINGS", "SCAN_ENDINGS", "UNITS", "EmptyFileError", "MeshFileError", "PointCloud", "Registered",
-           "common_unit", "ending_of", "list_meshes", "name_of", "read_mesh", "read_points", "read_registered", "read_scan",
-           "read_scan_mesh", "read_view", "write_mesh", "write_points"]
+           "common_unit", "ending_of", "list_meshes", "name_of", "read_mesh", "read_points", "read_registered",
+           "read_scan", "read_scan_mesh", "read_view", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
@@ -132,6 +132,7 @@ def _has_faces(contents: Contents) -> bool:
 
 def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
     """The mesh of a file, in metres and with its seams closed."""
+    assert contents.faces is not None, "only files with triangles are meshes"
     try:
         mesh = Mesh(contents.vertices, contents.faces, contents.colors, contents.of_file)
     except ValueError as error:
@@ -222,7 +223,7 @@ def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
     normals = contents.normals
     if normals is not None:
         normals = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
-    if normals is None and _has_faces(contents):
+    if normals is None and contents.faces is not None and len(contents.faces):
         normals = Mesh(points, contents.faces).vertex_normals
     return PointCloud(points, normals, contents.colors)
 

@@ -16,6 +16,7 @@ from ..cleaning.clean_scan import CleanScanConfig
 from ..cli import MM, Output, Person, SetArg
 from ..console import Metric, Outcome, bar, say
 from ..geometry.mesh import Mesh
+from ..judgement import Judgement, judge_many
 from .again import LISTED, Call
 from .figures import Limits, Verdict
 from .page import PAGE, judge_set, write_set_page
@@ -62,9 +63,10 @@ def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], 
     done = prepare(tasks, body, marks, space.folder, call.config, *tell)
     with space.staging("run") as staged:
         call.write(staged.folder)
-    return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(judge_set(space.folder)),
+    verdicts = judge_set(space.folder)
+    return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(verdicts),
                                   Metric("unit assumed", call.config.scan.unit or "m")],
-                   {"prepare": call.config}, list(done.failures),
+                   {"prepare": call.config}, list(done.failures), judgement=_of_set(verdicts),
                    following=f"open {space.folder / 'report.html'}, then "
                              f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
@@ -80,7 +82,13 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B00
     with workspace(registered) as space, space.staging("page") as staged:
         write_set_page(registered, limits, to=staged.folder)
     say(f"written: {registered / PAGE}")
-    return Outcome(None, _quality(judge_set(registered, limits)), {"limits": limits})
+    verdicts = judge_set(registered, limits)
+    return Outcome(None, _quality(verdicts), {"limits": limits}, judgement=_of_set(verdicts))
+
+
+def _of_set(verdicts: Sequence[Verdict]) -> Judgement:
+    """What a set is worth: of the verdicts on its scans."""
+    return judge_many({verdict.name: verdict.judgement for verdict in verdicts})
 
 
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:

@@ -165,13 +165,16 @@ class Verdict:
 
 
 def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: float, faces: int,
-           limits: Limits | None = None, doubts: Mapping[str, Sequence[Doubt]] | None = None) -> list[Verdict]:
+           limits: Limits | None = None, doubts: Mapping[str, Sequence[Doubt]] | None = None,
+           usual: float | None = None) -> list[Verdict]:
     """Verdicts on all scans, worst first; `size` of the template in metres, the number of its `faces`.
 
-    `doubts` are what in each scan no person can do.
+    `doubts` are what in each scan no person can do; `usual` is the share of vertices that scanners leave without data,
+    the median of these scans if not given.
     """
     limits = limits or Limits()
-    usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
+    if usual is None:
+        usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
     known = {f.name: f for f in figures}
     verdicts = [Verdict(name, np.inf, (reason,), known.get(name)) for name, reason in sorted(failures.items())]
     judged = [_judge(f, size, faces, usual, limits, (doubts or {}).get(f.name, ())) for f in figures

@@ -26,10 +26,12 @@ from ..geometry.landmarks import (
     shared_landmarks,
 )
 from ..geometry.mesh import Mesh
-from ..judgement import Judgement
+from ..judgement import Judgement, beyond_people, size
+from ..pipeline.figures import review
+from ..pipeline.scan import figures_of
 from .limbs import limb_doubts
-from .nonrigid import register, registration_problem
-from .person import person_parts
+from .nonrigid import Registration, register, registration_problem
+from .person import PersonParts, person_parts, stature
 from .repair import repaired
 from .schedule import RegistrationConfig
 
@@ -70,6 +72,7 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
         judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, found)))
 
 
+UNSEEN = 0.15                        # share of vertices that four views of a person leave without data
 NO_LANDMARKS = Path("none")          # as `--landmarks none`
 
 
@@ -138,7 +141,6 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     with bar("trying other rolls of limbs") as progress:
         fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
     write_mesh(output, fit.mesh)
-    doubts = limb_doubts(body, parts, fit.mesh.vertices) if parts else ()
     return Outcome(output, [
         *_led_by(given, pairs),
         Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
@@ -148,11 +150,22 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
         Metric("converged", str(fit.converged))], {"register": config},
-        judgement=Judgement.of(registration_problem(body, data, fit, pairs is not None),
-                               [doubt.words for doubt in doubts]))
+        judgement=judge_registration(scan.name, body, data, fit, pairs, parts))
 
 
 Landmarks = tuple[np.ndarray, np.ndarray]
+
+
+def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, pairs: Landmarks | None,
+                       parts: PersonParts | None) -> Judgement:
+    """What the registration of one scan is worth: by the limits of a set of scans, and whether it is of a person."""
+    problem = registration_problem(template, scan, fit, pairs is not None)
+    doubts = limb_doubts(template, parts, fit.mesh.vertices) if parts else ()
+    verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
+                     len(template.faces), doubts={name: doubts}, usual=UNSEEN)[0]
+    if parts is None or problem is not None:
+        return verdict.judgement
+    return verdict.judgement.joined(beyond_people(stature(template, parts, fit.mesh.vertices)))
 
 
 def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path | None,

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..correspondence.correlated import find_correspondences, find_seeds
+from ..geometry.format_glb import tallest
 from ..geometry.landmark_names import known_landmarks
 from ..geometry.landmarks import match_landmarks
 from ..geometry.mesh import Mesh
@@ -52,6 +53,21 @@ def person_parts(template: Mesh, progress: Callable[[int, int], None] | None = N
 
 
 _known: WeakKeyDictionary[Mesh, PersonParts | None] = WeakKeyDictionary()
+
+
+def stature(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> float:
+    """How tall a person is in whatever pose, metres: as much more than the template as the bones are longer.
+
+    `vertices` (N, 3), metres, are the template's on the person.
+    """
+    regressor, parents = parts.skeleton.joint_regressor(template), parts.skeleton.parents
+
+    def bones(body: np.ndarray) -> float:
+        joints = regressor @ body
+        return float(np.linalg.norm(joints[1:] - joints[parents[1:]], axis=1).sum())
+
+    height = float(np.ptp(template.vertices[:, tallest(template.vertices)]))
+    return height * bones(vertices) / bones(template.vertices)
 
 
 def _found(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:

@@ -84,7 +84,8 @@ def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, ed
     after = apply_edits(before, body, wanted, poses)
     after.save(output)
     return Outcome(output, [Metric("edits", len(wanted)), Metric("parts before", len(before.parents)),
-                            Metric("parts", len(after.parents)), *_shares(after, body)], {"edits": wanted})
+                            Metric("parts", len(after.parents)), *_shares(after, body)], {"edits": wanted},
+                   judgement=Judgement())
 
 
 def _asked(merge: tuple[str, str] | None, split: str | None, rename: tuple[str, str] | None,

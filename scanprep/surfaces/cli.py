@@ -8,7 +8,7 @@ import numpy as np
 
 from ..alignment.views import AlignViewsConfig, align_views, views_problem
 from ..arguments import Called, Place, UsageError
-from ..cleaning.clean_scan import CleanScanConfig, clean_scan
+from ..cleaning.clean_scan import CleanScanConfig, clean_scan, cleaning_doubts
 from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar, say
 from ..dataset import RegisteredSet
@@ -92,7 +92,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
     for note in notes:
         say(f"note: {note}")
     return Outcome(output, [*rows, Metric("landmarks carried", len(marks)), *about_mesh(made)],
-                   judgement=Judgement.of(check=doubts))
+                   judgement=_as_template(made).joined(Judgement.of(check=doubts)))
 
 
 def _files_of(folder: Path) -> list[Path]:
@@ -126,7 +126,8 @@ def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None) -> Outc
     after = repair(before)
     write_mesh(output, after)
     return Outcome(output, [Metric("fault found first", template_problem(before) or "none"),
-                            Metric("triangles before", len(before.faces)), *about_mesh(after)])
+                            Metric("triangles before", len(before.faces)), *about_mesh(after)],
+                   judgement=_as_template(after))
 
 
 def _manifold(mesh: Mesh, path: Path) -> Mesh:
@@ -166,7 +167,7 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
     return Outcome(output, [
         Metric("points before", len(found.kept)), Metric("points", int(found.kept.sum())),
         *(Metric(f"{why}, {len(points)} pieces" if len(points) > 1 else why, sum(points), "points")
-          for why, points in pieces.items())], {"clean": config})
+          for why, points in pieces.items())], {"clean": config}, judgement=Judgement.of(check=cleaning_doubts(found)))
 
 
 def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None,
@@ -204,7 +205,7 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
         {"views": config}, [f"{name}: its place is uncertain" for name in uncertain],
-        Judgement.of(views_problem(found)))
+        judgement=Judgement.of(views_problem(found)))
 
 
 def _view_landmarks(folder: Path, path: Path, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
@@ -229,7 +230,8 @@ def merge(views: ViewsArg, output: Output, unit: Unit | None = None,
     with bar("merging views") as progress:
         merged = merge_views(seen, config, progress)
     write_mesh(output, merged)
-    return Outcome(output, [Metric("views", len(seen)), *about_mesh(merged)], {"merge": config})
+    return Outcome(output, [Metric("views", len(seen)), *about_mesh(merged)], {"merge": config},
+                   judgement=Judgement.of(None if len(merged.faces) else "the views have no surface in common"))
 
 
 def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | None = None,
@@ -257,11 +259,12 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
             report = fill_report(before, config, progress, seen)
             after, holes = report.mesh, report.holes
     write_mesh(output, after)
+    left_open = [f"{len(after.boundary_loops)} holes are still open"] if len(after.boundary_loops) else []
     return Outcome(output, [
         Metric("holes before", len(before.boundary_loops)),
         *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
         Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
-        *about_mesh(after)], {"fill": config})
+        *about_mesh(after)], {"fill": config}, judgement=Judgement.of(check=left_open))
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
@@ -294,7 +297,8 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)
     write_mesh(output, after)
-    return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
+    return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config},
+                   judgement=_as_template(after))
 
 
 def _reduce_set(folder: Path, output: Path, faces: int, config: DecimateSetConfig) -> Outcome:
@@ -303,7 +307,13 @@ def _reduce_set(folder: Path, output: Path, faces: int, config: DecimateSetConfi
         after = write_decimated_set(before, output, faces, config, progress)
     return Outcome(output, [
         Metric("meshes", len(after.entries)), Metric("triangles before", len(before.template.faces)),
-        *about_mesh(after.template)], {"decimate": config})
+        *about_mesh(after.template)], {"decimate": config}, judgement=_as_template(after.template))
+
+
+def _as_template(mesh: Mesh) -> Judgement:
+    """Whether a mesh can be brought onto scans."""
+    problem = template_problem(mesh)
+    return Judgement.of(check=[] if problem is None else [f"not usable as a template: {problem}"])
 
 
 def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
@@ -316,6 +326,6 @@ def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]
         if missing:
             raise ValueError(f"none for {', '.join(missing)}")
         where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
-        unit = common_unit(paths, unit)
-        places = [UNITS[unit or "m"] * storage.numbers(where, name_of(path), 3) for path in paths]
-    return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]
+        common = common_unit(paths, unit)
+        places = [UNITS[common or "m"] * storage.numbers(where, name_of(path), 3) for path in paths]
+    return [(read_mesh(path, common), place) for path, place in zip(paths, places, strict=True)]

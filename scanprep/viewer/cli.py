@@ -77,7 +77,8 @@ def _shown(app: PickApp, serve: Port | None) -> Outcome:
     return Outcome(None, [Metric("bodies with landmarks", len(done)),
                           Metric("landmarks", sum(len(one.places) for one in done)),
                           Metric("more than before", sum(len(one.places) - before[one.path] for one in done)),
-                          *(Metric(one.path.name, len(one.places), f"in {one.file.name}") for one in done)])
+                          *(Metric(one.path.name, len(one.places), f"in {one.file.name}") for one in done)],
+                   judgement=None)
 
 
 def _files(scans: tuple[Path, ...]) -> list[tuple[Path, Path | None]]:

@@ -14,7 +14,7 @@ from scanprep.arguments import Place
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of
+from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, judgement_of_many
 from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page, link_to
 from scanprep.ranges import BETAS
@@ -87,7 +87,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
     with space.staging("page") as staged:
         _folder_page(results).write(staged.folder / "report.html")
-    return Outcome(output, _summary(results, len(found)), settings, failures_of(results))
+    return Outcome(output, _summary(results, len(found)), settings, failures_of(results),
+                   judgement=judgement_of_many(results))
 
 
 def _summary(results: Results, count: int) -> list[Metric]:

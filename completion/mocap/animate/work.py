@@ -8,6 +8,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.people import person_judgement
 from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM
@@ -34,7 +35,7 @@ from ..files.opensim import believed
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
+from ..pose.robust import markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
@@ -95,7 +96,10 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        judgement = Judgement.of(problem, (*worn.doubts(), *hardly_seen([motion]), *hardly_believed([motion])))
+        doubts = (*worn.doubts(), *motion_doubts([motion], [sequence], body.template))
+        judgement = Judgement.of(problem, doubts)
+        if found is not None:
+            judgement = person_judgement(self.model, found.betas).joined(judgement)
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body, believed(motion, sequence))
         metrics += write_glb(output / "animation.glb", motion, body)

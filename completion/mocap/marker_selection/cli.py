@@ -15,6 +15,7 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
@@ -75,7 +76,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
         part.write_text(chart_rows(result), encoding="utf-8")
     design_page(result, loaded, among, labels, metrics).write(output / "report.html")
     settings = {"design": config, "model": name, "candidates": candidates, "keep": keep, "poses": poses}
-    return Outcome(output, metrics, settings)
+    return Outcome(output, metrics, settings, judgement=Judgement())
 
 
 def _candidates(model: BodyModel, given: str | None, kept: MarkerLayout | None) -> MarkerLayout:

@@ -12,12 +12,13 @@ from model.files import load_model
 from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
-from scanprep.console import Metric, Outcome, bar, say
+from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmark_writing import marker_set
 from scanprep.geometry.landmarks import read_landmarks, read_template_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 from scanprep.registration.person import average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.landmarks import landmarks as synthetic_landmarks
@@ -53,7 +54,7 @@ def list_layouts() -> Outcome:
     Example: scape layout list
     """
     return Outcome(None, [Metric(name, count, f"markers; {about} On {bodies}.")
-                          for name, count, about, bodies in layout_summaries()])
+                          for name, count, about, bodies in layout_summaries()], judgement=None)
 
 
 def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, body: Path | None = None,
@@ -91,7 +92,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
             storage.write(output / "markerset.xml", marker_set(opensim_markers(found, shown, skeleton)))
     layout_page(layout, shown, found, picture, {m.name: f"{m.text()} {m.unit}" for m in figures}, skeleton
                 ).write(output / "report.html")
-    return Outcome(output, [Metric("body", name), *figures], {"layout": layout})
+    return Outcome(output, [Metric("body", name), *figures], {"layout": layout}, judgement=Judgement())
 
 
 def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | None = None,
@@ -135,16 +136,17 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
     result.layout.save(output)
     save_png(output.with_suffix(".png"), picture_layout(theirs, result.layout))
     write_mesh(output.with_suffix(".registered.ply"), result.registered)
-    if result.uncovered > UNCERTAIN:
-        say(f"note: {result.uncovered:.0%} of {target} is not covered by the source; look at "
-            f"{output.with_suffix('.png')}, and name landmarks if limbs are wrong")
+    doubts = [f"{result.uncovered:.0%} of the target is not covered by the source; look at "
+              f"{output.with_suffix('.png').name}, and name landmarks if limbs are wrong"] \
+        if result.uncovered > UNCERTAIN else []
     return Outcome(output, [
         *_figures(result.layout, theirs), Metric("landmarks", 0 if pairs is None else len(pairs[0])),
         Metric("distance of the registered source, RMS", MM * result.rms, "mm"),
         *([] if pairs is None else [Metric("distance of landmarks, RMS", MM * result.landmark_rms, "mm")]),
         Metric("target not covered", 100 * result.uncovered, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
-        Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout})
+        Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout},
+        judgement=Judgement.of(check=doubts))
 
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None

@@ -14,6 +14,7 @@ from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import HOME, Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, details, judgement_of, say
+from scanprep.judgement import Judgement, judge_many
 from scanprep.pictures.page import Page
 
 from ..marker_sets.named import choose_layout
@@ -87,16 +88,17 @@ def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str
     _tell(actors)
     done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *tell)
     failures = [line if line.startswith(f"{name}: ") else f"{name}: {line}" for name, line in done.failures.items()]
-    for name, (rows, failed) in done.values.items():
-        judgement = judgement_of(rows)
-        told = judgement.reasons if judgement is not None and judgement.verdict == "failed" else ()
-        failures += [f"{name}: {line}" for line in [*told, *failed]]
+    judged = {name: judgement_of(rows) or Judgement() for name, (rows, _) in done.values.items()}
+    for name, (_, failed) in done.values.items():
+        failures += [f"{name}: {line}" for line in [*judged[name].problems, *failed]]
     metrics = {name: [m for m in rows if m.name != JUDGEMENT] for name, (rows, _) in done.values.items()}
     with space.staging("page") as staged:
         _page(actors, metrics, failures).write(staged.folder / "report.html")
         call.write(staged.folder / HOME)
     settings = {"mosh": call.config, "model": loaded.name, "layout": call.layout, "held out": call.hold_out}
     return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures,
+                   judgement=judge_many(judged, len(done.failures)) if len(actors) > 1 or not judged else
+                   next(iter(judged.values())),
                    following=f"open {space.folder / 'report.html'}")
 
 

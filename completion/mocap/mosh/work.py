@@ -4,7 +4,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.learning.sexes import SexGuess
+from model.people import person_judgement
 from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM
@@ -29,7 +30,7 @@ from ..files.motion_files import joint_centres, write_glb, write_motion, write_r
 from ..files.opensim import centre_sequence
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.robust import hardly_believed, hardly_seen, markers_told, motion_problem
+from ..pose.robust import markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
@@ -82,8 +83,10 @@ class Work:
         pages -= clocks()
         problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
         motions = [take.motion for take in found.takes]
-        doubts = (*found.result.worn.doubts(), *hardly_seen(motions), *hardly_believed(motions))
-        metrics = [judgement_row(Judgement.of(problems, doubts)), Metric("model", self.name), *_person_metrics(found),
+        doubts = (*found.result.worn.doubts(), *motion_doubts(motions, [take.markers for take in found.takes],
+                                                              found.model.template))
+        judgement = found.person.joined(Judgement.of(problems, doubts))
+        metrics = [judgement_row(judgement), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                     settings).write(folder / "report.html")
@@ -92,7 +95,7 @@ class Work:
         whole = clocks() - start
         # not on the page: it is the same however often it is made
         metrics += _times(found, {"files": whole - solved - pages, "pages": pages}, whole)
-        write_report(Outcome(folder, metrics, settings, failures), self.command, float(whole[0]))
+        write_report(Outcome(folder, metrics, settings, failures, judgement=judgement), self.command, float(whole[0]))
         room.tell(2 * HALF, 2 * HALF)
         return metrics, failures
 
@@ -107,6 +110,11 @@ class _Found:
     takes: list[Take]
     usual: MarkerLayout
     layout_name: str
+
+    @cached_property
+    def person(self) -> Judgement:
+        """Whether the body is one that a person can have."""
+        return person_judgement(self.model, self.result.betas)
 
     def problem(self, take: Take) -> str | None:
         """Why the motion of a sequence means nothing."""
@@ -178,8 +186,8 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, picture)
-        doubts = (*found.result.worn.doubts(), *hardly_seen([take.motion]), *hardly_believed([take.motion]))
-        judgement = Judgement.of(found.problem(take), doubts)
+        doubts = (*found.result.worn.doubts(), *motion_doubts([take.motion], [take.markers], found.model.template))
+        judgement = found.person.joined(Judgement.of(found.problem(take), doubts))
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 

@@ -15,6 +15,10 @@ from ..marker_sets.layout import MarkerLayout
 from .settings import AnimateConfig
 from .swaps import DEVIATION, find_order
 
+DOUBTFUL = 0.018                     # of the size, 25 mm on a man; good motions are 4 to 25 mm off, shuffled frames 31
+# Sizes a second at which the median marker moves, 7 m/s on a man, over steps of so many seconds. Walking has 1, running
+# 4; a walk told ten times too fast 12, one with shuffled frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
+HASTY, STEP = 5.0, 1 / 30
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are swapped, and put back
 
 
@@ -138,6 +142,27 @@ def hardly_seen(motions: Sequence[Motion]) -> tuple[str, ...]:
     frames = sum(len(motion.residuals) for motion in motions)
     return (f"{few} of {frames} frames show fewer than 3 markers: the body there is carried over from the others",
             ) if few > frames / 2 else ()
+
+
+def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], body: Mesh) -> tuple[str, ...]:
+    """Reasons to look at motions of one body, made from markers; `body` is the model's template."""
+    reasons = [*hardly_seen(motions), *hardly_believed(motions)]
+    found = [motion.residuals[np.isfinite(motion.residuals)] for motion in motions]
+    off = float(np.concatenate(found).mean()) if any(map(len, found)) else 0.0
+    if off > DOUBTFUL * size(body):
+        reasons.append(f"the markers are {1000 * off:.0f} mm from where the body has them")
+    speed = max((marker_speed(one) for one in markers), default=0.0) / size(body)
+    if speed > HASTY:
+        reasons.append(f"the markers move at {speed * size(body):.0f} m/s: frames in another order, or the wrong rate?")
+    return tuple(reasons)
+
+
+def marker_speed(markers: MarkerSequence) -> float:
+    """Median speed of all markers, metres per second, over steps of about a thirtieth of a second."""
+    step = max(1, round(markers.rate * STEP))
+    moved = np.linalg.norm(markers.positions[step:] - markers.positions[:-step], axis=2)
+    known = moved[np.isfinite(moved)]
+    return float(np.median(known)) * markers.rate / step if len(known) else 0.0
 
 
 def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:

@@ -1,0 +1,30 @@
+"""Whether the body that a model of people makes of betas is one that a person can have."""
+from __future__ import annotations
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement, beyond_people
+from scanprep.pictures.camera import tallest
+from scanprep.skeleton.roles import find_roles
+
+from .body import BodyModel
+
+HUMAN = {"skullbase", "l_hip", "r_hip", "l_knee", "r_knee"}    # joints that a horse has not under these names
+
+
+def person_judgement(model: BodyModel, betas: np.ndarray | None) -> Judgement:
+    """Whether the body of betas (k,) is one that a person can have; of models of other things nothing is said.
+
+    Without betas it is the template's own body.
+    """
+    if not find_roles(model.skeleton.names).keys() >= HUMAN:
+        return Judgement()
+    body = model.subject(betas).vertices(np.zeros((len(model.skeleton.parents), 3)))
+    return beyond_people(*stature_and_volume(model.template.with_vertices(body)), betas)
+
+
+def stature_and_volume(body: Mesh) -> tuple[float, float | None]:
+    """Metres along the tallest axis of a body that stands, and litres; None for a surface that is open."""
+    height = float(np.ptp(body.vertices[:, tallest(body.vertices)]))
+    return height, 1000 * abs(body.volume) if body.is_closed else None
