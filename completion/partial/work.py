@@ -34,7 +34,8 @@ from .settings import CompletionConfig
 from .worn import worn_markers, write_worn
 
 EXPECTED, EXPLAINED = "expected error of the body, mean", "share of the scan that lies on the body"
-MEASURED, LEFT = "share of the body that was measured", "what the scan leaves beside the body that was bent onto it, RMS"
+MEASURED = "share of the body that was measured"
+LEFT = "what the scan leaves beside the body that was bent onto it, RMS"
 MEANS = (EXPECTED, EXPLAINED, MEASURED, LEFT)
 
 
