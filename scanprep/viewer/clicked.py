@@ -137,7 +137,7 @@ def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
     points = body.vertices if isinstance(body, Mesh) else body
     if landmarks is not None:
         x, y = (places - places.mean(axis=0) for places in landmarks)
-        U, _, Vt = np.linalg.svd(y.T @ x)                                      # [Kabsch] R_body_template
+        U, _, Vt = np.linalg.svd(y.T @ x)                                      # R_body_template, by Procrustes
         R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
         side = R @ first.axes[2]
         return Camera.from_side(points, side, own.vertical) if abs(side @ own.vertical) < 0.9 else own
