@@ -458,9 +458,8 @@ def test_the_instruction_stands_above_the_bodies(folder, person, new_page, width
         wait_until(page, above % ".sk-status")
         assert page.locator(".sk-status").inner_text().startswith("Click “")
         place = moved(person.mesh.vertices[landmarks()["right toe"]]) + [0, 0, 0.2]
-        page.evaluate("(from) => program.send('place', "
-                      "{pane: 1, name: 'left toe', origin: from, direction: [0, 0, -1]})",
-                      place.tolist())
+        page.evaluate("(from) => program.send('place', {pane: 1, name: 'left toe', origin: from, "
+                      "direction: [0, 0, -1]})", place.tolist())
         wait_until(page, above % ".sk-question")
         page.locator(".sk-question button").filter(has_text="keep").click()
         wait_until(page, "program.state.question === null && document.querySelector('.sk-question').hidden")

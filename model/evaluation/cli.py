@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from scanprep.arguments import Alias, Called, UsageError
+from scanprep.arguments import Alias, UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import storage
@@ -88,7 +88,7 @@ def _problems(model: BodyModel, found: Findings) -> list[str]:
 
 def sample(model: ModelArg, output: Output,
            count: Annotated[Count, Alias("-n")] = 9, seed: Seed = 0,
-           pose_too: bool = False, betas: Annotated[Count | None, Called("--components")] = None) -> Outcome:
+           pose_too: bool = False) -> Outcome:
     """Write random bodies of a model, a sheet of their pictures, and their betas and poses.
 
     Example: scape model sample model.npz -n 9 -o random
@@ -99,12 +99,11 @@ def sample(model: ModelArg, output: Output,
         count: How many bodies.
         seed: The same seed gives the same bodies.
         pose_too: Random poses as well, from the Gaussian of the training poses; else all stand at rest.
-        betas: Vary the first so many shape components only.
     """
     from scanprep.pictures.shading import save_png
 
     loaded = load_model(model)
-    drawn = sample_bodies(loaded, count, np.random.default_rng(seed), pose_too, betas)
+    drawn = sample_bodies(loaded, count, np.random.default_rng(seed), pose_too)
     width = len(str(count))
     for i, vertices in enumerate(drawn.vertices):
         name = f"body_{i + 1:0{width}d}"

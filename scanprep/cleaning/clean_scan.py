@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -12,7 +11,7 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh
 from ..geometry.places import spacing
 from ..geometry.sanitise import sanitise
-from ..ranges import FLAG, Settings
+from ..ranges import Settings
 from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
@@ -38,7 +37,7 @@ class CleanScanConfig(Settings):
         Points closer than this many times the median distance between neighbouring places belong together.
     """
 
-    gap: Annotated[float, FLAG] = 0.03
+    gap: float = 0.03
     min_points: int = 30
     planes: int = 3
     floor_area: float = 0.1

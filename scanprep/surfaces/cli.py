@@ -32,7 +32,7 @@ from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_
 from ..geometry.mesh import Mesh, template_problem
 from ..geometry.sanitise import sanitise
 from ..judgement import Judgement
-from ..ranges import Faces, Share
+from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
 from ..repair.manifold import repair
 from .cloud import read_surface
@@ -109,7 +109,7 @@ def _read_body(path: Path, unit: Unit | None) -> Mesh | PointCloud:
     return found if isinstance(found, Mesh) else read_points(path, unit)
 
 
-def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None, smallest: Share = 1.0) -> Outcome:
+def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None) -> Outcome:
     """Make a mesh manifold: degenerate, repeated and inverted triangles, sheets that touch, and loose pieces go.
 
     Holes stay open, and where a fault is cut out there is one more: scape prep fill closes them.
@@ -120,10 +120,9 @@ def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None, smalles
         mesh: Mesh.
         output: Mesh to write.
         unit: Unit of the mesh.
-        smallest: Pieces with a smaller share of the vertices of the largest one are dropped; 1 keeps that alone.
     """
     before = read_mesh(mesh, unit)
-    after = repair(before, smallest)
+    after = repair(before)
     write_mesh(output, after)
     return Outcome(output, [Metric("fault found first", template_problem(before) or "none"),
                             Metric("triangles before", len(before.faces)), *about_mesh(after)])

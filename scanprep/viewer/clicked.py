@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..alignment.icp import landmark_motion
 from ..depth_camera.picture import is_picture, read_depth
 from ..geometry.files import UNITS, name_of, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
@@ -136,10 +137,8 @@ def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
     own = camera_of(body)
     points = body.vertices if isinstance(body, Mesh) else body
     if landmarks is not None:
-        x, y = (places - places.mean(axis=0) for places in landmarks)
-        U, _, Vt = np.linalg.svd(y.T @ x)                                      # [Kabsch] R_body_template
-        R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-        side = R @ first.axes[2]
+        R_body_template = landmark_motion(*landmarks)[:3, :3]
+        side = R_body_template @ first.axes[2]
         return Camera.from_side(points, side, own.vertical) if abs(side @ own.vertical) < 0.9 else own
 
     def seen(camera: Camera, all_points: np.ndarray, turn: float = 0.0) -> np.ndarray:
