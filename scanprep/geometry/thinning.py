@@ -48,7 +48,7 @@ def thin_scan(scan: Mesh, name: str = "scan", most: int = MOST) -> Mesh:
 
 
 def _without_pleats(faces: np.ndarray) -> np.ndarray:
-    """Triangles (F, 3) once each, the way that most of the equal ones face; none where as many face either way.
+    """Triangles (F, 3) once each, the way that most of the equal ones face; none of an even number.
 
     Noise lays a surface in pleats. What is dropped has no border of its own, so no hole opens.
     """
@@ -58,7 +58,7 @@ def _without_pleats(faces: np.ndarray) -> np.ndarray:
     a, b, c = faces.T
     side = np.where((a > b) ^ (b > c) ^ (a > c), -1, 1)
     total = np.bincount(group, side, len(faces))[group]
-    agree = np.flatnonzero(side * total > 0)
+    agree = np.flatnonzero((side * total > 0) & (total % 2 == 1))
     return np.asarray(faces[agree[np.unique(group[agree], return_index=True)[1]]])
 
 
