@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
+from scanprep.arguments import Alias, Called
 from scanprep.console import Metric, bar, say
 
-ModelFile = Annotated[Path, tyro.conf.arg(aliases=["-m"])]
-ModelOrNone = Annotated[Path | None, tyro.conf.arg(aliases=["-m"])]
-Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+ModelFile = Annotated[Path, Alias("-m")]
+ModelOrNone = Annotated[Path | None, Alias("-m")]
+Out = Annotated[Path, Alias("-o"), Called("--output")]
 
 
 def read_model(path: Path | None) -> tuple[BodyModel, str]:
@@ -33,18 +33,14 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
 
 
 def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: str | None
-                        ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (L,) and points (L, 3) of the landmarks that a file and the model have in common."""
-    from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+                        ) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices (L,) and points (L, 3) of the landmarks that a file and the model have in common; None where too few."""
+    from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 
     kept = model.info.get("landmarks") if template is None else read_landmark_vertices(template, model.template)
     if not kept:
         raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
-    try:
-        _, vertices, points = match_landmarks(kept, read_landmarks(scan, None, unit))
-    except ValueError as error:
-        raise ValueError(f"{scan}: {error}") from None
-    return vertices, points
+    return shared_landmarks(scan, kept, read_landmarks(scan, None, unit))
 
 
 def rows(metrics: list[Metric]) -> list[tuple[str, Any, str]]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.roles import limb_parts, part_kind
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
 from scanprep.synthetic.poses import average, random_pose
@@ -25,7 +26,6 @@ LOOSE = 0.25                         # radians by which joints of this body may 
 DRAWN = 400                          # poses for its mean and covariance
 SHOULDER = 0.3                       # of an upper arm's rotation against the chest happens in the shoulder itself
 HELD = ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")   # parts that stay at rest
-KINDS = {"arm": ("shoulder", "upper_arm", "forearm", "hand", "arm"), "leg": ("hip", "thigh", "shin", "foot", "leg")}
 
 
 def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray | None:
@@ -47,7 +47,7 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
 
 def is_held(name: str) -> bool:
     """Whether a part, by its name, is one that poses of people here leave at rest: toes, fingers, face."""
-    return name.removesuffix("_left").removesuffix("_right").rstrip("0123456789") in HELD
+    return part_kind(name) in HELD
 
 
 def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.ndarray, covariance: np.ndarray
@@ -83,8 +83,9 @@ class _Person:
 
 
 def _person(template: Mesh, skeleton: Skeleton) -> _Person | None:
-    chains = {(kind, side): _chain(skeleton, kind, side) for kind in LIMBS for side in ("left", "right")}
     names = skeleton.names
+    chains = {(kind, side): limb_parts(names, skeleton.parents, skeleton.joints, kind, side)
+              for kind in LIMBS for side in ("left", "right")}
     if not all(chains.values()) or "head" not in names:
         return None
     joint = {key: skeleton.joints[chain[0]] for key, chain in chains.items()}
@@ -101,12 +102,6 @@ def _person(template: Mesh, skeleton: Skeleton) -> _Person | None:
     return _Person(axes, source, at_rest)
 
 
-def _chain(skeleton: Skeleton, kind: str, side: str) -> list[int]:
-    """The parts of a limb, from the body outwards."""
-    return [p for p, name in enumerate(skeleton.names)
-            if name.endswith(f"_{side}") and name.removesuffix(f"_{side}").rstrip("0123456789") in KINDS[kind]]
-
-
 def _trunk_parts(skeleton: Skeleton, names: Sequence[str]) -> list[str]:
     """The synthetic part that each part of the trunk moves with; limbs are put in later."""
     def nearest(name: str) -> str:
@@ -119,7 +114,7 @@ def _trunk_parts(skeleton: Skeleton, names: Sequence[str]) -> list[str]:
 def _follow_limb(template: Mesh, skeleton: Skeleton, chain: list[int], kind: str, side: str, scale: float,
                  axes: np.ndarray, source: list[tuple[int, int, float]], at_rest: np.ndarray) -> None:
     """Pair the parts of a limb with those of the synthetic people by their distance from its end."""
-    a, parts = average(), [PARTS.index(f"{side[0]}_{part}") for part in LIMBS[kind]]
+    a, parts = average(), [PARTS.index(f"{part}_{side}") for part in LIMBS[kind]]
     far = scale * _from_the_end(np.vstack([a.joints[parts], a.ends[parts[-1]]]))  # (4,), 0 at the fingers or toes
     mine = np.vstack([skeleton.joints[chain], _tip(template, skeleton, chain[-1])])
     away = _from_the_end(mine)

@@ -201,9 +201,8 @@ def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
     entries: dict[str, SetEntry] = {}
     for line, row in tables.read_table(path, _COLUMNS, ("name", "file")):
         entry = SetEntry(**{column: row[column] for column in _COLUMNS})
-        with storage.taking_apart(path, f"the name of a file in line {line}"):
-            there = (folder / entry.file).is_file()
-        if not there:
+        storage.path_inside(folder, entry.name, f"{path}: line {line}")       # files of other folders are called so
+        if not storage.path_inside(folder, entry.file, f"{path}: line {line}").is_file():
             raise storage.StorageError(f"{path}: line {line}: there is no file {entry.file}")
         if entry.name in entries:
             raise storage.StorageError(f"{path}: line {line}: the name {entry.name} comes twice")

@@ -119,8 +119,7 @@ def _both(name: str) -> list[tuple[str, np.ndarray]]:
     """The names on both sides of a name with {}, and what mirrors a point of the left."""
     if "{}" not in name:
         return [(name, np.ones(3))]
-    sides = ("left", "right") if " " in name else ("l", "r")
-    return [(name.format(sides[0]), np.ones(3)), (name.format(sides[1]), np.array([-1.0, 1, 1]))]
+    return [(name.format("left"), np.ones(3)), (name.format("right"), np.array([-1.0, 1, 1]))]
 
 
 def _at(side: float, front: float, up: float) -> np.ndarray:
@@ -150,9 +149,9 @@ class _Figure:
         rise = self.shoulder - self.hip
         self.joints = {
             "abdomen": _at(0, 0, self.hip + 0.22 * rise), "chest": _at(0, 0, self.hip + 0.55 * rise),
-            "head": _at(0, 0, self.chin + 0.1 * self.head), "{}_upper_arm": shoulder, "{}_forearm": elbow,
-            "{}_hand": elbow + 0.48 * shape.arms * h * fore, "{}_thigh": _at(wide, 0, self.hip),
-            "{}_shin": _at(1.04 * wide, 0, 0.5 * (self.hip + ankle)), "{}_foot": _at(1.08 * wide, 0, ankle)}
+            "head": _at(0, 0, self.chin + 0.1 * self.head), "upper_arm_{}": shoulder, "forearm_{}": elbow,
+            "hand_{}": elbow + 0.48 * shape.arms * h * fore, "thigh_{}": _at(wide, 0, self.hip),
+            "shin_{}": _at(1.04 * wide, 0, 0.5 * (self.hip + ankle)), "foot_{}": _at(1.08 * wide, 0, ankle)}
 
     def field(self) -> Field:
         """The left half; the mirror makes the rest."""
@@ -162,17 +161,17 @@ class _Figure:
             (Ellipsoid(_at(0, 0, self.hip + 0.10 * rise), np.array([0.95, 0.85, 0.75]) * b), 0),
             (Ellipsoid(_at(0, 0.16 * b, self.hip + 0.38 * rise), np.array([1.0, 1.0, 0.95]) * b), 0.4 * b),
             (Ellipsoid(_at(0, 0, self.shoulder - 0.25 * rise), np.array([1.15 * c, 0.85 * c, 0.36 * rise])), 0.5 * c),
-            (RoundCone(_at(0, 0, self.shoulder + 0.2 * c), j["{}_upper_arm"], 0.5 * c, 1.15 * r), 0.5 * c),
+            (RoundCone(_at(0, 0, self.shoulder + 0.2 * c), j["upper_arm_{}"], 0.5 * c, 1.15 * r), 0.5 * c),
             (RoundCone(_at(0, 0, self.shoulder), _at(0, 0, self.chin + 0.3 * self.head), 0.55 * c, 0.42 * c), 0.3 * c)])
-        leg = Group([(RoundCone(j["{}_thigh"] - [0, 0, 0.02 * h], j["{}_shin"], 1.5 * r, 1.05 * r), 0),
-                     (RoundCone(j["{}_shin"], j["{}_foot"], 1.05 * r, 0.8 * r), 0.5 * r), (self._foot(), 0.6 * r)])
-        arm = Group([(RoundCone(j["{}_upper_arm"], j["{}_forearm"], 1.15 * r, 0.85 * r), 0),
-                     (RoundCone(j["{}_forearm"], j["{}_hand"], 0.85 * r, 0.72 * r), 0.4 * r),
+        leg = Group([(RoundCone(j["thigh_{}"] - [0, 0, 0.02 * h], j["shin_{}"], 1.5 * r, 1.05 * r), 0),
+                     (RoundCone(j["shin_{}"], j["foot_{}"], 1.05 * r, 0.8 * r), 0.5 * r), (self._foot(), 0.6 * r)])
+        arm = Group([(RoundCone(j["upper_arm_{}"], j["forearm_{}"], 1.15 * r, 0.85 * r), 0),
+                     (RoundCone(j["forearm_{}"], j["hand_{}"], 0.85 * r, 0.72 * r), 0.4 * r),
                      (self._hand(), 0.12 * s.hands * h)])
         return Group([(trunk, 0), (leg, 0.6 * r + 0.12 * b), (self._head(), 0.15 * self.head), (arm, 0.8 * r)])
 
     def _foot(self) -> Field:
-        length, ankle = self.shape.feet * self.shape.height, self.joints["{}_foot"]
+        length, ankle = self.shape.feet * self.shape.height, self.joints["foot_{}"]
         half = 0.28 * length
         return Group([(Ellipsoid(_at(ankle[0], 0.22 * length, 0.62 * half), np.array([0.62, 1.75, 0.62]) * half), 0),
                       (Ellipsoid(_at(ankle[0], 0.5 * length, 0.7 * half), np.array([0.78, 0.8, 0.7]) * half),
@@ -192,7 +191,7 @@ class _Figure:
     def _palm(self, along: float, thumb: float, back: float) -> np.ndarray:
         """A place of the hand: shares of its length along, half of it to the thumb and to its back."""
         size = self.shape.hands * self.shape.height
-        return np.asarray(self.joints["{}_hand"] + size * (np.array([0.5 * thumb, 0.5 * back, along])
+        return np.asarray(self.joints["hand_{}"] + size * (np.array([0.5 * thumb, 0.5 * back, along])
                                                            @ self.hand_frame))
 
     def _head(self) -> Field:
@@ -210,9 +209,9 @@ class _Figure:
     def points(self) -> dict[str, np.ndarray]:
         """Places near the skin by the names of landmarks."""
         j, r, b, c, rise = self.joints, self.limb, self.belly, self.chest, self.shoulder - self.hip
-        foot, length = j["{}_foot"], self.shape.feet * self.shape.height
+        foot, length = j["foot_{}"], self.shape.feet * self.shape.height
         out, fore = self.hand_frame[1], self.hand_frame[2]
-        shoulder, elbow, knee = j["{}_upper_arm"], j["{}_forearm"], j["{}_shin"]
+        shoulder, elbow, knee = j["upper_arm_{}"], j["forearm_{}"], j["shin_{}"]
         hip = self.hip
         return {
             "{} toe": _at(foot[0], 0.75 * length, 0.15 * length), "{} heel": _at(foot[0], -0.3 * length, 0.1 * length),
@@ -220,7 +219,7 @@ class _Figure:
             "{} knee inside": knee - [1.1 * r, 0, 0],
             "{} waist": _at(b, 0, hip + 0.5 * rise), "crotch": _at(0, 0, hip - 0.7 * b),
             "{} middle finger": self._palm(1.0, 0, 0), "{} thumb": self._palm(0.48, 1.1, 0),
-            "{} wrist": j["{}_hand"] + 0.8 * r * out, "{} elbow outside": elbow - _at(0, 0.9 * r, 0),
+            "{} wrist": j["hand_{}"] + 0.8 * r * out, "{} elbow outside": elbow - _at(0, 0.9 * r, 0),
             "{} elbow inside": elbow + _at(0, 0.9 * r, 0), "{} shoulder": shoulder + [0.3 * r, 0, 1.1 * r],
             "{} armpit": shoulder - 1.15 * r * out + 0.9 * r * fore,
             "{} nipple": _at(0.5 * c, c, self.shoulder - 0.22 * rise), "navel": _at(0, 1.2 * b, hip + 0.36 * rise),

@@ -16,7 +16,7 @@ from scanprep.synthetic.people import random_pose
 FRAMES = 8
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])      # from the axes of the people to those of files
 OTHERS = {"pelvis": "Hips", "abdomen": "LowerBack", "chest": "Spine1", "head": "Head",
-          **{f"{s}_{ours}": side + theirs for s, side in (("l", "Left"), ("r", "Right")) for ours, theirs in
+          **{f"{ours}_{side.lower()}": side + theirs for side in ("Left", "Right") for ours, theirs in
              (("upper_arm", "Arm"), ("forearm", "ForeArm"), ("hand", "Hand"), ("thigh", "UpLeg"), ("shin", "Leg"),
               ("foot", "Foot"))}}
 
@@ -45,14 +45,14 @@ def elsewhere(tmp_path, poses, trans, scale=39.37):
     rig = make_rig(small_people(), np.zeros(1))
     names, parents, J = list(rig.skeleton.names), rig.skeleton.parents, rig.skeleton.joints
     A = np.tile(np.eye(3), (16, 1, 1))
-    for side, sign in (("l", 1), ("r", -1)):
-        arm = [names.index(f"{side}_{part}") for part in ("upper_arm", "forearm", "hand")]
+    for side, sign in (("left", 1), ("right", -1)):
+        arm = [names.index(f"{part}_{side}") for part in ("upper_arm", "forearm", "hand")]
         bone = J[arm[1]] - J[arm[0]]
         A[arm] = rotations.exp(np.array([0, -sign * np.arctan2(-bone[2], abs(bone[0])), 0]))
     R = rig.skeleton.part_rotations(poses) @ np.swapaxes(A, -1, -2)
     rest = joint_places(rig.skeleton, rig.skeleton.pose_of(A))
     Q = rotations.exp(np.array([0, 1.1, 0])) @ Y_UP
-    chest, hand = names.index("chest"), names.index("l_hand")
+    chest, hand = names.index("chest"), names.index("hand_left")
     middle = (rest[names.index("abdomen")] + rest[chest]) / 2
     # the abdomen in two joints that turn alike, and a finger that turns on its own
     order = [*range(chest), 16, *range(chest, 16), 17]
@@ -75,10 +75,10 @@ def of_amass(poses, up=2):
     names, rest = ours.names, amass.t_pose()
     part = dict.fromkeys(("spine1", "spine2"), "abdomen") | {"pelvis": "pelvis", "head": "head"}
     A = {}
-    for side, s in (("left", "l"), ("right", "r")):
+    for side in ("left", "right"):
         for theirs, mine in (("hip", "thigh"), ("knee", "shin"), ("ankle", "foot"), ("foot", "foot"),
                              ("shoulder", "upper_arm"), ("elbow", "forearm"), ("wrist", "hand")):
-            part[f"{side}_{theirs}"] = f"{s}_{mine}"
+            part[f"{side}_{theirs}"] = f"{mine}_{side}"
         for chain in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
             R = Y_UP
             for a, b in pairwise(chain):

@@ -65,11 +65,12 @@ def split(x: np.ndarray, faces: np.ndarray, skeleton: Skeleton) -> Skeleton:
     part = np.array([JOINT[name] for name in PARTS])[skeleton.part_of_face]
     part[(part == 3) & (c[:, 2] > (j["abdomen"][2] + j["chest"][2]) / 2)] = 6
     part[(part == 15) & (c[:, 2] < j["head"][2] + 0.05)] = 12
-    for side, sign, (collar, arm, toes, fingers) in (("l", 1, (13, 20, 10, 22)), ("r", -1, (14, 21, 11, 23))):
-        part[(part == 9) & (sign * c[:, 0] > 0.6 * abs(j["l_upper_arm"][0])) & (c[:, 2] > j["chest"][2] + 0.1)] = collar
-        far = np.linalg.norm(c - j[f"{side}_hand"], axis=1)
+    for side, sign, (collar, arm, toes, fingers) in (("left", 1, (13, 20, 10, 22)), ("right", -1, (14, 21, 11, 23))):
+        beside = sign * c[:, 0] > 0.6 * abs(j["upper_arm_left"][0])
+        part[(part == 9) & beside & (c[:, 2] > j["chest"][2] + 0.1)] = collar
+        far = np.linalg.norm(c - j[f"hand_{side}"], axis=1)
         part[(part == arm) & (far > 0.6 * far[part == arm].max())] = fingers
-        part[(part == JOINT[f"{side}_foot"]) & (c[:, 1] < j[f"{side}_foot"][1] - 0.08)] = toes
+        part[(part == JOINT[f"foot_{side}"]) & (c[:, 1] < j[f"foot_{side}"][1] - 0.08)] = toes
     return Skeleton(part, PARENTS, np.array([c[part == p].mean(axis=0) for p in range(24)]))
 
 

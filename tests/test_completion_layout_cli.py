@@ -96,7 +96,7 @@ def test_the_table_has_partners_and_parts(person):
     layout = named_layout("cmu41", person.mesh)
     rows = {row[0]: row for row in marker_rows(person.mesh, layout, person.skeleton)}
     assert rows["LELB"][3] == "RELB" and rows["C7"][3] == "middle" and rows["RBAC"][3] == "-"
-    assert rows["LTHI"][2] == "l_thigh" and rows["LTHI"][5] == "loose" and rows["LWRA"][4] == "45.0 mm"
+    assert rows["LTHI"][2] == "thigh_left" and rows["LTHI"][5] == "loose" and rows["LWRA"][4] == "45.0 mm"
     assert "RBAK" in rows["RBAC"][1]
 
 

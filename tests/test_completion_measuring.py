@@ -1,16 +1,19 @@
 """`scape measure`: sets, completions, betas and meshes in, a table and a page out; the body of some measurements."""
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from people_bodies import kept, small_people
 
 from completion.__main__ import main
 from completion.partial.completion import Completion, save_completion
 from model import find_tapes, measure
 from model.measurement.catalogue import CATALOGUE
-from scanprep import RegisteredSet, write_mesh
+from scanprep import Mesh, RegisteredSet, write_mesh
+from scanprep.geometry.landmark_names import known_landmarks, landmark_name
 from scanprep.judgement import Judgement
 from scanprep.synthetic.people import BodyShape, Person
 
@@ -60,6 +63,32 @@ def test_a_folder_and_betas_with_their_model(folder, tmp_path, capsys):
     assert "4 bodies, measured" in page and "back waist length, ISO 8559-1" in page
     report = (tmp_path / "all.csv.report.json").read_text(encoding="utf-8")
     assert "NaN" not in report and json.loads(report)["judgement"]["verdict"] == "good"
+
+
+TAPES = ("stature", "chest_girth", "hip_girth", "thigh_girth_left", "calf_girth_right", "foot_length_left")
+
+
+def test_a_model_with_the_ten_landmarks_of_the_readme_is_measured(folder, tmp_path, capsys):
+    """Heels, crotch and all that is not among them are found; they were refused before."""
+    model = small_people()
+    known = known_landmarks(model.info["landmarks"])
+    readme = {name: known[landmark_name(name)] for name in (
+        "crown", "navel", "LeftHand", "RightHand", "foot_l", "foot_r", "left elbow", "right elbow", "l_knee", "r_knee")}
+    replace(model, info={**model.info, "landmarks": readme}).save(tmp_path / "ten.npz")
+    for name in ("ten", "model"):
+        path = (tmp_path if name == "ten" else folder) / f"{name}.npz"
+        assert scape(folder / "bodies" / "rest.ply", "-m", path, "-o", tmp_path / f"{name}.csv") == 0
+        assert ("found with the average person" in capsys.readouterr().err) == (name == "ten")
+    ten, full = (table(tmp_path / f"{name}.csv")["rest"] for name in ("ten", "model"))
+    for name in TAPES:
+        assert float(ten[name]) == pytest.approx(float(full[name]), abs=0.012), name
+
+
+def test_what_is_no_person_has_no_landmarks_to_measure_from(tmp_path, capsys):
+    ball = trimesh.creation.icosphere(4, 0.5)
+    write_mesh(tmp_path / "ball.ply", Mesh(ball.vertices, ball.faces))
+    assert scape(tmp_path / "ball.ply", "-o", tmp_path / "m.csv") == 1
+    assert "measuring begins at landmarks of the template, and there are none" in capsys.readouterr().err
 
 
 def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys):
@@ -116,7 +145,6 @@ def test_the_body_of_some_measurements(folder, tmp_path, capsys):
     (["-o", "m.csv"], "BODY: expected at least one body to measure"),
     (["nowhere", "-o", "m.csv"], "nowhere: there is no such file or folder"),
     (["bodies", "-o", "m.xlsx"], "expected the name of a table, such as measures.csv"),
-    (["bodies", "-o", "m.csv"], "measuring begins at landmarks of the template, and there are none"),
     (["bodies", "--landmarks", "marks.json", "-o", "m.csv"], "bodies/bent.ply: it is the template of all bodies, as no "
      "model is named, and does not stand upright: the left shin is "),
     (["somebody.json", "-o", "m.csv"], "somebody.json: betas need their model; name it with -m")])

@@ -142,8 +142,8 @@ def test_a_figure_is_closed_symmetric_and_has_its_landmarks_on_the_skin(name):
     assert np.percentile(np.linalg.norm(surface.closest(image).points - image, axis=1), 95) < 0.008 * height
     assert inside(mesh, np.array(list(figure.joints.values()))).all()
     for part, point in figure.joints.items():
-        if part.startswith("l_"):
-            np.testing.assert_allclose(figure.joints["r" + part[1:]], point * [-1, 1, 1], atol=1e-12)
+        if part.endswith("_left"):
+            np.testing.assert_allclose(figure.joints[part.replace("left", "right")], point * [-1, 1, 1], atol=1e-12)
 
 
 def test_a_figure_of_ones_own():

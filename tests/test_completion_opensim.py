@@ -49,7 +49,7 @@ def test_axes_of_the_body_at_rest():
         np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-12, err_msg=name)
         assert np.linalg.det(frame) == pytest.approx(1)
     for side, name in (("l", "left"), ("r", "right")):
-        hip, knee = (JOINTS[PARTS.index(f"{side}_{part}")] for part in ("thigh", "shin"))
+        hip, knee = (JOINTS[PARTS.index(f"{part}_{name}")] for part in ("thigh", "shin"))
         np.testing.assert_allclose(axes(f"thigh_{side}", 1), (hip - knee) / np.linalg.norm(hip - knee), err_msg=name)
     rest = angles(np.tile(np.eye(3), (1, 16, 1, 1)))
     assert rest["hip_adduction_r"] == pytest.approx(-4.5) and rest["hip_flexion_l"] == pytest.approx(0, abs=1e-9)
@@ -75,7 +75,8 @@ SIDED = [("hip_flexion", "thigh", "pelvis", 2, 1), ("hip_rotation", "thigh", "th
 def test_a_known_rotation_is_that_angle_and_no_other(side, angle, part, segment, column, sign):
     axis = axes(segment if segment in ("pelvis", "trunk") else f"{segment}_{side}", column)
     turn = sign * (1 if side == "r" or column == 2 else -1) * np.radians(30)
-    before, after = angles(posed("head", np.eye(3))), angles(posed(f"{side}_{part}", exp(turn * axis)))
+    whole = f"{part}_{'left' if side == 'l' else 'right'}"
+    before, after = angles(posed("head", np.eye(3))), angles(posed(whole, exp(turn * axis)))
     assert after[f"{angle}_{side}"] - before[f"{angle}_{side}"] == pytest.approx(30, abs=1e-6)
     first = [joint for joint in BODY.joints() if joint.angles[0][:-2] in ("hip_flexion", "knee_angle", "elbow_flex")]
     for joint in first:                                  # the other joints, and those of the other side, stay
@@ -97,9 +98,9 @@ def test_trunk_and_head(angle, part, axis):
 
 def test_a_raised_arm_points_where_its_plane_and_elevation_say():
     rng = np.random.default_rng(3)
-    R = np.stack([posed("r_upper_arm", exp(rng.normal(0, 1.2, 3)))[0] for _ in range(30)])
+    R = np.stack([posed("upper_arm_right", exp(rng.normal(0, 1.2, 3)))[0] for _ in range(30)])
     found, trunk = angles(R), BODY.frames["trunk"]
-    arm = -(R[:, PARTS.index("r_upper_arm")] @ axes("humerus_r", 1)) @ trunk
+    arm = -(R[:, PARTS.index("upper_arm_right")] @ axes("humerus_r", 1)) @ trunk
     plane, elevation = (np.radians(found[f"shoulder_{name}_r"]) for name in ("plane", "elevation"))
     wanted = np.stack([np.sin(plane) * np.sin(elevation), -np.cos(elevation), np.cos(plane) * np.sin(elevation)], 1)
     np.testing.assert_allclose(arm, wanted, atol=1e-9)   # plane 0 is abduction, 90 forward flexion
@@ -139,7 +140,7 @@ def test_an_arm_beyond_a_right_angle_goes_on():
 
 
 def test_a_side_or_the_names_are_missing():
-    some = [j for j, name in enumerate(PARTS) if name not in ("l_shin", "l_foot", "r_hand")]
+    some = [j for j, name in enumerate(PARTS) if name not in ("shin_left", "foot_left", "hand_right")]
     parents = np.array([-1 if p < 0 else some.index(p) for p in PARENTS[some]])
     less = anatomy(tuple(PARTS[j] for j in some), parents, JOINTS[some])
     assert less.missing() == ("elbow_r", "wrist_r", "hip_l", "knee_l", "ankle_l")   # no far end, no axis

@@ -8,10 +8,11 @@ from viewing_apps import PART, app_of, ask, expected, on_screen, open_app, seen,
 
 from completion.motion import Motion
 from completion.viewing.dragging import Drag
-from completion.viewing.movable import FEW, MovableBody, part_in_words
+from completion.viewing.movable import FEW, MovableBody
 from completion.viewing.saving import free_name
 from model.files import load_model
 from scanprep import read_mesh
+from scanprep.skeleton.roles import in_words
 from scanprep.viewer.server import Server
 
 
@@ -66,7 +67,7 @@ def test_a_body_with_many_other_betas_is_made_again():
 
 
 def test_models_that_name_their_parts_otherwise_share_them():
-    assert [part_in_words(name) for name in ("hand_left", "l_hand", "upper_arm_right", "r_upper_arm", "chest", "part3")
+    assert [in_words(name) for name in ("hand_left", "l_hand", "upper_arm_right", "r_upper_arm", "chest", "part3")
             ] == ["left hand"] * 2 + ["right upper arm"] * 2 + ["chest", "part3"]
 
 

@@ -16,7 +16,6 @@ from model.export.correctives import motion_correctives
 from model.export.glb import skinned_glb, write_skinned_glb
 from model.export.names import names_of
 from model.export.rig import carried, joint_places, make_rig, rerooted
-from model.motion.roles import find_roles
 from model.posing.cli import mesh
 from model.statue.control.files import humanoid, read_control
 from scanprep.command_line import run
@@ -24,6 +23,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import stance
+from scanprep.skeleton.roles import find_roles
 from scanprep.skeleton.tree import Skeleton
 
 
@@ -189,7 +189,7 @@ def test_the_command_has_root_names_ground_and_front(files, model, rig, motion):
     for name in ("a.glb", "b.bvh"):
         assert run(export, "scape model export", [
             str(files / "named.npz"), "-o", str(files / name), "--motion", str(files / "motion.npz"), "--root",
-            "pelvis", "--names", "mixamo", "--ground", "--up", "1"]) == 0
+            "pelvis", "--names", "mixamo", "--ground", "--up", "y"]) == 0
         told.append({m["metric"]: m["value"] for path in files.glob(f"{name[0]}*.json")
                      for m in json.loads(path.read_text())["metrics"]})
         assert told[-1]["root"] == "mixamorig:Hips" and told[-1]["parts without a name of mixamo"] == "tail"

@@ -12,11 +12,10 @@ from scanprep.synthetic.poses import random_pose
 
 
 def as_named(person, R=None):
-    """The person's mesh and skeleton, with the names that `name_parts` gives, turned."""
+    """The person's mesh and skeleton, turned."""
     R = np.eye(3) if R is None else R
-    names = [f"{name[2:]}_{'left' if name[0] == 'l' else 'right'}" if name[1] == "_" else name for name in PARTS]
     return (Mesh(person.mesh.vertices @ R.T, person.mesh.faces),
-            Skeleton(person.part_of_face, person.parents, person.joints @ R.T, tuple(names)))
+            Skeleton(person.part_of_face, person.parents, person.joints @ R.T, PARTS))
 
 
 PARTS = Person.names
@@ -40,7 +39,7 @@ def test_they_turn_with_the_body():
 
 def test_knees_bend_one_way():
     poses = human_poses(*as_named(PERSON), 200, np.random.default_rng(0))
-    for shin in (PARTS.index("l_shin"), PARTS.index("r_shin")):
+    for shin in (PARTS.index("shin_left"), PARTS.index("shin_right")):
         assert poses[:, shin, 0].max() > 1 and poses[:, shin, 0].min() > -0.2            # heels go back, never forward
 
 

@@ -9,7 +9,6 @@ from scipy.spatial import ConvexHull
 from model import body_with_measurements, find_tapes, measure
 from model.measurement import reading
 from model.measurement.catalogue import CATALOGUE, named
-from model.measurement.marks import MIDDLE, PAIRED, known_landmarks
 from model.measurement.path import shortest_path
 from model.measurement.reading import Standing
 from model.measurement.section import around, bulge, direction, mean_of, section, tape
@@ -187,18 +186,6 @@ def test_moved_limbs_are_told(person, tapes):
     pose[4, 1] = 1.2
     assert [line.split(" is ")[0] for line in measure(person.posed(pose), tapes).turned] == [
         "the left upper arm", "the left forearm"]
-
-
-def test_names_of_other_templates():
-    """SCAPE's and CAESAR's names are the same places."""
-    every = [*MIDDLE.items(), *PAIRED.items()]
-    for number, sides in ((1, ("left", "right")), (2, ("Lt.", "Rt."))):
-        given = {forms[min(number, len(forms) - 1)].format(side): k for k, (_, forms) in enumerate(every)
-                 for side in (sides if "{}" in forms[0] else ("",))}
-        found = known_landmarks(given)
-        wanted = {full: k for k, (name, forms) in enumerate(every)
-                  for full in ((f"left {name}", f"right {name}") if "{}" in forms[0] else (name,))}
-        assert found == wanted
 
 
 def test_what_a_template_lacks_is_told(person):

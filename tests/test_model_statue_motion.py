@@ -11,13 +11,13 @@ from model.features import linear_features
 from model.motion.bvh import read_bvh
 from model.motion.moving import MovingSkeleton
 from model.motion.onto import read_motion
-from model.motion.roles import find_roles, trunk
 from model.skinning import SkinningModel
 from model.statue.control.files import humanoid
 from model.statue.motion.motions import Follower, _bound, bvh_motion, own_motion, people_motion, write_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
+from scanprep.skeleton.roles import find_roles, trunk
 from scanprep.synthetic.people import PARTS, Person, named_pose, walk
 
 GENERIC = np.zeros((17, 3))

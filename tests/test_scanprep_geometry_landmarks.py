@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from scanprep.geometry.files import MeshFileError
+from scanprep.geometry.landmark_names import TEN, known_landmarks, landmark_name, paired_names
 from scanprep.geometry.landmarks import (
     LANDMARK_ENDINGS,
     landmarks_beside,
@@ -12,6 +13,7 @@ from scanprep.geometry.landmarks import (
     read_landmark_vertices,
     read_landmarks,
     read_template_landmarks,
+    shared_landmarks,
     write_landmarks,
 )
 from scanprep.geometry.mesh import Mesh
@@ -254,7 +256,7 @@ def test_landmarks_are_matched_by_name_in_the_order_of_the_template():
 
 
 def test_too_few_matches_show_both_lists():
-    with pytest.raises(ValueError, match=r"at least 3 .* found 1; template: nose, chin; scan: Nose, chin, knee"):
+    with pytest.raises(ValueError, match=r"at least 3 .* found 2; template: nose, chin; scan: Nose, chin, knee"):
         match_landmarks({"nose": 1, "chin": 2}, {"Nose": 1, "chin": 2, "knee": 3})
     with pytest.raises(ValueError, match="template: none; scan: none"):
         match_landmarks({}, {})
@@ -280,3 +282,65 @@ def test_the_template_of_a_registered_set_has_the_landmarks_of_the_set(tmp_path)
     write_landmarks(tmp_path / "template.json", {"b": 2})
     assert read_template_landmarks(tmp_path / "template.ply", MESH) == {"b": 2}
     assert read_template_landmarks(tmp_path / "x.ply", MESH, tmp_path / "landmarks.json") == {"a": 3}
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [
+    ("left middle finger", ("l_hand", "LeftHand", "hand left", "Hand_L", "HAND, LEFT", "middle finger left hand",
+                            "Lt. Dactylion", "leftFingertip")),
+    ("right toe", ("R.Foot", "right_foot", "Right foot", "toe in right leg", "Rt. Digit II", "RightBigToe")),
+    ("left elbow outside", ("elbow_l", "LeftElbow", "elbow (outside) left arm", "Lt. Olecranon")),
+    ("right knee", ("kneeR", "knee in right leg", "Rt. Femoral Lateral Epicn.", "RIGHT KNEE")),
+    ("right knee inside", ("knee (inside) in right leg", "right knee inside")),
+    ("top of head", ("Crown", "head top", "TopOfHead", "Vertex", "top_of_head")), ("navel", ("Belly button", "cornea")),
+    ("left nipple", ("tit, left", "Lt. Thelion/Bustpoint")), ("neck back", ("neck (back)", "Cervicale")),
+    ("mole 3", ("Mole_3",)), ("left scar", ("scar (left)",))])
+def test_a_place_has_one_name_however_it_is_spelt(ours, theirs):
+    assert {landmark_name(name) for name in (ours, *theirs)} == {ours}
+
+
+def test_the_ten_of_the_readme_are_what_everything_wants():
+    readme = ["crown", "navel", *(f"{side} {name}" for name in ("hand", "foot", "elbow", "knee")
+                                  for side in ("left", "right"))]
+    assert [landmark_name(name) for name in readme] == list(TEN)
+    assert len(paired_names(TEN, readme)) == 10
+
+
+def test_a_name_spelt_alike_comes_before_a_synonym():
+    assert known_landmarks({"crown": 1, "top of head": 2, "l_knee": 3, "left knee cap": 4}) == {
+        "top of head": 2, "left knee": 3, "left knee cap": 4}
+    assert paired_names(["left hand", "left wrist"], ["left wrist", "left hand", "left middle finger"]) == [
+        ("left hand", "left hand"), ("left wrist", "left wrist")]
+    assert paired_names(["left hand", "left middle finger"], ["LeftHand"]) == [("left hand", "LeftHand")]
+
+
+def test_names_nobody_shares_are_said_and_left(tmp_path):
+    with pytest.warns(UserWarning, match="marks.json: .*template: navel, crotch; scan: p1, p2; going on without"):
+        assert shared_landmarks(tmp_path / "marks.json", {"navel": 1, "crotch": 2},
+                                {"p1": np.zeros(3), "p2": np.ones(3)}) is None
+
+
+@pytest.mark.parametrize("cloud", [False, True])
+@pytest.mark.parametrize(("name", "content", "factor"), [
+    ("a.mrk.json", lambda p: slicer(p, "LPS", scale=1), "1000"),          # a scan in metres, which Slicer calls mm
+    ("a.mrk.json", lambda p: slicer(p, "RAS", scale=1), "1000"),
+    ("a.pp", lambda p: picked({n: 1000 * x for n, x in p.items()}), "0.001"),         # the other way round
+    ("a.landmarks.txt", lambda p: "".join(f"{x} {y} {z} {n}\n" for n, (x, y, z) in
+                                          ((n, 100 * v) for n, v in p.items())), "0.01"),
+    ("a.pp", picked, None), ("a.mrk.json", lambda p: slicer(p, "RAS"), None)])
+def test_landmarks_in_another_unit_than_the_scan_are_brought_onto_it(tmp_path, recwarn, name, content, factor, cloud):
+    rng = np.random.default_rng(0)
+    scan = rng.normal(size=(2000, 3)) * [0.1, 0.3, 0.6]
+    points = dict(zip(("crown", "navel", "left hand", "right hand"), scan[:4] + 0.002, strict=True))
+    path = written(tmp_path / name, content(points))
+    found = read_landmarks(path, scan if cloud else Mesh(scan, np.zeros((0, 3), dtype=np.int64)))
+    for label, place in points.items():
+        np.testing.assert_allclose(found[label], place, atol=1e-6, err_msg=label)
+    said = [str(one.message) for one in recwarn]
+    assert len(said) == bool(factor) and all(f"multiplied by {factor} they do" in line for line in said), said
+
+
+def test_landmarks_that_lie_on_no_scan_of_any_unit_stay_as_they_are(tmp_path, recwarn):
+    scan = np.random.default_rng(0).normal(size=(2000, 3)) * [0.1, 0.3, 0.6]
+    far = {"a": [9.0, 1.0, 0.0], "b": [9.0, 2.0, 1.0], "c": [8.0, 1.0, 3.0]}
+    found = read_landmarks(written(tmp_path / "a.json", far), scan)
+    assert all((found[name] == far[name]).all() for name in far) and not recwarn.list

@@ -7,7 +7,7 @@ from scanprep.registration import unmarked
 from scanprep.registration.limb_ends import bending
 from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_bending, rolls
 from scanprep.registration.nonrigid import Registration
-from scanprep.registration.person import NAMES, PersonParts, average_person
+from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import NAMED_POSES, PARTS, named_pose
 
@@ -22,7 +22,7 @@ def person():
 @pytest.fixture(scope="module")
 def parts(person):
     """The parts of a template that is the average person itself, but stands differently in its own frame."""
-    skeleton = Skeleton(person.part_of_face, person.parents, person.joints, NAMES)
+    skeleton = Skeleton(person.part_of_face, person.parents, person.joints, PARTS)
     return PersonParts(skeleton, np.broadcast_to(np.eye(3), (len(PARTS), 3, 3)))
 
 
@@ -38,7 +38,7 @@ def test_a_roll_about_an_axis_is_what_was_put_in():
 
 def test_angles_are_those_that_a_joint_was_given(person):
     pose = np.zeros((len(PARTS), 3))
-    forearm, shin = PARTS.index("l_forearm"), PARTS.index("r_shin")
+    forearm, shin = PARTS.index("forearm_left"), PARTS.index("shin_right")
     pose[forearm], pose[shin] = np.radians(40) * frames()[forearm, 1], np.radians(-25) * frames()[shin, 0]
     angles = joint_angles(person.part_rotations(pose))
     wanted = np.zeros((len(PARTS), 3))
@@ -52,8 +52,8 @@ def test_what_people_do_is_not_doubted(person, parts, name):
     assert not words(person, parts, turned)
 
 
-@pytest.mark.parametrize("part, name, parent", [("l_forearm", "left forearm", "left upper arm"),
-                                                ("r_shin", "right shin", "right thigh"), ("head", "head", "chest")])
+@pytest.mark.parametrize("part, name, parent", [("forearm_left", "left forearm", "left upper arm"),
+                                                ("shin_right", "right shin", "right thigh"), ("head", "head", "chest")])
 def test_a_limb_rolled_about_its_own_axis_is_told(person, parts, part, name, parent):
     pose, p = np.zeros((len(PARTS), 3)), PARTS.index(part)
     pose[p] = np.radians(150) * frames()[p, 0]
@@ -75,7 +75,7 @@ def test_skin_that_slid_is_told(person, parts):
 
 
 def test_a_limb_drawn_into_the_body_is_told(person, parts):
-    p = PARTS.index("l_forearm")
+    p = PARTS.index("forearm_left")
     mine = person.part_of_vertex == p
     small = person.mesh.vertices.copy()
     small[mine] = person.joints[p] + 0.7 * (small[mine] - person.joints[p])

@@ -12,14 +12,14 @@ from scanprep.registration.graph_fit import deform, start_fit, start_motion
 from scanprep.registration.limbs import beyond_people, frames, joint_angles, limb_doubts
 from scanprep.registration.matches import prepare
 from scanprep.registration.nonrigid import Registration, measured
-from scanprep.registration.person import NAMES, PersonParts, average_person, person_parts
+from scanprep.registration.person import PersonParts, average_person, person_parts
 from scanprep.registration.repair import better, motion_of, repaired, rolled
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import PARENTS, PARTS, named_pose
 
-FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("l_forearm", "r_shin", "head"))
+FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("forearm_left", "shin_right", "head"))
 QUICK = RegistrationConfig((GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=3),
                             GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=4)), ends=0, final_fit=None)
 
@@ -31,7 +31,7 @@ def person():
 
 @pytest.fixture(scope="module")
 def parts(person):
-    skeleton = Skeleton(person.part_of_face, person.parents, person.joints, NAMES)
+    skeleton = Skeleton(person.part_of_face, person.parents, person.joints, PARTS)
     return PersonParts(skeleton, np.broadcast_to(np.eye(3), (len(PARTS), 3, 3)))
 
 
@@ -55,7 +55,7 @@ def with_rolled_skin(person, body, part, angle):
 def test_rolls_are_the_best_of_all():
     """The tree of one leg against all that could be; the joints of the rest are content."""
     rng = np.random.default_rng(0)
-    thigh, shin, foot = (PARTS.index(f"r_{name}") for name in ("thigh", "shin", "foot"))
+    thigh, shin, foot = (PARTS.index(f"{name}_right") for name in ("thigh", "shin", "foot"))
     costs = np.zeros((len(PARTS), STEPS, STEPS))
     costs[[thigh, shin, foot]] = rng.uniform(0, 2, (3, STEPS, STEPS))
     turned = CHANGE * np.minimum(np.arange(STEPS), STEPS - np.arange(STEPS)) / (STEPS / 2)

@@ -61,11 +61,11 @@ def test_merging_into_the_root_moves_its_centre(person):
     after = merge_parts(person.skeleton, person.mesh, "abdomen", 0)
     assert after.names[0] == "abdomen" and len(after.parents) == 15
     np.testing.assert_allclose(after.joints[0], root_centre(after, person.mesh), atol=1e-12)
-    assert {parent(after, name) for name in ("chest", "l_thigh", "r_thigh")} == {"abdomen"}
+    assert {parent(after, name) for name in ("chest", "thigh_left", "thigh_right")} == {"abdomen"}
 
 
 def test_parts_that_hang_on_the_same_one_merge_between_their_joints(person):
-    halves = split_part(merge_parts(person.skeleton, person.mesh, "l_hand", "l_forearm"), person.mesh, "chest")
+    halves = split_part(merge_parts(person.skeleton, person.mesh, "hand_left", "forearm_left"), person.mesh, "chest")
     assert parent(halves, "chest_2") == "chest"
     siblings = [name for name in halves.names if parent(halves, name) == "chest_2"]
     touching = merge_parts(halves, person.mesh, "chest", "chest_2")
@@ -74,15 +74,15 @@ def test_parts_that_hang_on_the_same_one_merge_between_their_joints(person):
 
 def test_a_part_is_split_across_its_length_into_connected_halves(person):
     mesh, before = person.mesh, person.skeleton
-    after = split_part(before, mesh, "l_thigh", names=("thigh_top", "thigh_end"))
+    after = split_part(before, mesh, "thigh_left", names=("thigh_top", "thigh_end"))
     top, end = faces(after, "thigh_top"), faces(after, "thigh_end")
-    assert np.array_equal(top | end, faces(before, "l_thigh"))
+    assert np.array_equal(top | end, faces(before, "thigh_left"))
     for half in (top, end):
         assert len(np.unique(pieces(mesh.face_pairs, np.where(half, 0, 1))[half])) == 1
-        assert mesh.face_areas[half].sum() > 0.3 * mesh.face_areas[faces(before, "l_thigh")].sum()
+        assert mesh.face_areas[half].sum() > 0.3 * mesh.face_areas[faces(before, "thigh_left")].sum()
     assert parent(after, "thigh_top") == "pelvis" and parent(after, "thigh_end") == "thigh_top"
-    assert parent(after, "l_shin") == "thigh_end"
-    hip, knee = joint(before, "l_thigh"), joint(before, "l_shin")
+    assert parent(after, "shin_left") == "thigh_end"
+    hip, knee = joint(before, "thigh_left"), joint(before, "shin_left")
     along = (joint(after, "thigh_end") - hip) @ (knee - hip) / ((knee - hip) @ (knee - hip))
     assert 0.3 < along < 0.7
     assert np.linalg.norm(joint(after, "thigh_end") - (hip + along * (knee - hip))) < 0.03
@@ -91,14 +91,14 @@ def test_a_part_is_split_across_its_length_into_connected_halves(person):
 
 def test_poses_show_where_a_merged_part_bends(person, poses):
     """An arm made one part comes apart at its elbow again."""
-    joined = merge_parts(person.skeleton, person.mesh, "l_upper_arm", "l_forearm")
-    again = split_part(joined, person.mesh, "l_upper_arm", poses, ("l_upper_arm", "l_forearm"))
+    joined = merge_parts(person.skeleton, person.mesh, "upper_arm_left", "forearm_left")
+    again = split_part(joined, person.mesh, "upper_arm_left", poses, ("upper_arm_left", "forearm_left"))
     assert again.names == person.skeleton.names and np.array_equal(again.parents, person.parents)
     differ = person.mesh.face_areas[again.part_of_face != person.part_of_face].sum()
-    assert differ < 0.15 * person.mesh.face_areas[faces(joined, "l_upper_arm")].sum()
-    assert np.linalg.norm(joint(again, "l_forearm") - joint(person.skeleton, "l_forearm")) < 0.02
-    with pytest.raises(ValueError, match="'l_foot' cannot be cut in two, it does not bend in these poses"):
-        split_part(person.skeleton, person.mesh, "l_foot", np.stack([person.mesh.vertices + k for k in range(3)]))
+    assert differ < 0.15 * person.mesh.face_areas[faces(joined, "upper_arm_left")].sum()
+    assert np.linalg.norm(joint(again, "forearm_left") - joint(person.skeleton, "forearm_left")) < 0.02
+    with pytest.raises(ValueError, match="'foot_left' cannot be cut in two, it does not bend in these poses"):
+        split_part(person.skeleton, person.mesh, "foot_left", np.stack([person.mesh.vertices + k for k in range(3)]))
 
 
 def test_the_split_of_the_root_keeps_the_tree(person):
@@ -121,23 +121,23 @@ def test_names_and_joints_change_alone(person):
 
 
 def test_a_file_of_edits_is_carried_out_in_order(person, tmp_path):
-    edits = [{"rename": {"l_hand": "palm", "head": "skull"}}, {"merge": ["l_forearm", "palm"]},
-             {"split": "l_forearm", "names": ["l_forearm", "l_hand"]},
-             {"move_joint": "l_hand", "position": [0.5, 0.0, 1.0]}, {"merge": ["0", 1]}]
+    edits = [{"rename": {"hand_left": "palm", "head": "skull"}}, {"merge": ["forearm_left", "palm"]},
+             {"split": "forearm_left", "names": ["forearm_left", "hand_left"]},
+             {"move_joint": "hand_left", "position": [0.5, 0.0, 1.0]}, {"merge": ["0", 1]}]
     path = tmp_path / "edits.json"
     path.write_text(json.dumps(edits))
     after = apply_edits(person.skeleton, person.mesh, read_edits(path))
-    by_hand = rename_part(rename_part(person.skeleton, "l_hand", "palm"), "head", "skull")
-    by_hand = split_part(merge_parts(by_hand, person.mesh, "l_forearm", "palm"), person.mesh, "l_forearm",
-                         names=("l_forearm", "l_hand"))
-    by_hand = merge_parts(move_joint(by_hand, person.mesh, "l_hand", (0.5, 0.0, 1.0)), person.mesh, 0, 1)
+    by_hand = rename_part(rename_part(person.skeleton, "hand_left", "palm"), "head", "skull")
+    by_hand = split_part(merge_parts(by_hand, person.mesh, "forearm_left", "palm"), person.mesh, "forearm_left",
+                         names=("forearm_left", "hand_left"))
+    by_hand = merge_parts(move_joint(by_hand, person.mesh, "hand_left", (0.5, 0.0, 1.0)), person.mesh, 0, 1)
     assert after.names == by_hand.names and after.joints.tobytes() == by_hand.joints.tobytes()
     assert np.array_equal(after.part_of_face, by_hand.part_of_face)
 
 
 @pytest.mark.parametrize(("edit", "message"), [
-    ({"merge": ["l_hand", "r_hand"]}, "neither linked nor on the same part"),
-    ({"merge": ["head", "l_upper_arm"]}, "'head' and 'l_upper_arm' do not touch"),
+    ({"merge": ["hand_left", "hand_right"]}, "neither linked nor on the same part"),
+    ({"merge": ["head", "upper_arm_left"]}, "'head' and 'upper_arm_left' do not touch"),
     ({"merge": ["head", "head"]}, "expected two different parts, got 'head' twice"),
     ({"merge": "head"}, "expected a list of two parts"),
     ({"split": "wing"}, "expected one of pelvis, .* got 'wing'"),

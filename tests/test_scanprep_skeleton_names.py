@@ -6,15 +6,11 @@ from animal_bodies import Animal, Build
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.edit import merge_parts, split_part
-from scanprep.skeleton.names import in_words, joint_in_words, name_parts
+from scanprep.skeleton.names import name_parts
+from scanprep.skeleton.roles import find_roles, in_words, joint_in_words, limb_parts, part_name
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import BodyShape, Person
-
-
-def expected(name):
-    """`l_upper_arm` of the synthetic people as `upper_arm_left`."""
-    return f"{name[2:]}_{'left' if name[0] == 'l' else 'right'}" if name[1] == "_" else name
 
 
 def unnamed(skeleton):
@@ -37,7 +33,7 @@ def test_people_of_any_build_and_direction_are_named(seed):
     R, t = rotations.exp(rng.normal(0, 2, 3)), rng.normal(0, 3, 3)
     mesh = Mesh(body.mesh.vertices @ R.T + t, body.mesh.faces)
     skeleton = Skeleton(body.part_of_face, body.parents, body.joints @ R.T + t)
-    assert named(mesh, skeleton) == tuple(map(expected, body.names))
+    assert named(mesh, skeleton) == body.names
 
 
 def test_in_the_mirror_left_is_right(person):
@@ -45,7 +41,7 @@ def test_in_the_mirror_left_is_right(person):
     mesh = Mesh(person.mesh.vertices * flip, person.mesh.faces[:, ::-1])
     found = named(mesh, Skeleton(person.part_of_face, person.parents, person.joints * flip))
     swapped = {"left": "right", "right": "left"}
-    for name, true in zip(found, map(expected, person.names), strict=True):
+    for name, true in zip(found, person.names, strict=True):
         stem, _, side = true.rpartition("_")
         assert name == (f"{stem}_{swapped[side]}" if side in swapped else true)
 
@@ -55,7 +51,7 @@ def test_the_order_of_vertices_and_parts_does_not_matter(person):
     old, faces = rng.permutation(len(person.mesh.vertices)), rng.permutation(len(person.mesh.faces))
     mesh = Mesh(person.mesh.vertices[old], np.argsort(old)[person.mesh.faces[faces]])
     found = named(mesh, Skeleton(person.part_of_face[faces], person.parents, person.joints))
-    assert found == tuple(map(expected, person.names))
+    assert found == person.names
 
 
 def test_coarser_and_finer_trees_are_named(person):
@@ -64,20 +60,21 @@ def test_coarser_and_finer_trees_are_named(person):
     def names(skeleton):
         return set(named(mesh, unnamed(skeleton)))
 
-    whole = set(map(expected, person.names))
+    whole = set(person.names)
     two = merge_parts(person.skeleton, mesh, "pelvis", "abdomen")
     assert names(two) == whole - {"abdomen"}
     one = merge_parts(two, mesh, "pelvis", "chest")
     assert names(one) == whole - {"pelvis", "abdomen", "chest"} | {"trunk"}
     three = split_part(person.skeleton, mesh, "abdomen")
     assert names(three) == whole - {"abdomen"} | {"abdomen1", "abdomen2"}
-    stumps = merge_parts(merge_parts(person.skeleton, mesh, "l_forearm", "l_hand"), mesh, "r_forearm", "r_hand")
+    stumps = merge_parts(merge_parts(person.skeleton, mesh, "forearm_left", "hand_left"), mesh,
+                         "forearm_right", "hand_right")
     assert names(stumps) == whole - {"hand_left", "hand_right"}
 
 
 def test_what_is_no_person_keeps_its_names(person):
     mesh = person.mesh
-    lame = unnamed(merge_parts(person.skeleton, mesh, "l_hand", "l_forearm"))
+    lame = unnamed(merge_parts(person.skeleton, mesh, "hand_left", "forearm_left"))
     assert named(mesh, lame) == lame.names
     headless = unnamed(merge_parts(person.skeleton, mesh, "chest", "head"))
     assert named(mesh, headless) == headless.names
@@ -89,8 +86,34 @@ def test_what_is_no_person_keeps_its_names(person):
 
 
 @pytest.mark.parametrize(("name", "part", "joint"), [
-    ("forearm_left", "left forearm", "left elbow"), ("upper_arm_right", "right upper arm", "right shoulder"),
+    ("forearm_left", "left forearm", "left elbow"), ("l_forearm", "left forearm", "left elbow"),
+    ("upper_arm_right", "right upper arm", "right shoulder"),
     ("head", "head", "neck"), ("tail", "tail", "joint of the tail"),
     ("spine_2", "spine 2", "joint of the spine 2"), ("thigh2_left", "left thigh2", "joint of the left thigh2")])
 def test_names_in_words(name, part, joint):
     assert in_words(name) == part and joint_in_words(name) == joint
+
+
+@pytest.mark.parametrize("spelt", ["hand_left", "l_hand", "hand_l", "hand_L", "hand.L", "L_hand", "left_hand",
+                                   "hand-left"])
+def test_every_spelling_of_a_side_is_one_part(spelt):
+    assert part_name(spelt) == "hand_left" and find_roles([spelt]) == {"l_wrist": 0}
+
+
+OTHERS = {"upper_arm": "Arm", "forearm": "ForeArm", "hand": "Hand", "thigh": "UpLeg", "shin": "Leg", "foot": "Foot",
+          "pelvis": "Hips", "abdomen": "Spine", "chest": "Spine2", "head": "Head"}
+
+
+@pytest.mark.parametrize("spell", [
+    lambda plain, side: f"{side[0]}_{plain}" if side else plain,  # ours of old
+    lambda plain, side: f"mixamorig:{side.title()}{OTHERS[plain]}"], ids=["old", "mixamo"])
+def test_limbs_are_found_whatever_program_named_them(person, spell):
+    names = []
+    for name in person.names:
+        plain, _, side = name.rpartition("_") if name.endswith(("_left", "_right")) else (name, "", "")
+        names.append(spell(plain, side))
+    for limb, side in (("arm", "left"), ("arm", "right"), ("leg", "left"), ("leg", "right")):
+        found = limb_parts(names, person.parents, person.joints, limb, side)
+        assert found == limb_parts(person.names, person.parents, person.joints, limb, side)
+        assert [person.names[p].removesuffix(f"_{side}") for p in found] == (
+            ["upper_arm", "forearm", "hand"] if limb == "arm" else ["thigh", "shin", "foot"])

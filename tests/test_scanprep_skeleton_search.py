@@ -85,7 +85,7 @@ def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
 def test_parts_that_moved_on_one_side_alone_are_found_on_both():
     body, rng = Person(), np.random.default_rng(1)
     bent = np.zeros((5, 16, 3))
-    for part in ("l_forearm", "r_thigh", "head", "l_upper_arm"):
+    for part in ("forearm_left", "thigh_right", "head", "upper_arm_left"):
         bent[1:, body.names.index(part)] = rng.normal(0, 0.5, (4, 3))
     poses = np.stack([body.posed(pose) for pose in bent])
     found = search_skeleton(body.mesh, poses, CONFIG)

@@ -1,6 +1,7 @@
 """Bodies that files hold: registered, completed, or as betas of a model."""
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,13 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from model.body import BodyModel
+from model.measurement.marks import MEASURED
 from model.measurement.tapes import Tapes
 from model.posing.cli import read_subject
 from scanprep.cli import Unit
+from scanprep.console import bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of, read_mesh
+from scanprep.geometry.landmark_names import known_landmarks
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
+from scanprep.registration.person import find_landmarks
 
 from ..partial.completion import load_completion
 from ..viewing.kinds import reported_model
@@ -115,8 +120,30 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     """The template that tapes are found on, and its landmarks.
 
     The model's, which keeps its own; else that of the set; else the first body. Landmarks are in the file given, or
-    beside, or known by the triangles: those of the synthetic people.
+    beside, or known by the triangles: those of the synthetic people. Where tapes begin at others too, as they do when
+    ten were clicked, the average person finds them.
     """
+    template, known = _known_landmarks(given, bodies, model)
+    lacking = [name for name in MEASURED if name not in known_landmarks(known)]
+    if not lacking:
+        return template, known
+    with bar("looking for the other landmarks") as progress:
+        found = find_landmarks(template, known, progress)
+    more = {name: found[name] for name in lacking if name in found}
+    if not more and not known:
+        raise ValueError("measuring begins at landmarks of the template, and there are none, nor does the average "
+                         "person come to lie on it; name a file of them with --landmarks (scape pick makes one), or "
+                         "a model that keeps them with -m")
+    if more:
+        warnings.warn(f"{len(more)} landmarks of the template that measuring begins at were found with the average "
+                      "person, a few centimetres from where you would click them; to place one yourself, click it "
+                      f"with scape pick under its name: {', '.join(more)}", stacklevel=2)
+    return template, known | more
+
+
+def _known_landmarks(given: Path | None, bodies: Sequence[Body], model: BodyModel | None
+                     ) -> tuple[Mesh, dict[str, int]]:
+    """The template, and the landmarks that somebody gave it."""
     from scanprep.synthetic.landmarks import landmarks
     from scanprep.synthetic.topology import load
 
@@ -130,9 +157,7 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
         return template, read_landmark_vertices(beside, template)
     if np.array_equal(template.faces, load().mesh.faces):
         return template, landmarks()
-    whose = "the model" if model is not None else "" if first is None else str(first.path)
-    raise ValueError(f"{whose}: measuring begins at landmarks of the template, and there are none; name a file of them "
-                     "with --landmarks (scape pick makes one), or a model that keeps them with -m")
+    return template, {}
 
 
 def check_standing(tapes: Tapes, body: Body) -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.linear import Subject
-from model.motion.roles import above, numbered_roles
 from scanprep.geometry import rotations
+from scanprep.skeleton.roles import above, numbered_roles
 
 from ..motion import Motion
 

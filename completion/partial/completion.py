@@ -15,7 +15,7 @@ from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
-from scanprep.skeleton.names import in_words, joint_in_words
+from scanprep.skeleton.roles import in_words, joint_in_words
 from scanprep.threads import one_thread
 
 from ..bodies import as_body

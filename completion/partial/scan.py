@@ -12,6 +12,8 @@ from scanprep.depth_camera.person import Person, find_person
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.places import distinct_places
+from scanprep.geometry.sanitise import sanitise
 from scanprep.threads import search_threads
 
 from .normals import completed_normals, one_sign, plane_normals, spread, turn_outward
@@ -160,22 +162,29 @@ def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPo
     if not np.isfinite(points).all():
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise ValueError(f"{name}: {len(bad)} points are not finite, the first is point {bad[0]}")
+    index, border = distinct_places(points), np.zeros(len(points), dtype=bool)
+    meshed = isinstance(scan, Mesh) and len(scan.faces) > 0
+    if isinstance(scan, Mesh) and meshed:
+        scan = sanitise(scan, name)
+        given = scan.vertex_normals
+        border[scan.boundary_vertices] = True
+        index = np.flatnonzero((given != 0).any(axis=1))
+        index = index[distinct_places(points[index])]
+    if len(index) <= NEIGHBOURS:
+        raise ValueError(f"{name}: expected more than {NEIGHBOURS} "
+                         f"{'vertices with triangles' if meshed else 'distinct points'}, got {len(index)}")
+    # A point that is there twice would halve the distance to the neighbours, and the plane through them.
+    points, border, given = points[index], border[index], None if given is None else given[index]
     distance, near = cKDTree(points).query(points, NEIGHBOURS, workers=search_threads(len(points)))
     spacing = float(np.median(distance[:, 1:5].mean(axis=1)))
-    every = np.arange(len(points))
-    if isinstance(scan, Mesh) and len(scan.faces):
-        border = np.zeros(len(points), dtype=bool)
-        border[scan.boundary_vertices] = True
-        used = (scan.vertex_normals != 0).any(axis=1)
-        if used.sum() <= NEIGHBOURS:
-            raise ValueError(f"{name}: expected more than {NEIGHBOURS} vertices with triangles, got {used.sum()}")
-        return ScanPoints(points[used], scan.vertex_normals[used], border[used], spacing, 0 * every[used], every[used])
+    if meshed and given is not None:
+        return ScanPoints(points, given, border, spacing, 0 * index, index)
     normals = plane_normals(points, near) if given is None else completed_normals(given, points, near)
     if viewpoint is not None:
         normals = normals * np.where(np.einsum("nd,nd->n", normals, viewpoint - points) < 0, -1, 1)[:, None]
     elif given is None or not one_sign(normals, near):
         normals = turn_outward(points, normals, near, distance, 4 * spacing)
-    return ScanPoints(points, normals, np.zeros(len(points), dtype=bool), spacing, 0 * every, every)
+    return ScanPoints(points, normals, border, spacing, 0 * index, index)
 
 
 def _split(scan: View, name: str) -> tuple[np.ndarray, np.ndarray | None]:

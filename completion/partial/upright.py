@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.human_poses import KINDS
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.roles import LIMBS, numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 TILT = 0.35                          # radians that trunks of people who stand lean, standard deviation
@@ -53,11 +53,12 @@ class Upright:
 def standing_axis(template: Mesh, skeleton: Skeleton) -> np.ndarray | None:
     """The axis (3,) of a template's frame that points most from its legs to its head; None without head or legs."""
     part = skeleton.part_of_vertex(template)
-    legs = [p for p, name in enumerate(skeleton.names) if name.rpartition("_")[0] in KINDS["leg"]]
-    heads = [p for p, name in enumerate(skeleton.names) if name == "head"]
-    if not legs or not heads:
+    roles = numbered_roles(skeleton.names, skeleton.joints)
+    legs = [p for role, p in roles.items() if role[2:] in LIMBS["leg"]]
+    if not legs or "skullbase" not in roles:
         return None
-    way = template.vertices[np.isin(part, heads)].mean(axis=0) - template.vertices[np.isin(part, legs)].mean(axis=0)
+    head, legs_middle = (template.vertices[np.isin(part, parts)].mean(axis=0) for parts in (roles["skullbase"], legs))
+    way = head - legs_middle
     axis = np.zeros(3)
     axis[np.abs(way).argmax()] = np.sign(way[np.abs(way).argmax()])
     return axis

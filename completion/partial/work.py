@@ -11,14 +11,15 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
-from scanprep.console import Metric, Outcome, judgement_row, write_report
+from scanprep.console import Metric, Outcome, details, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, read_view
 from scanprep.geometry.format_common import UNITS
-from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
@@ -96,12 +97,13 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
         depth = read_picture(inputs.scans, work.unit)
         files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
-        named = read_landmarks(inputs.landmarks, files.mesh, work.unit) if inputs.landmarks else {}
+        surface = files.mesh or (all_points(files.views) if files.views else None)
+        named = read_landmarks(inputs.landmarks, surface, work.unit) if inputs.landmarks else {}
         landmarks = _landmarks(work, inputs.landmarks, named)
         masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
-            raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
+            raise UsageError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
         files = person_in(depth, work.body.template, landmarks)
     scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
@@ -121,11 +123,10 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
     metrics = [judgement_row(done.judgement), *figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
-    rows = [(m.name, m.value, m.unit) for m in metrics]
     name = ", ".join(path.name for path in inputs.scans)
     panes = completion_panes(views, done, work.body.template, masked, landmarks,
                              {vertex: name for name, vertex in work.marks.items()})
-    completion_page(panes, name, rows, picture, masked is not None).write(output / "report.html")
+    completion_page(panes, name, metrics, picture, masked is not None).write(output / "report.html")
     if work.command:
         storage.write(output / SCENE, small_scene(panes))
     return metrics
@@ -134,22 +135,24 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
 def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.ndarray, np.ndarray] | None,
             masked: np.ndarray | None) -> list[Metric]:
     """The rows of the closing table."""
-    rows = [Metric("distance of the scan to the completed mesh, RMS", MM * done.rms, "mm"),
-            Metric("scan points explained", 100 * done.explained, "%"),
-            Metric("vertices with data", 100 * float(done.seen.mean()), "%")]
+    rows = [Metric("share of the scan that lies on the body", 100 * done.explained, "%"),
+            Metric("share of the body that was measured", 100 * float(done.seen.mean()), "%")]
+    if done.expected_error is not None:
+        rows.insert(0, Metric("expected error of the body, mean", MM * float(np.nanmean(done.expected_error)), "mm"))
     if landmarks is None:
         rows.append(Metric("landmarks used", "none"))
     else:
         rows += [Metric("landmarks used", len(landmarks[0])),
-                 Metric("distance of landmarks, predicted mesh, RMS", MM * done.landmark_rms, "mm")]
+                 Metric("landmarks to the model's own body, RMS", MM * done.landmark_rms, "mm")]
     if len(inputs.scans) > 1:
         rows.append(Metric("views", len(inputs.scans)))
     if masked is not None:
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
-    return [*rows, Metric("converged", "yes" if done.converged else "no"), Metric("rounds", done.iterations),
-            Metric("model", work.model)]
+    return [*rows, Metric("what the scan leaves beside the body that was bent onto it, RMS", MM * done.rms, "mm"),
+            Metric("model", work.model), *details([Metric("settled", "yes" if done.converged else "no"),
+                                                   Metric("rounds", done.iterations)])]
 
 
 def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> np.ndarray | None:
@@ -159,7 +162,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
     if len(paths) == 1:
         return read_mask(paths[0], all_points(files.views), unit)
     if len(paths) != len(files.views):
-        raise ValueError(f"--mask: expected one file, or one for each of the {len(files.views)} views, "
+        raise UsageError(f"--mask: expected one file, or one for each of the {len(files.views)} views, "
                          f"got {len(paths)}")
     starts = np.cumsum([0, *map(point_count, files.views)])
     points = all_points(files.views)
@@ -168,13 +171,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
 
 
 def _landmarks(work: Work, file: Path | None, named: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-    if file is None:
-        return None
-    try:
-        _, vertices, points = match_landmarks(work.marks, named)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-    return vertices, points
+    return None if file is None else shared_landmarks(file, work.marks, named)
 
 
 def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -> Completion:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
 from scanprep.geometry.files import (
     ENDINGS,
@@ -82,7 +83,7 @@ def _by_folder(folder: Path) -> dict[str, dict[int, Path]]:
 
 def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
     if "{camera}" not in pattern or "{frame}" not in pattern:
-        raise ValueError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
+        raise UsageError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
     expression = re.escape(pattern).replace(r"\{camera\}", "(?P<camera>.+?)").replace(r"\{frame\}", r"(?P<frame>\d+)")
     found: dict[str, dict[int, Path]] = {}
     for path in sorted(folder.rglob("*")):

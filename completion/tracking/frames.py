@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.places import distinct_places
+from scanprep.geometry.sanitise import sanitise
 
 from ..partial.scan import NEIGHBOURS, ScanPoints, View, prepare_scan, spread
 
@@ -56,7 +58,8 @@ def as_views(cloud: ScanPoints) -> list[PointCloud]:
 
 def _read(view: View, viewpoint: np.ndarray | None, number: int) -> _Points:
     if isinstance(view, Mesh):
-        points, rough = view.vertices, view.vertex_normals if len(view.faces) else None
+        points, sound = view.vertices, sanitise(view, f"frame: view {number}")
+        rough = sound.vertex_normals if len(sound.faces) else None
     elif isinstance(view, PointCloud):
         points, rough = view.points, view.normals
     else:
@@ -67,7 +70,8 @@ def _read(view: View, viewpoint: np.ndarray | None, number: int) -> _Points:
             raise ValueError(f"frame: view {number}: expected points of shape (n, 3), or (n, 6) with normals, "
                              f"got {array.shape}")
         points, rough = array[:, :3], array[:, 3:] if array.shape[1] == 6 else None
-    good = np.isfinite(points).all(axis=1)
+    good = np.flatnonzero(np.isfinite(points).all(axis=1))
+    good = good[distinct_places(points[good])]
     return _Points(points[good], None if rough is None else np.nan_to_num(rough[good]), viewpoint)
 
 

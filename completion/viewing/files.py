@@ -16,7 +16,6 @@ from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import is_camera
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
-from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import Dots
 from scanprep.viewer.clicked import read_surface
 from scanprep.viewer.dropped import with_camera
@@ -160,7 +159,7 @@ class Files:
         if file is None:
             return of_mesh(name, shape)
         try:
-            return of_mesh(name, shape, read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit))
+            return of_mesh(name, shape, read_landmarks(file, shape, self.unit))
         except ValueError as problem:                    # a file of another kind that happens to have its name
             return replace(of_mesh(name, shape), notes=(f"no landmarks beside {name}: {problem}",))
 

@@ -13,7 +13,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import PointOperator, picked
 from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.names import in_words
+from scanprep.skeleton.roles import in_words
 
 FEW = 3                              # differences beside the body at a new pose: for more it gets these betas itself
 KEPT = 24                            # differences of the body that are kept, those used last
@@ -29,7 +29,7 @@ class MovableBody:
 
     def __init__(self, model: BodyModel) -> None:
         self.model, self.skeleton = model, model.skeleton
-        self.parts = tuple(map(part_in_words, model.skeleton.names))
+        self.parts = tuple(map(in_words, model.skeleton.names))
         self.part_of_vertex = model.skeleton.part_of_vertex(model.template)
         self.regressor = model.joint_regressor
         self.betas: np.ndarray | None = np.zeros(model.n_betas) if model.n_betas else None
@@ -128,9 +128,3 @@ class MovableBody:
                 self._differences.popitem(last=False)
         self._differences.move_to_end(k)
         return self._differences[k]
-
-
-def part_in_words(name: str) -> str:
-    """A part's name by which models that name them otherwise share it: "left hand" for hand_left and l_hand."""
-    side = {"l_": "left", "r_": "right"}.get(name[:2])
-    return in_words(name if side is None else f"{name[2:]}_{side}")

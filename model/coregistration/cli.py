@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
+from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
-from scanprep.cli import Output, Unit
+from scanprep.cli import Output, Person, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
+from scanprep.geometry.landmarks import read_landmarks, shared_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
@@ -29,11 +29,11 @@ from .single import Landmarks
 
 FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "score", "starts")
 
-ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
+ScansArg = Annotated[Path, Place("SCANS")]
 
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
-                     first: Path | None = None, subject: str = "template", unit: Unit | None = None,
+                     first: Path | None = None, subject: Annotated[str, Person] = "template", unit: Unit | None = None,
                      config: CoregistrationConfig = CoregistrationConfig(), *, space: Workspace  # noqa: B008
                      ) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
@@ -112,11 +112,7 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
 def _landmarks(model: BodyModel, path: Path | None, scan: Mesh | np.ndarray, unit: Unit | None) -> Landmarks | None:
     if path is None or not model.info.get("landmarks"):
         return None
-    found = read_landmarks(path, scan if isinstance(scan, Mesh) else None, unit)
-    try:
-        return match_landmarks(model.info["landmarks"], found)[1:]
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    return shared_landmarks(path, model.info["landmarks"], read_landmarks(path, scan, unit))
 
 
 def _starts(first: Path | None, model: BodyModel, names: Sequence[str]) -> list[np.ndarray | None]:

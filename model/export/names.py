@@ -4,9 +4,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+from scanprep.skeleton.roles import numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
-from ..motion.roles import numbered_roles
 from .rig import Rig
 
 Names = Literal["mixamo", "vrm", "h-anim", "opensim"]

@@ -1,4 +1,4 @@
-"""Names of the landmarks that measurements begin from, in the vocabularies that template files use."""
+"""The landmarks that measurements begin from, and the axes of the body that they tell."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -6,39 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.landmark_names import known_landmarks
 from scanprep.geometry.mesh import Mesh
 
-# our names, which are those of the synthetic people -> the SCAPE and SPRING meshes' -> CAESAR's
-MIDDLE = {
-    "top of head": ("top of head", "vertex", "crown"), "navel": ("navel", "cornea"),
-    "back": ("back", "cornea (on the back, similar position)"), "crotch": ("crotch", "between two legs"),
-    "neck front": ("neck front", "neck (front)", "suprasternale"),
-    "neck back": ("neck back", "neck (back)", "cervicale")}
-PAIRED = {
-    "toe": ("{} toe", "toe in {} leg", "{} digit ii"),
-    "heel": ("{} heel", "heel in {} leg", "{} calcaneous, post."),
-    "knee": ("{} knee", "knee in {} leg", "{} femoral lateral epicn."),
-    "knee inside": ("{} knee inside", "knee (inside) in {} leg", "{} femoral medial epicn."),
-    "waist": ("{} waist", "waist {} side", "{} 10th rib"), "hip": ("{} hip", "hip, {}", "{} trochanterion"),
-    "middle finger": ("{} middle finger", "middle finger {} hand", "{} dactylion"),
-    "elbow outside": ("{} elbow outside", "elbow (outside) {} arm", "{} olecranon"),
-    "elbow inside": ("{} elbow inside", "elbow (inside) {} arm", "{} humeral medial epicn."),
-    "shoulder": ("{} shoulder", "shoulder (upper) {} side", "{} acromion"),
-    "armpit": ("{} armpit", "shoulder (bottom) {} side", "{} axilla, ant."),
-    "nipple": ("{} nipple", "tit, {}", "{} thelion/bustpoint"), "ear": ("{} ear", "ear, {}", "{} tragion")}
-SIDES = {"left": ("left", "lt."), "right": ("right", "rt.")}
-FEET = tuple(f"{side} {name}" for side in SIDES for name in ("toe", "heel"))
+FEET = tuple(f"{side} {name}" for side in ("left", "right") for name in ("toe", "heel"))
+# Where tapes begin. No waist: without its landmarks it is the narrowest place, which says more than a guess.
+MEASURED = (*FEET, "top of head", "neck front", "neck back", "navel", "back", "crotch",
+            *(f"{side} {name}" for side in ("left", "right") for name in (
+                "ear", "shoulder", "armpit", "nipple", "hip", "knee", "knee inside", "elbow outside", "elbow inside",
+                "middle finger")))
 ABOVE = ("top of head", "neck front", "neck back", "left ear", "right ear")
-
-
-def known_landmarks(landmarks: Mapping[str, int]) -> dict[str, int]:
-    """The landmarks that measurements use, by our names: `left knee` for `knee in left leg` or `Lt. Femoral ...`."""
-    given = {" ".join(name.lower().split()): int(vertex) for name, vertex in landmarks.items()}
-    wanted = dict(MIDDLE)
-    for side, words in SIDES.items():
-        wanted |= {f"{side} {name}": tuple(form.format(word) for form in forms for word in words)
-                   for name, forms in PAIRED.items()}
-    return {name: given[form] for name, forms in wanted.items() for form in forms[::-1] if form in given}
 
 
 @dataclass(frozen=True, eq=False)

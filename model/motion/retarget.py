@@ -14,11 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import rotations
+from scanprep.skeleton.roles import NEEDED, above, numbered_roles, trunk, way
 from scanprep.skeleton.tree import Skeleton
 
 from ..export.rig import check_motion, joint_places
 from .moving import MovingSkeleton
-from .roles import NEEDED, above, numbered_roles, trunk, way
 from .trunks import grouped, heights, nearest_starts, spread
 
 Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from scanprep.skeleton.roles import numbered_roles
+
 from .moving import MovingSkeleton
-from .roles import numbered_roles
 
 UPRIGHT = 0.8                        # cosine between segments and the vertical, from which on somebody stands
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.ranges import Settings
 
 from .control.files import humanoid
@@ -89,7 +90,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
 
     [Statues]
     """
-    control, config = control or humanoid(), config or StatueConfig()
+    control, config, scan = control or humanoid(), config or StatueConfig(), sanitise(scan)
     given = (scan, joints, points, control)
     if joints is None and points is None:
         posed = posed_automatically(control, step("features", given, lambda: find_features(control, scan)))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..geometry import storage
 from .digests import paths_of, version
 from .room import Failure, Job, attempt
 
@@ -96,8 +97,9 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
     if error is None:
         value, files = future.result()
         for name, data in files.items():
-            (job.folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (job.folder / name).write_bytes(data)
+            path = storage.path_inside(job.folder, name, address)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
         return value
     if isinstance(error, KilledWorker):
         return Failure(f"{job.name}: the workers at work on it died, one after another")

@@ -63,6 +63,8 @@ def written_of(output: Path) -> dict[str, str]:
         except storage.StorageError:
             continue
         if isinstance(told, dict) and (report not in earlier or output.name in told):
+            for file in told:
+                storage.path_inside(report.parent, file, report)
             return {**told, report.name: Digests().of_file(report)}
     return {}
 

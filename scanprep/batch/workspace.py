@@ -71,7 +71,7 @@ class Workspace:
         found = Ownership(self.folder, self.digests)
         for place in {self.folder, self.output or self.folder}:
             for record in (place / HOME / "done").glob("*.npz"):
-                found.add((load_header(record) or {"files": {}})["files"], place)
+                found.add(_files_of(record, place), place)
         if self.output is not None:
             found.add(written_of(self.output), report_path(self.output).parent)
         return found
@@ -153,7 +153,7 @@ class Workspace:
 
     def drop(self, name: str) -> None:
         """Remove a result and its files, as far as they are as scapekit wrote them."""
-        for file, digest in (load_header(self._record(name)) or {"files": {}})["files"].items():
+        for file, digest in _files_of(self._record(name), self.folder).items():
             self._remove(file, digest)
         self.drop_record(name)
 
@@ -176,7 +176,7 @@ class Workspace:
         common = self.digests.of(work)
         found = []
         for path in sorted((self.home / "done").glob("*.npz")):
-            header = load_header(path)
+            header = _read_record(path, self.folder)
             if header and header["work"] == common and all((self.folder / f).is_file() for f in header["files"]):
                 found.append(unquote(path.stem))
         return found
@@ -195,7 +195,7 @@ class Workspace:
 
     def _kept(self, name: str, key: str) -> Any:
         """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""
-        header = load_header(self._record(name))
+        header = _read_record(self._record(name), self.folder)
         if header is None or header["digest"] != key or (self.force and name not in self._made) \
                 or not all((self.folder / file).is_file() for file in header["files"]):
             return NOTHING
@@ -234,8 +234,10 @@ class Workspace:
 
     def _settle(self, ready: Path) -> None:
         """Bring the files of a result to their place, and take away those that it had before and has no more."""
-        header = load_header(ready / RECORD)
-        assert header is not None, f"{ready}: results get their name when they are whole"
+        header = _read_record(ready / RECORD, self.folder)
+        if header is None:                                  # results get their name when they are whole
+            raise storage.StorageError(f"{ready / RECORD}: expected the record of a result, cannot read it; remove "
+                                       f"the folder {ready} to make that result anew")
         record = self._record(unquote(ready.name))
         before = self._before(unquote(ready.name))
         for file in header["files"]:
@@ -263,9 +265,9 @@ class Workspace:
 
     def _before(self, name: str) -> dict[str, str]:
         """File -> digest of what a result wrote when it was last made."""
-        record = load_header(self._record(name))
-        if record is not None or name != "output" or self.output is None:
-            return dict((record or {"files": {}})["files"])
+        files = _files_of(self._record(name), self.folder)
+        if files or name != "output" or self.output is None:
+            return files
         # an output that is a file keeps no record of it
         place = report_path(self.output).parent.relative_to(self.folder)
         return {(place / file).as_posix(): digest for file, digest in written_of(self.output).items()}
@@ -288,6 +290,24 @@ class Staged:
 
     folder: Path
     value: Any = None
+
+
+def _read_record(path: Path, folder: Path) -> dict[str, Any] | None:
+    """What the record of a result tells; None where there is none that can be read.
+
+    StorageError where it names a file that is not in its folder: such a record was not written here.
+    """
+    header = load_header(path)
+    if header is None or not isinstance(header.get("files"), dict) or not {"digest", "work"} <= set(header):
+        return None
+    for file in header["files"]:
+        storage.path_inside(folder, file, path)
+    return header
+
+
+def _files_of(record: Path, folder: Path) -> dict[str, str]:
+    """File -> digest of what a result wrote; nothing where there is no record of it."""
+    return dict((_read_record(record, folder) or {"files": {}})["files"])
 
 
 def _plain(name: str) -> str:

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -10,10 +9,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
-from ..ranges import FLAG, Settings
+from ..geometry.places import spacing
+from ..geometry.sanitise import sanitise
+from ..ranges import Settings
 from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
+MUTUAL, SPARSE = 4, 3.0              # neighbours of a point where points are few, and how far off, in links
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 
 
@@ -32,10 +34,10 @@ class CleanScanConfig(Settings):
     floor_area : float, square metres
         A plane on which less is measured is no floor; both soles together have about 0.04.
     spacings : float
-        Points closer than this many times the median distance to the nearest neighbour belong together.
+        Points closer than this many times the median distance between neighbouring places belong together.
     """
 
-    gap: Annotated[float, FLAG] = 0.03
+    gap: float = 0.03
     min_points: int = 30
     planes: int = 3
     floor_area: float = 0.1
@@ -98,12 +100,12 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
         A scan without points, or one of which nothing is left.
     """
     config, rng = config or CleanScanConfig(), rng or np.random.default_rng(0)
+    scan = sanitise(scan) if isinstance(scan, Mesh) else scan
     mesh = _as_mesh(scan)
     points = mesh.vertices
     if not len(points):
         raise ValueError("scan: expected points, got none")
-    spacing = float(np.median(cKDTree(points).query(points[rng.permutation(len(points))[:2000]], 2)[0][:, 1]))
-    link = max(0.012, config.spacings * spacing)    # whether triangles join them or not
+    link = max(0.012, config.spacings * spacing(points))            # whether triangles join them or not
     label, planes = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):
@@ -165,7 +167,8 @@ def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
     # One point of every small cell stands for all of it, so that dense scans do not take long.
     _, first, cell = np.unique(np.floor(points / (link / 2)).astype(np.int64), axis=0, return_index=True,
                                return_inverse=True)
-    near = cKDTree(points[first]).query_pairs(link, output_type="ndarray")
+    near = np.concatenate([cKDTree(points[first]).query_pairs(link, output_type="ndarray"),
+                           _sparse_links(points[first], link, SPARSE * link)])
     a = np.concatenate([sides[:, 0], first[near[:, 0]], np.arange(len(points))])
     b = np.concatenate([sides[:, 1], first[near[:, 1]], first[cell.reshape(-1)]])
     _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(points), len(points))),
@@ -173,6 +176,20 @@ def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
     size = np.bincount(label[first])                    # by cells, not by points, which crowd near the scanner
     rank = np.argsort(np.argsort(-size, kind="stable"), kind="stable")
     return np.asarray(rank[label])
+
+
+def _sparse_links(points: np.ndarray, link: float, longest: float) -> np.ndarray:
+    """Pairs (n, 2) of points farther apart than `link` and up to `longest` metres that are among each other's nearest.
+
+    They join a side that was seen from afar, or by one view where others overlap, to itself; two surfaces hardly.
+    """
+    if len(points) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    apart, near = cKDTree(points).query(points, min(MUTUAL + 1, len(points)), distance_upper_bound=longest)
+    a, b = np.repeat(np.arange(len(points)), near.shape[1] - 1), near[:, 1:].ravel()
+    far = (apart[:, 1:].ravel() > link) & (b < len(points))
+    a, b = a[far], b[far]
+    return np.stack([a, b], axis=1)[np.isin(a * len(points) + b, b * len(points) + a)]
 
 
 def _body_of(points: np.ndarray, piece: np.ndarray, config: CleanScanConfig, landmarks: np.ndarray | None

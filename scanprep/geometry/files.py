@@ -27,6 +27,7 @@ from .format_common import (
     metres_per_unit,
 )
 from .mesh import Mesh
+from .sanitise import sanitise
 from .seams import merged_mean, seams_closed
 
 __all__ = ["ENDINGS", "SCAN_ENDINGS", "UNITS", "EmptyFileError", "MeshFileError", "PointCloud", "Registered",
@@ -226,14 +227,16 @@ def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
 
 
 def read_view(path: str | Path, unit: str | None = None) -> Mesh | PointCloud:
-    """A mesh, or the points of a file without triangles with the normals and colours that it has."""
+    """A scan as a mesh, its triangles made sound (`sanitise`), or as points with their normals and colours."""
     path = Path(path)
     contents = _read(path)
-    return _mesh(path, contents, unit) if _has_faces(contents) else _cloud(path, contents, unit)
+    if not _has_faces(contents):
+        return _cloud(path, contents, unit)
+    return sanitise(_mesh(path, contents, unit), str(path))
 
 
 def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
-    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
+    """A scan as a mesh, its triangles made sound (`sanitise`), or as points (n, 3) where the file has no triangles."""
     view = read_view(path, unit)
     return view if isinstance(view, Mesh) else view.points
 
@@ -242,6 +245,11 @@ def write_points(path: str | Path, cloud: PointCloud) -> None:
     """Write points in metres, whole or not at all: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
     contents = Contents(cloud.points, None, cloud.normals, cloud.colors)
     _write(Path(path), contents, "double", {".ply": _MESHES[".ply"], **_POINTS})
+
+
+def is_scan(path: Path) -> bool:
+    """Whether a name is that of a mesh or a point cloud."""
+    return ending_of(path) in SCAN_ENDINGS
 
 
 def list_meshes(folder: str | Path) -> list[Path]:

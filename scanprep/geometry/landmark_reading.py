@@ -9,11 +9,9 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from . import storage
-from .format_common import FARTHEST, UNITS, Lines, MeshFileError, quote
-from .mesh import Mesh
+from .format_common import UNITS, Lines, MeshFileError, quote
 
 Entry = np.ndarray | int | dict[str, Any]        # point, vertex, or face with barycentric coordinates
 _Points = list[tuple[str, np.ndarray]]
@@ -24,10 +22,11 @@ class Found(NamedTuple):
 
     pairs: list[tuple[str, Entry]]
     unit: str | None = None                      # of the points, where the format or the file tells
+    flipped: bool = False                        # may be: 3D Slicer has LPS and RAS, and scans of either
 
 
-def entries_of(path: Path, data: bytes, unit: str | None, mesh: Mesh | None) -> Found:
-    """The landmarks of a file by its ending; `unit` is that which was told, `mesh` tells the axes of 3D Slicer.
+def entries_of(path: Path, data: bytes, unit: str | None) -> Found:
+    """The landmarks of a file by its ending; `unit` is that which was told.
 
     MeshFileError with the line or the element that is wrong.
     """
@@ -36,9 +35,9 @@ def entries_of(path: Path, data: bytes, unit: str | None, mesh: Mesh | None) -> 
         raise MeshFileError(f"{path}: expected landmarks as text, found a binary file")
     with storage.taking_apart(path, "landmarks", MeshFileError):
         if suffix == ".json":
-            return _json(path, data, unit, mesh)
+            return _json(path, data, unit)
         if suffix == ".fcsv":
-            return _as_meshed(_fiducials(path, data), unit, mesh)
+            return _fiducials(path, data)
         if suffix == ".pp":
             return Found([*_picked_points(path, data)])
         if suffix == ".xml":
@@ -52,7 +51,7 @@ def entries_of(path: Path, data: bytes, unit: str | None, mesh: Mesh | None) -> 
         return Found(_named_rows(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8"))
 
 
-def _json(path: Path, data: bytes, unit: str | None, mesh: Mesh | None) -> Found:
+def _json(path: Path, data: bytes, unit: str | None) -> Found:
     """Ours, scalismo's, or a markups file of 3D Slicer."""
     tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused later, by name
     if isinstance(tree, list) and tree and all(isinstance(one, dict) and "id" in one for one in tree):
@@ -60,7 +59,7 @@ def _json(path: Path, data: bytes, unit: str | None, mesh: Mesh | None) -> Found
     if not isinstance(tree, dict):
         raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, found a {type(tree).__name__}")
     if isinstance(tree.get("markups"), list):
-        return _as_meshed(_slicer(path, tree["markups"], unit), unit, mesh)
+        return _slicer(path, tree["markups"], unit)
     return Found([(name, _json_entry(path, name, value)) for name, value in tree.items()])
 
 
@@ -111,7 +110,7 @@ def _slicer(path: Path, markups: list[Any], unit: str | None) -> Found:
                     pairs.append((str(name), position * signs))
     if str(own_unit) not in UNITS and unit is None:
         raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
-    return Found(pairs, own_unit)
+    return Found(pairs, own_unit, flipped=True)
 
 
 _FIDUCIALS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID".split(",")
@@ -135,18 +134,7 @@ def _fiducials(path: Path, data: bytes) -> Found:
         if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != _DEFINED:
             continue
         pairs.append(_named_point(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
-    return Found([(name, point * signs) for name, point in pairs], "mm")
-
-
-def _as_meshed(found: Found, unit: str | None, mesh: Mesh | None) -> Found:
-    """Points of 3D Slicer, in LPS as it writes meshes; in RAS, where the mesh at hand shows that they were meant so."""
-    if mesh is None or not all((np.abs(np.asarray(p)) <= FARTHEST).all() for _, p in found.pairs) or not found.pairs:
-        return found
-    points = UNITS[unit or found.unit or "mm"] * np.array([p for _, p in found.pairs])
-    tree, flip = cKDTree(mesh.vertices), np.array([-1, -1, 1])
-    if tree.query(points * flip)[0].sum() >= tree.query(points)[0].sum():
-        return found
-    return Found([(name, np.asarray(p) * flip) for name, p in found.pairs], found.unit)
+    return Found([(name, point * signs) for name, point in pairs], "mm", flipped=True)
 
 
 def _picked_points(path: Path, data: bytes) -> _Points:

@@ -1,6 +1,7 @@
 """Files of landmarks: what they mean on a mesh, and which belongs to what; `landmark_reading` has the formats."""
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,15 +13,19 @@ from scipy.spatial import cKDTree
 from . import storage
 from .files import name_of
 from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_per_unit
+from .landmark_names import paired_names
 from .landmark_reading import Entry, entries_of
 from .landmark_writing import as_bytes
 from .mesh import Mesh
 
+ON_SURFACE = 0.03                    # of its size: clicks lie so near to a scan, those in another unit do not
+SPREAD = 0.2                         # of its size: landmarks of a person, who has hands, feet and a head, spread wider
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt",
                     ".landmarks.csv", ".fcsv", ".scalismo.json")
 
 
-def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None = None) -> dict[str, np.ndarray]:
+def read_landmarks(path: str | Path, mesh: Mesh | np.ndarray | None = None, unit: str | None = None
+                   ) -> dict[str, np.ndarray]:
     """Read named points.
 
     Parameters
@@ -30,11 +35,12 @@ def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None 
         (`[{"id": name, "coordinates": [x, y, z]}]`); MeshLab `.pp`; CAESAR `.lnd`; 3D Slicer `.mrk.json` and `.fcsv`;
         `.csv` with a heading `name,x,y,z`; a marker set of OpenSim, `.xml`, whose markers are all in one frame;
         otherwise text with lines `x y z name`.
-    mesh : Mesh, optional
-        What vertices and faces refer to.
+    mesh : Mesh or (n, 3) float, metres, optional
+        The scan: what vertices and faces refer to, and on which the points must lie.
     unit : 'm', 'mm', 'cm' or 'in', optional
         Unit of the coordinates in the file. When it is not given: millimetres for `.lnd` and `.fcsv`, what the file
-        says for `.mrk.json`, otherwise metres, with a UserWarning where the points span more than 10 m.
+        says for `.mrk.json`, otherwise metres. Where they then do not lie on the scan and in another unit they do,
+        that unit is taken, with a UserWarning.
 
     Returns
     -------
@@ -162,9 +168,12 @@ def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mappi
                     ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """The landmarks that the template and the scan have in common, in the template's order.
 
+    Names that mean the same count as the same: `crown` and `top of head`, `LeftHand` and `left middle finger`.
+
     Returns
     -------
     names : L strings
+        The template's.
     template values : (L, ...) array
     scan values : (L, ...) array
 
@@ -173,17 +182,30 @@ def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mappi
     ValueError
         Fewer than `minimum` names match; both lists are in the message.
     """
-    names = tuple(name for name in template_landmarks if name in scan_landmarks)
-    if len(names) < minimum:
+    pairs = paired_names(template_landmarks, scan_landmarks)
+    if len(pairs) < minimum:
         raise ValueError(f"landmarks: expected at least {minimum} names that template and scan share, found "
-                         f"{len(names)}; template: {', '.join(template_landmarks) or 'none'}; "
+                         f"{len(pairs)}; template: {', '.join(template_landmarks) or 'none'}; "
                          f"scan: {', '.join(scan_landmarks) or 'none'}")
-    return (names, np.array([template_landmarks[name] for name in names]),
-            np.array([scan_landmarks[name] for name in names]))
+    return (tuple(ours for ours, _ in pairs), np.array([template_landmarks[ours] for ours, _ in pairs]),
+            np.array([scan_landmarks[theirs] for _, theirs in pairs]))
 
 
-def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, Entry]:
-    pairs, own_unit = entries_of(path, load_bytes(path), unit, mesh)
+def shared_landmarks(path: Path, template_landmarks: Mapping[str, int], scan_landmarks: Mapping[str, np.ndarray]
+                     ) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices (L,) and points (L, 3) that `match_landmarks` pairs; None, with a warning, where they are too few.
+
+    `path` is the scan's landmark file, for the warning, which says what both sides call theirs.
+    """
+    try:
+        return match_landmarks(template_landmarks, scan_landmarks)[1:]
+    except ValueError as problem:
+        warnings.warn(f"{path}: {problem}; going on without landmarks", stacklevel=2)
+        return None
+
+
+def _entries(path: Path, mesh: Mesh | np.ndarray | None, unit: str | None) -> dict[str, Entry]:
+    pairs, own_unit, flipped = entries_of(path, load_bytes(path), unit)
     if not pairs:
         raise MeshFileError(f"{path}: expected landmarks, found none")
     entries = dict(pairs)
@@ -196,14 +218,52 @@ def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, Entry
             if not (np.abs(value) <= FARTHEST).all():
                 problem = f"lies beyond {FARTHEST:g}" if np.isfinite(value).all() else "is not finite"
                 raise MeshFileError(f"{path}: landmark '{name}' {problem}: {value.tolist()}")
-    scale = metres_per_unit(path, np.array(points).reshape(-1, 3), unit or own_unit, smallest=0.0)
+    surface, scale = mesh.vertices if isinstance(mesh, Mesh) else mesh, np.ones(3)
+    if points and surface is None:
+        scale = metres_per_unit(path, np.array(points), unit or own_unit, smallest=0.0) * scale
+    elif points and surface is not None:
+        scale = _metres_on_surface(path, np.array(points), surface, unit or own_unit, flipped)
     return {name: scale * v if isinstance(v, np.ndarray) else v for name, v in entries.items()}
 
 
-def _place(path: Path, name: str, value: Entry, mesh: Mesh | None) -> np.ndarray:
+def _metres_on_surface(path: Path, points: np.ndarray, surface: np.ndarray, unit: str | None, flipped: bool
+                       ) -> np.ndarray:
+    """What to multiply the points (L, 3) of a file with (3,), so that they lie on a surface (n, 3), metres.
+
+    Programs write units that are not those of the scan: 3D Slicer calls everything millimetres. So the unit told
+    counts where the points then lie on the scan, else the one in which they do.
+    """
+    if unit is not None and unit not in UNITS:
+        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    told = UNITS[unit or "m"]
+    tree, size = cKDTree(surface), float(np.linalg.norm(np.ptp(surface, axis=0)))
+    signs = [np.ones(3), np.array([-1.0, -1, 1])] if flipped else [np.ones(3)]
+
+    def away(scale: np.ndarray) -> float:
+        return float(np.median(tree.query(points * scale)[0]))
+
+    def fits(scale: np.ndarray) -> bool:
+        spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # on one spot of it anything lies on it
+        return spread > SPREAD * size and away(scale) <= ON_SURFACE * size
+
+    best = min((told * sign for sign in signs), key=away)
+    if len(points) < 3 or fits(best):
+        return best
+    # every ratio of two units, as the scan may have been converted and the landmarks not, or the other way round
+    factors = {a / b for a in UNITS.values() for b in UNITS.values()}
+    others = [scale for factor in factors for sign in signs if fits(scale := told * factor * sign)]
+    if not others:
+        return best
+    other = min(others, key=away)
+    warnings.warn(f"{path}: read in {unit or 'm'} the landmarks do not lie on the scan; multiplied by "
+                  f"{abs(other[0]) / told:.4g} they do, and so they are used", stacklevel=4)
+    return other
+
+
+def _place(path: Path, name: str, value: Entry, mesh: Mesh | np.ndarray | None) -> np.ndarray:
     if isinstance(value, np.ndarray):
         return value
-    if mesh is None:
+    if not isinstance(mesh, Mesh):
         kind = "vertex" if isinstance(value, int) else "face"
         raise ValueError(f"mesh: {path} gives landmark '{name}' by {kind}, so the mesh is needed it refers to")
     if isinstance(value, int):

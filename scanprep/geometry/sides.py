@@ -3,8 +3,9 @@ from __future__ import annotations
 
 import re
 
-_WORDS = re.compile(r"(?<![A-Za-z])(left|right|lt|rt)(?![A-Za-z])", re.IGNORECASE)
-_LETTER = re.compile(r"^[LR](?=[A-Z0-9._ ])|^[lr](?=[._ ])|(?<=[._ ])[LRlr]$|(?<=[a-z0-9])[LR]$")
+_WORDS = re.compile(r"(?<![A-Za-z])(?i:left|right|lt|rt)(?![A-Za-z])|(?<![A-Za-z])(?:[Ll]eft|[Rr]ight)(?=[A-Z])"
+                    r"|(?<=[a-z0-9])(?:Left|Right)(?![a-z])")
+_LETTER = re.compile(r"^[LR](?=[A-Z0-9._ -])|^[lr](?=[._ -])|(?<=[._ -])[LRlr]$|(?<=[a-z0-9])[LR]$")
 _OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "left", "lt": "rt", "rt": "lt"}
 
 
@@ -12,7 +13,7 @@ def other_side(label: str) -> str | None:
     """The label of the same place on the other side, or None for a label that names no side.
 
     Sides are an L or R in front (LELB, L.Knee), one at the end (elbow_l, KneeR), or the words left, right,
-    Lt. and Rt.
+    Lt. and Rt. (knee_left, LeftKnee).
     """
     if _WORDS.search(label):
         return _WORDS.sub(lambda found: _like(found[0]), label, count=1)
@@ -25,6 +26,15 @@ def side_of(label: str) -> int:
     """1 for a label of the left, -1 for the right, 0 for one that names no side."""
     found = _WORDS.search(label) or _LETTER.search(label)
     return 0 if found is None else 1 if found[0][0] in "lL" else -1
+
+
+def split_side(label: str) -> tuple[str, str]:
+    """A label without its side, and "left", "right" or "" for the side: ("hand", "left") for l_hand and hand_left."""
+    found = _WORDS.search(label) or _LETTER.search(label)
+    if found is None:
+        return label, ""
+    before, behind = label[:found.start()].rstrip(" ._-,"), label[found.end():].lstrip(" ._-,")
+    return " ".join(filter(None, (before, behind))), "left" if found[0][0] in "lL" else "right"
 
 
 def _like(word: str) -> str:

@@ -12,7 +12,7 @@ import os
 import stat
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import IO, Any
 
 import numpy as np
@@ -63,6 +63,51 @@ def check_regular(path: str | Path, error: type[StorageError] = StorageError, wh
         raise error(f"{path}: expected {what}, found a {'folder' if stat.S_ISDIR(mode) else 'pipe or a device'}")
 
 
+def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
+    """The file of a folder that another file names, which must lie in that folder.
+
+    Folders of results travel: what their records name may be anything. So a name is a relative path without `..`,
+    and no link on the way leads out of the folder.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Where the file must lie.
+    name : str
+        A relative path, as it was read.
+    source : str or Path
+        The file that it was read from, for the error.
+
+    Returns
+    -------
+    Path
+        `folder / name`.
+
+    Raises
+    ------
+    StorageError
+        Not text, absolute, with `..` in it, or a link that leads out of the folder.
+
+    Examples
+    --------
+    >>> path_inside("set", "meshes/anna.ply", "set/set.csv").as_posix()
+    'set/meshes/anna.ply'
+    """
+    refused = StorageError(f"{source}: expected the name of a file inside {folder}, found {name!r}")
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise refused
+    # The rules of Windows are the stricter ones: drives, and a backslash that separates.
+    parts = PureWindowsPath(name)
+    if parts.drive or parts.root or ".." in parts.parts:
+        raise refused
+    path = Path(folder) / name
+    with taking_apart(source, f"the name of a file, not {name[:80]!r}"):      # too long, or links in a circle
+        inside = path.resolve().is_relative_to(Path(folder).resolve())
+    if not inside:
+        raise StorageError(f"{source}: {path} is a link that leads out of {folder}; expected a file inside")
+    return path
+
+
 def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError] = StorageError) -> bytes:
     """All of a file, or an `error` that names it."""
     check_regular(path, error, what)
@@ -71,9 +116,9 @@ def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError]
 
 
 def write(path: str | Path, data: bytes | str) -> None:
-    """Write a file, whole or not at all; text as UTF-8."""
+    """Write a file, whole or not at all; text as UTF-8, and as `\\udce9` what is none of it in the name of a file."""
     with writing(path) as beside:
-        beside.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+        beside.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
 @contextlib.contextmanager
@@ -158,8 +203,16 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
          header: dict[str, Any] | None = None, compress: bool = True) -> None:
     """Write arrays and a JSON header into one `.npz` file: what it holds and the number of its layout, for `load`."""
     text = json.dumps({"kind": kind, "version": version, **(header or {})})
+    save_arrays(path, {HEADER: np.array(text), **arrays}, compress)
+
+
+def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
+    """Write arrays into one `.npz` file; ValueError for one of objects, which only a pickle would hold."""
+    for name, array in arrays.items():                     # before NumPy 2.3 savez cannot refuse them itself
+        if np.asarray(array).dtype.hasobject:
+            raise ValueError(f"{path}: expected arrays of numbers or text, {name} holds objects")
     with writing(path) as beside, open(beside, "wb") as out:
-        (np.savez_compressed if compress else np.savez)(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
+        (np.savez_compressed if compress else np.savez)(out, **arrays)     # type: ignore[arg-type]
 
 
 def load_arrays(path: str | Path, what: str = "an .npz file", only: Collection[str] | None = None

@@ -9,6 +9,8 @@ from scipy.spatial import cKDTree
 from ..threads import search_threads
 from .farthest_points import thin
 from .mesh import Mesh
+from .places import distinct_places
+from .sanitise import sanitise
 from .surface import OrientedPoints, checked_points
 
 NEIGHBOURS = 16                  # points of a scan over which its normals are averaged
@@ -23,32 +25,52 @@ class Target:
     border: np.ndarray                          # (n,) bool: on the edge of a hole, where data end, not the surface
     oriented: bool                              # the normals are known to point outward
     descriptors: np.ndarray | None = None       # (n, q) what else a point is matched by (see `path_descriptors`)
+    index: np.ndarray | None = None             # (n,) number of each point in the scan
 
     def thinned(self, cell: float) -> Target:
         """One point for each cubic cell (metres)."""
         keep = thin(self.points, cell)
         return Target(self.points[keep], self.normals[keep], self.border[keep], self.oriented,
-                      None if self.descriptors is None else self.descriptors[keep])
+                      None if self.descriptors is None else self.descriptors[keep],
+                      None if self.index is None else self.index[keep])
 
 
 def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
-    """Prepare a scan: normals averaged over neighbours, borders found; ValueError for fewer than four points."""
+    """Prepare a scan: repeated points left out, normals averaged over neighbours, borders found.
+
+    Every point has a normal. ValueError for fewer than four distinct points.
+    """
     points = checked_points(scan.vertices if isinstance(scan, Mesh) else scan, name)
-    if len(points) < 4:
-        raise ValueError(f"{name}: expected at least 4 points, got {len(points)}")
-    normals = None
+    index, normals = distinct_places(points), None
     if isinstance(scan, Mesh) and len(scan.faces):
-        used = np.unique(scan.faces)
-        points, normals = points[used], scan.vertex_normals[used]
-    oriented = normals is not None
+        scan = sanitise(scan, name)
+        index = np.unique(scan.faces)
+        index = index[distinct_places(points[index])]
+        normals = scan.vertex_normals[index]
+    if len(index) < 4:
+        raise ValueError(f"{name}: expected at least 4 distinct points, got {len(index)}")
+    points = points[index]
     near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)), workers=search_threads(len(points)))[1]
     if normals is not None:
-        agree = np.einsum("nkd,nd->nk", normals[near], normals) > 0
-        normals = np.einsum("nk,nkd->nd", agree, normals[near])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    else:
-        normals = _spread_normals(points[near])
-    return Target(points, normals, _one_sided(points, near), oriented)
+        return Target(points, _averaged_normals(points, normals, near), _one_sided(points, near), True, index=index)
+    return Target(points, _spread_normals(points[near]), _one_sided(points, near), False, index=index)
+
+
+def _averaged_normals(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3), each the mean over the neighbours (n, k) that face the same way.
+
+    Where the triangles around a point cancel, as where they lie back to back, it is that of its neighbours' plane.
+    """
+    agree = np.einsum("nkd,nd->nk", normals[near], normals) > 0
+    mean = np.einsum("nk,nkd->nd", agree, normals[near])
+    length = np.linalg.norm(mean, axis=1)
+    lost = length < 1e-9                     # all others sum up at least one unit normal
+    if lost.any():
+        plane = _spread_normals(points[near[lost]])
+        against = np.einsum("nd,nd->n", plane, normals[near[lost]].sum(axis=1)) < 0
+        mean[lost], length[lost] = np.where(against[:, None], -plane, plane), 1.0
+    mean /= length[:, None]
+    return mean
 
 
 def _spread_normals(near: np.ndarray) -> np.ndarray:

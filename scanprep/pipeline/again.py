@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from ..batch.calls import KeptCall
 from ..geometry.files import read_mesh
-from ..geometry.landmarks import read_template_landmarks
+from ..geometry.landmarks import landmarks_beside, read_template_landmarks
 from ..geometry.mesh import Mesh
 from .prepare import PrepareConfig
 from .scan import Init
@@ -46,10 +46,12 @@ def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Seque
                     ) -> tuple[dict[str, int], str]:
     """The landmarks of the template, where any scan is led by landmarks; and what is to be told."""
     without = [task.name for task in tasks if task.landmarks is None]
+    # the set keeps those of the template in any case: what is learned from it is measured by them
+    kept = read_template_landmarks(template, body, given) if given or landmarks_beside(template) else {}
     if init == "pose":
-        return {}, "no landmarks are used; all scans must be near the template's pose"
+        return kept, "no landmarks are used; all scans must be near the template's pose"
     if init == "automatic" or (init == "best" and len(without) == len(tasks)):
-        return {}, "no landmarks are used; look at the page for scans turned round or mirrored"
+        return kept, "no landmarks are used; look at the page for scans turned round or mirrored"
     note = (f"no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
             "look at the page for those turned round or mirrored") if without and init == "best" else ""
-    return read_template_landmarks(template, body, given), note
+    return kept or read_template_landmarks(template, body, given), note

@@ -12,7 +12,7 @@ from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
-from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
+from ..geometry.landmarks import check_on_surface, read_landmarks, shared_landmarks
 from ..geometry.mesh import Mesh
 from ..judgement import extent
 from ..ranges import FLAG, Settings
@@ -114,12 +114,12 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         return None
     if task.landmarks is None:
         raise ValueError(f"{task.scan}: expected a landmark file of the name {task.name}, found none")
-    found = read_landmarks(task.landmarks, scan if isinstance(scan, Mesh) else None, settings.unit)
+    found = read_landmarks(task.landmarks, scan, settings.unit)
     check_on_surface(task.landmarks, found, scan.vertices if isinstance(scan, Mesh) else scan)
-    try:
-        return match_landmarks(template_landmarks, found)[1:]
-    except ValueError as error:
-        raise ValueError(f"{task.landmarks}: {error}") from None
+    pairs = shared_landmarks(task.landmarks, template_landmarks, found)
+    if pairs is None and settings.init == "landmarks":
+        raise ValueError(f"{task.landmarks}: --init landmarks needs three names that the template has too")
+    return pairs
 
 
 def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings,

@@ -4,8 +4,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..console import visible
 from ..geometry import storage, tables
-from ..geometry.files import SCAN_ENDINGS, MeshFileError, ending_of, name_of
+from ..geometry.files import SCAN_ENDINGS, MeshFileError, is_scan, name_of
 from ..geometry.landmarks import landmarks_beside
 
 TABLE = "scans.csv"
@@ -57,6 +58,9 @@ def _list_scans(folder: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in sorted(filter(_is_scan, folder.iterdir())):
         name = name_of(path)
+        if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
+            raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
+                             "rename it")
         if name in found:
             raise ValueError(f"{folder}: expected one file a scan, found {found[name].name} and {path.name}, both "
                              f"of the name '{name}'; rename one, or merge them where they are views of one scan")
@@ -69,7 +73,7 @@ def _list_scans(folder: Path) -> dict[str, Path]:
 
 
 def _is_scan(path: Path) -> bool:
-    return ending_of(path) in SCAN_ENDINGS and not path.name.startswith(".") and path.is_file()
+    return is_scan(path) and not path.name.startswith(".") and path.is_file()
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
+from ..arguments import Place
 from ..cli import MM, MeshArg, Output, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import find_correspondences
@@ -18,7 +18,13 @@ from ..correspondence.correspondences import (
 )
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_mesh, read_scan, write_mesh
-from ..geometry.landmarks import landmarks_beside, match_landmarks, read_landmarks, read_template_landmarks
+from ..geometry.landmarks import (
+    landmarks_beside,
+    match_landmarks,
+    read_landmarks,
+    read_template_landmarks,
+    shared_landmarks,
+)
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from .limbs import limb_doubts
@@ -27,7 +33,7 @@ from .person import person_parts
 from .repair import repaired
 from .schedule import RegistrationConfig
 
-TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
+TargetArg = Annotated[Path, Place("TARGET")]
 
 
 def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,
@@ -36,6 +42,15 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
     """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
 
     Example: scape prep align front.ply back.ply -o front_aligned.ply
+
+    Args:
+        source: Mesh to move.
+        target: Mesh that stays.
+        output: Mesh to write, the moved one.
+        landmarks: Landmarks of the mesh that is moved.
+        target_landmarks: Those of the other, with the same names.
+        unit: Unit of both meshes and of their landmarks.
+        config: Settings.
     """
     moving, fixed = read_mesh(source, unit), read_mesh(target, unit)
     T = np.eye(4)
@@ -145,8 +160,8 @@ def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path 
     """Vertices of the template and points of the scan that carry the same names."""
     if landmarks is None:
         return None
-    found = read_landmarks(landmarks, data if isinstance(data, Mesh) else None, unit)
-    return match_landmarks(read_template_landmarks(template, body, template_landmarks), found)[1:]
+    found = read_landmarks(landmarks, data, unit)
+    return shared_landmarks(landmarks, read_template_landmarks(template, body, template_landmarks), found)
 
 
 def _led_by(landmarks: Path | None, pairs: Landmarks | None) -> list[Metric]:

@@ -15,7 +15,7 @@ import numpy as np
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..judgement import size
-from ..skeleton.names import in_words
+from ..skeleton.roles import in_words, part_kind
 from ..skeleton.tree import Skeleton
 from ..synthetic.anatomy import MIRROR_PART
 from ..synthetic.people import NAMED_POSES, PARENTS, PARTS, named_pose, random_pose
@@ -100,7 +100,8 @@ def limb_measures(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> L
     """How the parts of a template came to lie on its new vertices (N, 3), metres, against what people do."""
     angles = joint_angles(parts.skeleton.fit_rotations(template, vertices) @ parts.R_template_rest)
     bending, growth = part_bending(template, parts.skeleton, vertices)
-    most = (people_do()[2] + np.array([SHAPE[_kind(part)] for part in PARTS])) * size(template.with_vertices(vertices))
+    shape = np.array([SHAPE[part_kind(part)] for part in PARTS])
+    most = (people_do()[2] + shape) * size(template.with_vertices(vertices))
     return LimbMeasures(angles, beyond_people(angles), bending, most, growth - np.median(growth))
 
 
@@ -113,13 +114,8 @@ def beyond_people(angles: np.ndarray) -> np.ndarray:
 def allowed() -> tuple[np.ndarray, np.ndarray]:
     """The lowest and the highest joint angles (16, 3), degrees, that are not doubted."""
     low, high, _ = people_do()
-    slack = np.array([SLACK[_kind(part)] for part in PARTS])
+    slack = np.array([SLACK[part_kind(part)] for part in PARTS])
     return low - slack, high + slack
-
-
-def _kind(part: str) -> str:
-    """A part of either side."""
-    return part[2:] if part[1] == "_" else part
 
 
 def joint_angles(R: np.ndarray) -> np.ndarray:

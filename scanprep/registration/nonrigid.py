@@ -191,7 +191,9 @@ def _within(target: Target, x: np.ndarray, normals: np.ndarray, neighbours: int 
     """(N,) from 0 to 1: points that face the same way lie close by, and not at the edge of a hole."""
     tree = cKDTree(target.points)
     apart, near = tree.query(x, min(neighbours, len(target.points)))
-    spacing = float(np.median(tree.query(target.points, 2)[0][:, 1]))
+    # Close by is what the points around are to each other, but no less than usual: where views overlap they are dense.
+    nearest = tree.query(target.points, 2)[0][:, 1]
+    spacing = np.maximum(np.median(nearest), nearest[near].mean(axis=1))
     alike = np.einsum("nkd,nd->nk", target.normals[near], normals) > 0.3
     nearest = np.where(alike, apart, np.inf).min(axis=1)
     edge = (alike * target.border[near]).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)

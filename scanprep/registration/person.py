@@ -5,24 +5,29 @@ compared with those of people, before its first scan is registered.
 """
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..correspondence.correlated import find_correspondences, find_seeds
+from ..geometry.landmark_names import known_landmarks
+from ..geometry.landmarks import match_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 from ..skeleton.tree import Skeleton
+from ..synthetic.landmarks import landmarks
 from ..synthetic.people import PARENTS, PARTS, Person
-from .nonrigid import register, stretched_share
+from .nonrigid import Registration, register, stretched_share
+from .schedule import RegistrationConfig
 
 UNCOVERED, STRETCHED = 0.02, 0.05      # shares of a template and of the person on it beyond which it is no person
 MATCHING = 30                          # per cent of the time, before the person is registered
+ENOUGH = 4                             # landmarks from which the average person finds the others
 ENDS = 5                               # of limbs: head, hands and feet
-NAMES = tuple(f"{part[2:]}_{'left' if part[0] == 'l' else 'right'}" if part[1] == "_" else part for part in PARTS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,26 +56,69 @@ _known: WeakKeyDictionary[Mesh, PersonParts | None] = WeakKeyDictionary()
 
 def _found(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
     """The parts of a template that was not seen before."""
-    person = average_person()
-    try:
-        seeds = find_seeds(person.mesh, template)
-    except ValueError:                 # it has too few ends of limbs
-        return None
-    if len(seeds) < ENDS:
-        return None
-    pairs = find_correspondences(person.mesh, template, (seeds.template_vertices, seeds.scan_points),
-                                 progress=lambda done, total: tell(round(MATCHING * done / total), 100))
-    fit = register(person.mesh, template, correspondences=pairs,
-                   progress=lambda done, total: tell(round(MATCHING + (100 - MATCHING) * done / total), 100))
-    if fit.uncovered > UNCOVERED or stretched_share(person.mesh, fit.mesh) > STRETCHED:
+    person, fit = average_person(), _person_on(template, None, RegistrationConfig(), tell)
+    if fit is None:
         return None
     nearest = Surface(fit.mesh).closest(template.corners.mean(axis=1)).faces
     part_of_face = person.part_of_face[nearest]
     if len(np.unique(part_of_face)) < len(PARTS):
         return None
     joints = person.skeleton.joint_regressor(person.mesh) @ fit.mesh.vertices
-    return PersonParts(Skeleton(part_of_face, PARENTS, joints, NAMES),
+    return PersonParts(Skeleton(part_of_face, PARENTS, joints, PARTS),
                        person.skeleton.fit_rotations(person.mesh, fit.mesh.vertices))
+
+
+def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, config: RegistrationConfig,
+               tell: Callable[[int, int], None]) -> Registration | None:
+    """The average person on a template, led by landmarks or by the ends of limbs; None where it does not lie on it."""
+    person = average_person().mesh
+    if landmarks is not None:
+        fit = register(person, template, landmarks, config, tell)
+    else:
+        try:
+            seeds = find_seeds(person, template)
+        except ValueError:             # it has too few ends of limbs
+            return None
+        if len(seeds) < ENDS:
+            return None
+        pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
+                                     progress=lambda done, total: tell(round(MATCHING * done / total), 100))
+        fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(
+            round(MATCHING + (100 - MATCHING) * done / total), 100))
+    return None if fit.uncovered > UNCOVERED or stretched_share(person, fit.mesh) > STRETCHED else fit
+
+
+def find_landmarks(template: Mesh, known: Mapping[str, int],
+                   progress: Callable[[int, int], None] | None = None) -> dict[str, int]:
+    """All landmarks of the synthetic people on a template of which some are known, or none.
+
+    The average person is brought onto the template, led by the known ones where these are at least four, and every
+    other landmark goes along to the nearest vertex. Somebody who clicks would be a few centimetres off in the middle
+    of the trunk and the limbs, nearer at their ends.
+
+    Parameters
+    ----------
+    template : Mesh
+        A person; without landmarks, one who stands.
+    known : name to vertex
+        In any spelling of `landmark_name`.
+    progress : callable, optional
+        Called with (done, total).
+
+    Returns
+    -------
+    dict of name to int
+        Those that are known, as they are, by our names; then the others. The known ones alone where the average
+        person does not come to lie on the template.
+    """
+    marks, given = landmarks(), known_landmarks(known)
+    names, vertices, places = match_landmarks(marks, given, minimum=0)
+    led = (vertices, template.vertices[places]) if len(names) >= ENOUGH else None
+    fit = _person_on(template, led, RegistrationConfig.quick(), progress or (lambda done, total: None))
+    if fit is None:
+        return given
+    nearest = cKDTree(template.vertices).query(fit.mesh.vertices[list(marks.values())])[1]
+    return given | {name: int(v) for name, v in zip(marks, nearest, strict=True) if name not in given}
 
 
 @lru_cache(maxsize=1)

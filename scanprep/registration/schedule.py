@@ -1,7 +1,7 @@
 """The schedule of a non-rigid registration, as data. Lengths are multiples of the template's size, √area."""
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ..ranges import Cell, Count, Positive, Settings
 
@@ -130,6 +130,12 @@ class RegistrationConfig(Settings):
     ends: int = 5
     rolls: int = 3
     final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
+
+    @classmethod
+    def quick(cls) -> RegistrationConfig:
+        """Without the last steps: a third of the time, 7 mm from true landmarks instead of 6."""
+        whole = cls()
+        return replace(whole, graph=whole.graph[:-1], final_fit=None)
 
     @classmethod
     def published(cls) -> RegistrationConfig:

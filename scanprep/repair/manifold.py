@@ -6,6 +6,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..geometry.mesh import Mesh
+from ..geometry.sanitise import invert_against_neighbours, inverted
 from ..geometry.surface import Rays
 
 FLAT = 1e-12               # square metres: no area
@@ -81,28 +82,9 @@ def _drop_flat(mesh: Mesh) -> Mesh:
 
 
 def orient(mesh: Mesh) -> Mesh:
-    """Triangles inverted so that neighbours face the same way, in every patch the way most of its area does.
-
-    Patches end at edges with more than two triangles. One that has a single side only, as a Möbius strip has, is
-    left as it is.
-    """
-    if mesh.is_edge_manifold:
-        return mesh
-    forward = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).ravel()
-    order = np.argsort(mesh.face_edges.ravel(), kind="stable")
-    start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])[mesh.edge_use == 2]
-    first, second = order[start], order[start + 1]
-    a, b, agree = first // 3, second // 3, forward[first] != forward[second]
-    # Every triangle is there twice, as it is and inverted; what faces the same way hangs together.
-    count = len(mesh.faces)
-    rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
-    _, patch = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count)),
-                                    directed=False)
-    as_is, inverted = patch[:count], patch[count:]
-    area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
-    invert = area[inverted] > area[as_is]
-    invert |= (area[inverted] == area[as_is]) & (inverted < as_is)
-    return Mesh(mesh.vertices, np.where(invert[:, None], mesh.faces[:, ::-1], mesh.faces), mesh.colors)
+    """Triangles inverted so that neighbours face the same way, in every patch the way most of its area does."""
+    invert, _ = invert_against_neighbours(mesh)
+    return Mesh(mesh.vertices, inverted(mesh.faces, invert), mesh.colors) if invert.any() else mesh
 
 
 def _drop_at_bad_edges(mesh: Mesh) -> Mesh:

@@ -11,8 +11,6 @@ from .tree import Skeleton
 
 ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
 LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
-JOINTS = {"arm": "shoulder", "upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist", "leg": "hip", "thigh": "hip",
-          "shin": "knee", "foot": "ankle", "head": "neck"}                    # on which a part hangs
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
@@ -48,20 +46,6 @@ class _Person:
     chest: int
     up: np.ndarray
     centre: np.ndarray
-
-
-def in_words(name: str) -> str:
-    """A part's name as a sentence has it: "left forearm" for forearm_left."""
-    plain, _, side = name.rpartition("_")
-    return f"{side} {plain.replace('_', ' ')}" if plain and side in ("left", "right") else name.replace("_", " ")
-
-
-def joint_in_words(name: str) -> str:
-    """The joint that a part hangs on, from the part's name: "left elbow" for forearm_left."""
-    plain = name.removesuffix("_left").removesuffix("_right")
-    if plain not in JOINTS:
-        return f"joint of the {in_words(name)}"
-    return in_words(JOINTS[plain] + name.removeprefix(plain))
 
 
 def part_partners(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> np.ndarray | None:

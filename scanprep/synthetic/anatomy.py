@@ -16,8 +16,8 @@ import numpy as np
 from ..ranges import Range, Settings, ranges
 
 PARTS = ("pelvis", "abdomen", "chest", "head",
-         "l_upper_arm", "l_forearm", "l_hand", "r_upper_arm", "r_forearm", "r_hand",
-         "l_thigh", "l_shin", "l_foot", "r_thigh", "r_shin", "r_foot")
+         "upper_arm_left", "forearm_left", "hand_left", "upper_arm_right", "forearm_right", "hand_right",
+         "thigh_left", "shin_left", "foot_left", "thigh_right", "shin_right", "foot_right")
 PARENTS = np.array([-1, 0, 1, 2, 2, 4, 5, 2, 7, 8, 0, 10, 11, 0, 13, 14])
 MIRROR_PART = np.array([0, 1, 2, 3, 7, 8, 9, 4, 5, 6, 13, 14, 15, 10, 11, 12])
 ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, TOE_OUT = np.radians([36.0, 14.0, 4.5, 9.0])
@@ -86,7 +86,7 @@ class BodyShape(Settings):
         scale = {"weight": 0.9, "muscle": 0.8, "belly": 0.7, "chest": 0.8, "limbs": 0.7}
         for field in fields(BodyShape)[2:]:
             values[field.name] = scale.get(field.name, 0.9) * rng.normal()
-        allowed = {name: (found.low, found.high) for name, (found, _) in ranges(BodyShape).items()}
+        allowed = {name: (found.low, found.high) for name, found in ranges(BodyShape).items()}
         return BodyShape(**{name: float(np.clip(v, *allowed[name])) for name, v in values.items()})
 
 

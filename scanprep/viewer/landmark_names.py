@@ -3,10 +3,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arguments import UsageError
+from ..geometry.landmark_names import TEN
 from ..geometry.sides import other_side
-
-TEN = ("top of head", "navel", "left middle finger", "right middle finger", "left toe", "right toe",
-       "left elbow outside", "right elbow outside", "left knee", "right knee")
 
 _MIDDLE = ("Sellion", "Supramenton", "Nuchale", "Suprasternale", "Substernale", "Cervicale", "10th Rib Midspine",
            "Waist, Preferred, Post.", "Crotch")
@@ -27,7 +26,7 @@ def read_names(given: str) -> tuple[str, ...]:
         return LISTS[given]
     path = Path(given)
     if not path.is_file():
-        raise ValueError(f"--names: expected {', '.join(LISTS)}, or a text file with one name in each line; there is "
+        raise UsageError(f"--names: expected {', '.join(LISTS)}, or a text file with one name in each line; there is "
                          f"no file {given}")
     names = [" ".join(line.split()) for line in path.read_text(encoding="utf-8").splitlines()]
     names = [name for name in names if name and not name.startswith("#")]

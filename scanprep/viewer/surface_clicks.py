@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
+from ..geometry.places import spacing
 from ..geometry.surface import Rays, Surface
 
 BESIDE = 1e-6                        # of the size: so far behind a hit a ray goes on
@@ -37,8 +37,7 @@ class Clickable:
 
     @cached_property
     def _spacing(self) -> float:
-        some = self.points[::max(1, len(self.points) // 2000)]
-        return float(np.median(cKDTree(self.points).query(some, 2)[0][:, 1]))
+        return spacing(self.points)
 
     @property
     def has_surface(self) -> bool:

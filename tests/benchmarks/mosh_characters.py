@@ -53,10 +53,7 @@ OF_SCAPE = {                         # names of the landmarks of the SCAPE templ
     "back": "cornea (on the back, similar position)", "neck front": "neck (front)", "neck back": "neck (back)",
     "{} eye": "eye, {}", "nose tip": "tip of nose", "mouth": "mouse (middle)", "{} ear": "ear, {}",
     "top of head": "top of head", "{} hip": "hip, {}"}
-PARTS_OF_SCAPE = {"l_upper_arm": "upper_arm_left", "r_upper_arm": "upper_arm_right", "l_forearm": "forearm_left",
-                  "r_forearm": "forearm_right", "l_hand": "hand_left", "r_hand": "hand_right", "l_thigh": "thigh_left",
-                  "r_thigh": "thigh_right", "l_shin": "shin_left", "r_shin": "shin_right", "l_foot": "foot_left",
-                  "r_foot": "foot_right"}
+LIMB_PARTS = ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
 
 
 def template_marks(model: BodyModel) -> dict[str, int]:
@@ -80,10 +77,9 @@ def on_figure(model: BodyModel, figure: Cartoon, kept: Path) -> tuple[Character,
 
 def joints_off(model: BodyModel, figure: Cartoon, found: Character) -> list[float]:
     """How far the joints of the limbs lie from those that the figure was made with, metres."""
-    names = list(model.skeleton.names)
-    pairs = [(names.index(name if name in names else other), figure.joints[name])
-             for name, other in PARTS_OF_SCAPE.items()]
-    return [float(np.linalg.norm(found.joints[j] - at)) for j, at in pairs]
+    parts = [f"{part}_{side}" for part in LIMB_PARTS for side in ("left", "right")]
+    return [float(np.linalg.norm(found.joints[model.skeleton.names.index(part)] - figure.joints[part]))
+            for part in parts]
 
 
 def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSequence, MarkerLayout]:

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from model.linear import Subject
-from model.motion.roles import numbered_roles
 from scanprep.console import say
 from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import stance
+from scanprep.skeleton.roles import numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion

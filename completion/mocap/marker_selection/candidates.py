@@ -8,7 +8,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sides import other_side, side_of
+from scanprep.geometry.sides import other_side, side_of, split_side
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
 
@@ -139,8 +139,7 @@ def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]])
     for place in places:
         stem = ""
         if skeleton is not None and parts is not None:
-            words = skeleton.names[parts[place[0]]].replace(".", "_").split("_")
-            stem = "_".join(w for w in words if w.lower() not in ("left", "right", "l", "r")).upper() + "."
+            stem = split_side(skeleton.names[parts[place[0]]])[0].replace(".", "_").upper() + "."
         key = f"{'M' if len(place) == 1 else 'LR'}.{stem}"
         counts[key] = counts.get(key, 0) + 1
         labels += [f"{side}.{stem}{counts[key]}" for side in ("M" if len(place) == 1 else "LR")]

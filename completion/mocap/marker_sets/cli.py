@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from model.files import load_model
+from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmark_writing import marker_set
-from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
+from scanprep.geometry.landmarks import read_landmarks, read_template_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.registration.person import average_person
 from scanprep.skeleton.tree import Skeleton
@@ -29,7 +29,7 @@ from .named import layout_names, layout_summaries, read_layout
 from .opensim import opensim_markers
 from .symmetry import label_pairs
 
-LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
+LayoutArg = Annotated[str, Place("LAYOUT")]
 
 COMMANDS = {
     "list": ("The marker sets that come along.", "completion.mocap.marker_sets.cli:list_layouts"),
@@ -78,7 +78,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     from .pictures import layout_page, picture_layout
 
     if model is not None and body is not None:
-        raise ValueError("--model and --body: expected one of them")
+        raise UsageError("--model and --body: expected one of them")
     shown, skeleton, kept, name = _body(model, body, unit)
     found = read_layout(layout, shown, kept)
     figures = _figures(found, shown)
@@ -129,10 +129,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
     if landmarks is not None:
         marks = synthetic_landmarks() if source is None and source_landmarks is None else read_template_landmarks(
             source or Path("average person"), ours, source_landmarks, "--source-landmarks")
-        try:
-            pairs = match_landmarks(marks, read_landmarks(landmarks, theirs, unit))[1:]
-        except ValueError as error:
-            raise ValueError(f"{landmarks}: {error}") from None
+        pairs = shared_landmarks(landmarks, marks, read_landmarks(landmarks, theirs, unit))
     with bar("registering") as progress:
         result = transfer_layout(found, ours, theirs, pairs, progress=progress)
     result.layout.save(output)

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.farthest_points import thin
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.geometry.target import Target, target_of
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
@@ -44,7 +45,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     if len(scan.vertices) < 100:
         raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
     search = PoseSearch(Articulated(control))
-    scan = outward(scan)
+    scan = sanitise(scan)
     unit = likely_unit(scan.vertices)
     data = scan if len(scan.vertices) < 40_000 else scan.vertices[thin(scan.vertices, 0.007 / UNITS[unit])]
     target = target_of(data)
@@ -88,13 +89,6 @@ def likely_unit(points: np.ndarray) -> str:
     spread = points - points.mean(axis=0)
     longest = float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
     return min(UNITS, key=lambda unit: abs(np.log(max(longest, 1e-12) * UNITS[unit] / 1.7)))    # metres
-
-
-def outward(scan: Mesh) -> Mesh:
-    """The same scan with its triangles seen from outside, if most of them were seen from inside."""
-    centre = scan.vertices.mean(axis=0)
-    inside_out = Mesh(scan.vertices - centre, scan.faces).volume < 0
-    return Mesh(scan.vertices, scan.faces[:, ::-1], scan.colors) if inside_out else scan
 
 
 def _facing_outward(target: Target, scan: Mesh, spacing: float) -> Target:

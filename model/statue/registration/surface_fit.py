@@ -294,4 +294,5 @@ def scan_target(scan: Mesh) -> Target:
     border = np.zeros(len(scan.vertices), dtype=bool)
     border[scan.boundary_vertices] = True
     border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
-    return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
+    target = target_of(scan, name="scan")
+    return replace(target, border=border[target.index])

@@ -1,0 +1,82 @@
+"""The one list of landmark names: what people call the same place, in this program's files and in those of others."""
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from .sides import split_side
+
+# Our name of a place in the middle of the body or, without its side, on either side: then other names, in small
+# letters without side and punctuation: what people write, the SCAPE and SPRING meshes, CAESAR, ISO 7250.
+MIDDLE = {
+    "top of head": ("crown", "head top", "head", "vertex", "apex"), "navel": ("belly button", "omphalion", "cornea"),
+    "back": ("cornea on the back similar position",), "crotch": ("between two legs", "perineum"),
+    "neck front": ("suprasternale", "throat"), "neck back": ("cervicale", "c7", "nape"),
+    "nose tip": ("tip of nose", "nose", "pronasale"), "mouth": ("mouse middle",), "chin": ("menton",)}
+PAIRED = {
+    "toe": ("foot", "toes", "toe tip", "big toe", "toe in leg", "digit ii", "foot tip"),
+    "heel": ("heel in leg", "calcaneous post", "heel back"), "ankle": ("lateral malleolus", "ankle outside"),
+    "knee": ("knee in leg", "knee front", "knee outside", "kneecap", "patella", "femoral lateral epicn"),
+    "knee inside": ("knee inside in leg", "femoral medial epicn"),
+    "waist": ("waist side", "10th rib"), "hip": ("trochanterion",),
+    "middle finger": ("hand", "middle finger hand", "middle finger tip", "fingertip", "finger", "hand tip",
+                      "dactylion"),
+    "thumb": ("thumb tip",), "wrist": ("radial styloid",),
+    "elbow outside": ("elbow", "elbow outside arm", "olecranon", "elbow back"),
+    "elbow inside": ("elbow inside arm", "humeral medial epicn"),
+    "shoulder": ("shoulder upper side", "acromion", "shoulder top"),
+    "armpit": ("shoulder bottom side", "axilla ant", "axilla"),
+    "nipple": ("tit", "thelion bustpoint", "breast"), "eye": ("ectocanthus",), "ear": ("tragion",)}
+# The ten that README asks for: limbs have ends and bends there, and everybody finds them.
+TEN = ("top of head", "navel", *(f"{side} {name}" for name in ("middle finger", "toe", "elbow outside", "knee")
+                                 for side in ("left", "right")))
+_KNOWN = {form: name for names in (MIDDLE, PAIRED) for name, forms in names.items() for form in (name, *forms)}
+
+
+def landmark_name(name: str) -> str:
+    """Our name of a landmark, whatever its case, its spaces, how its side is told, and which synonym it is.
+
+    Examples
+    --------
+    >>> [landmark_name(name) for name in ("LeftHand", "l_hand", "hand left", "Hand_L", "Middle finger, left hand")]
+    ['left middle finger', 'left middle finger', 'left middle finger', 'left middle finger', 'left middle finger']
+    >>> landmark_name("crown"), landmark_name("scar 3")
+    ('top of head', 'scar 3')
+    """
+    plain, side = split_side(name.strip())
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", plain).lower()
+    words = " ".join(re.sub(r"[\W_]+", " ", words).split())
+    known = _KNOWN.get(words, words)
+    if bool(side) != (known in PAIRED) and known in {**MIDDLE, **PAIRED}:       # "left navel", or an elbow of no side
+        known = words
+    return f"{side} {known}".strip()
+
+
+def known_landmarks(landmarks: Mapping[str, Any]) -> dict[str, Any]:
+    """Landmarks by our names: `left knee` for `knee in left leg` or `Lt. Femoral Lateral Epicn.`.
+
+    Where several are names of one place, the one that is spelt as ours counts, else the first.
+    """
+    out: dict[str, Any] = {}
+    for name, value in landmarks.items():
+        ours = landmark_name(name)
+        if ours not in out or name == ours:
+            out[ours] = value
+    return out
+
+
+def paired_names(ours: Iterable[str], theirs: Iterable[str]) -> list[tuple[str, str]]:
+    """The names (ours, theirs) of the same places, in our order: equal ones, then those that mean the same."""
+    theirs = list(theirs)
+    same = set(ours) & set(theirs)
+    by_meaning: dict[str, str] = {}
+    for name in theirs:
+        if name not in same:
+            by_meaning.setdefault(landmark_name(name), name)
+    pairs = []
+    for name in ours:
+        other = name if name in same else by_meaning.pop(landmark_name(name), None)
+        if other is not None:
+            pairs.append((name, other))
+    return pairs

@@ -1,0 +1,179 @@
+"""A scan made sound: degenerate and repeated triangles dropped, inverted ones turned to face outward.
+
+Only triangles change. Vertices stay, with their order: masks, colours and landmark files refer to their numbers.
+"""
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ..threads import search_threads
+from .mesh import Mesh
+from .places import distinct_rows
+from .surface import Rays
+
+FLAT = 1e-9              # area over squared longest side: float32 files leave no flatter triangle that has a normal
+SAMPLES = 400            # triangles of each patch that look for what is in front of them and behind
+WAYS = 4                 # rays of each, to either side
+REACH = 0.15             # of the diagonal, that a ray goes: through a trunk, but not across a room
+HIDDEN = 0.05            # share of the rays by which the front must be hidden more often than the back
+SURE = 5.0               # standard deviations by which that must differ from chance
+
+
+def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
+    """Drop what is no surface and turn what is inside out.
+
+    Triangles without area, repeated triangles and flaps (a triangle and its reverse on an edge of their own) are
+    dropped; of a two-sided surface one side stays. Neighbours are made to face the same way, and each patch the way
+    that less of the scan hides: an open shell is seen from outside.
+
+    Parameters
+    ----------
+    scan : Mesh
+        In any unit.
+    name : str
+        What the warning calls it: its file, or the argument.
+
+    Returns
+    -------
+    Mesh
+        The very same object where nothing was wrong. A UserWarning tells what was dropped and turned, in one line.
+
+    Examples
+    --------
+    >>> from scanprep.synthetic.people import Person
+    >>> body = Person().mesh
+    >>> sanitise(body) is body
+    True
+    """
+    if not len(scan.faces):
+        return scan
+    place = distinct_rows(scan.vertices)
+    one_place = scan if place is None else Mesh(scan.vertices, place[scan.faces])
+    keep, notes = _surface_triangles(one_place)
+    if not keep.any():
+        return scan                          # nothing but lines: whoever needs a surface says so
+    kept = one_place if keep.all() else Mesh(scan.vertices, one_place.faces[keep])
+    invert, patch = invert_against_neighbours(kept)
+    invert ^= _inside_out(Mesh(kept.vertices, inverted(kept.faces, invert)) if invert.any() else kept, patch)
+    if invert.any():
+        notes.append("all triangles faced inward and were turned" if invert.all() else
+                     f"{invert.sum()} of {len(invert)} triangles faced inward and were turned")
+    if not notes:
+        return scan
+    warnings.warn(f"{name}: {'; '.join(notes)}", stacklevel=2)
+    return Mesh(scan.vertices, inverted(scan.faces[keep], invert), scan.colors, scan.of_file)
+
+
+def inverted(faces: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Triangles (F, 3), some of them, (F,) bool, seen from the other side; their first corner stays."""
+    return np.where(which[:, None], faces[:, [0, 2, 1]], faces)
+
+
+def _surface_triangles(mesh: Mesh) -> tuple[np.ndarray, list[str]]:
+    """Which triangles (F,) bool are surface, and what the others are."""
+    sides = mesh.corners - np.roll(mesh.corners, -1, axis=1)
+    longest = np.einsum("fsd,fsd->fs", sides, sides).max(axis=1)
+    flat = mesh.face_areas <= FLAT * longest
+    notes = [f"{flat.sum()} triangles without area dropped"] if flat.any() else []
+    group = distinct_rows(np.sort(mesh.faces, axis=1))
+    if group is None:
+        return ~flat, notes
+    # Of equal triangles the first stays; those that face the other way make their group two-sided.
+    a, b, c = mesh.faces.T
+    odd = (a > b) ^ (b > c) ^ (a > c)
+    keep = ~flat & (group == np.arange(len(group)))
+    repeated = ~flat & ~keep
+    two_sided = np.zeros(len(keep), dtype=bool)
+    two_sided[group[repeated & (odd != odd[group])]] = True
+    # A flap hangs on one vertex alone, or on an edge that two other triangles share.
+    rest = Mesh(mesh.vertices, mesh.faces[keep])
+    use = rest.edge_use[rest.face_edges]
+    flap = np.zeros(len(keep), dtype=bool)
+    flap[keep] = two_sided[keep] & ((use > 2).any(axis=1) | (use == 1).all(axis=1))
+    reverse = repeated & (odd != odd[group])
+    for what, which in (("repeated triangles dropped", repeated & ~reverse),
+                        ("triangles of two-sided surfaces dropped, one of each pair", reverse & ~flap[group]),
+                        ("flaps dropped, a triangle and its reverse each", flap)):
+        if which.any():
+            notes.append(f"{which.sum()} {what}")
+    return keep & ~flap, notes
+
+
+def invert_against_neighbours(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Which triangles (F,) bool to invert so that neighbours face the same way, and the patch (F,) each belongs to.
+
+    In every patch most of its area stays as it is. Patches end at edges with more than two triangles. One that has a
+    single side only, as a Möbius strip has, stays as it is.
+    """
+    count = len(mesh.faces)
+    first, second = mesh.side_pairs.T
+    a, b = first // 3, second // 3
+    if mesh.is_edge_manifold:
+        links = coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
+        return np.zeros(count, dtype=bool), connected_components(links, directed=False)[1]
+    forward = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).ravel()
+    agree = forward[first] != forward[second]
+    # Every triangle is there twice, as it is and inverted; what faces the same way hangs together.
+    rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
+    _, patch = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count)),
+                                    directed=False)
+    as_is, turned = patch[:count], patch[count:]
+    area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
+    invert = area[turned] > area[as_is]
+    invert |= (area[turned] == area[as_is]) & (turned < as_is)
+    return invert, np.unique(np.minimum(as_is, turned), return_inverse=True)[1].reshape(-1)
+
+
+def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
+    """(F,) bool: triangles of the patches (F,) whose front the scan hides more often than their back.
+
+    From a triangle of a body, or of a shell of one, rays to the outside leave; those to the inside meet the far side.
+    """
+    rng = np.random.default_rng(0)
+    # Some triangles of every patch, drawn without respect to size: their areas weigh the votes.
+    order = rng.permutation(len(patch))
+    order = order[np.argsort(patch[order], kind="stable")]
+    size = np.bincount(patch)
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
+    some = np.repeat(order[rank < SAMPLES], WAYS)
+    around, reach = _directions(mesh.face_normals[some], rng), REACH * float(np.linalg.norm(np.ptp(
+        mesh.vertices, axis=0)))
+    start, off = mesh.corners[some].mean(axis=1), 1e-4 * reach * mesh.face_normals[some]
+    rays = Rays(mesh)
+    vote = rays.occluded(start + off, around, reach).astype(float) - rays.occluded(start - off, -around, reach)
+    vote *= mesh.face_areas[some]
+    # The sum of the votes against what it would be if each were as likely the other way.
+    total = np.bincount(patch[some], vote, len(size))
+    spread = np.sqrt(np.bincount(patch[some], vote**2, len(size)))
+    share = total / np.maximum(np.bincount(patch[some], mesh.face_areas[some], len(size)), 1e-300)
+    known = (np.abs(share) > HIDDEN) & (np.abs(total) > SURE * spread)
+    turn = known & (total > 0)
+    if turn.any() and not known.all():
+        turn |= ~known & _against_nearest(mesh, patch, known, turn)
+    return turn[patch]
+
+
+def _against_nearest(mesh: Mesh, patch: np.ndarray, known: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """(P,) bool: patches that face against the nearest triangles of patches of which the side is known.
+
+    For small and flat ones, in a scan whose triangles are known to face both ways.
+    """
+    middle, sure = mesh.corners.mean(axis=1), known[patch]
+    asked = np.flatnonzero(~sure)
+    near = np.flatnonzero(sure)[cKDTree(middle[sure]).query(middle[asked], workers=search_threads(len(asked)))[1]]
+    outward = mesh.face_normals[near] * np.where(turn[patch[near]], -1, 1)[:, None]
+    agree = np.einsum("fd,fd->f", mesh.face_normals[asked], outward)
+    return np.bincount(patch[asked], mesh.face_areas[asked] * agree, len(known)) < 0
+
+
+def _directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Unit vectors (n, 3) on the side of normals (n, 3), more often along them (by the cosine)."""
+    around = rng.normal(size=normals.shape)
+    around = normals + around / np.linalg.norm(around, axis=1, keepdims=True)
+    length = np.linalg.norm(around, axis=1, keepdims=True)
+    return np.where(length > 1e-6, around / np.maximum(length, 1e-6), normals)

@@ -1,0 +1,180 @@
+"""Folders that come from somebody else: what they name outside of themselves is neither read, moved nor removed."""
+import csv
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+
+from scanprep import Mesh, RegisteredSet
+from scanprep.batch.cluster import _outcome
+from scanprep.batch.digests import Digests
+from scanprep.batch.opening import beside, workspace
+from scanprep.batch.ownership import HOME
+from scanprep.batch.room import Job
+from scanprep.batch.values import save_value
+from scanprep.batch.workspace import RECORD, Task
+from scanprep.console import Metric, bar, say, show
+from scanprep.geometry import storage
+from scanprep.geometry.storage import StorageError, path_inside
+from scanprep.geometry.tables import number_table, read_table, write_table
+from scanprep.pipeline.scans import find_scans
+
+
+@dataclasses.dataclass(frozen=True)
+class Copy:
+    """Work that writes one file."""
+
+    def __call__(self, given, room):
+        (room.folder / "copy.txt").write_text(given.read_text())
+        return 4
+
+
+NAMES = ("../profile", "a/../../profile", "/etc/hostname", "..\\profile", "C:\\profile", "C:profile", "\\profile", "",
+         "a\0b", "link/profile", 7, None)
+
+
+@pytest.fixture
+def home(tmp_path):
+    """A folder of results with a link out of it, and beside it a file of the user's that must stay as it is."""
+    (tmp_path / "profile").write_text("mine")
+    (tmp_path / "out" / HOME / "done").mkdir(parents=True)
+    (tmp_path / "out" / "link").symlink_to(tmp_path, target_is_directory=True)
+    yield tmp_path
+    assert (tmp_path / "profile").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_leads_out_of_the_folder(home, name):
+    with pytest.raises(StorageError, match=r"report\.json.*(inside|expected)"):
+        path_inside(home / "out", name, "report.json")
+
+
+@pytest.mark.parametrize("name", ["a.ply", "meshes/a b.ply", "meshes/2024.05.01 ä.ply", "a..b"])
+def test_a_name_inside(tmp_path, name):
+    assert path_inside(tmp_path, name, "report.json") == tmp_path / name
+
+
+def hostile(home, name):
+    """What the record of a result says that names another's file, with its true digest: it could be removed."""
+    return {"digest": "of before", "work": "", "files": {name: Digests().of_file(home / "profile")}}
+
+
+def run_again(home):
+    (home / "in.txt").write_text("text")
+    with workspace(home / "out") as space:
+        return space.run(Copy(), [Task("in", home / "in.txt", "place")])
+
+
+TEXTS = [name for name in NAMES if isinstance(name, str) and "\0" not in name]
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_record_names_the_file_of_somebody_else(home, name):
+    """The next run would remove it: what a result had written and has no more goes."""
+    save_value(home / "out" / HOME / "done" / "in.npz", None, hostile(home, name))
+    with pytest.raises(StorageError, match=r"in\.npz"):
+        run_again(home)
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_result_on_its_way_names_the_file_of_somebody_else(home, name):
+    """The next run would put a file there: what a killed run had made whole comes to its place."""
+    ready = home / "out" / HOME / "ready" / "in"
+    ready.mkdir(parents=True)
+    (home / "out" / HOME / "ready" / "profile").write_text("theirs")
+    save_value(ready / RECORD, None, hostile(home, name))
+    with pytest.raises(StorageError, match=r"record\.npz"):
+        run_again(home)
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_report_names_the_file_of_somebody_else(home, name):
+    (home / "out" / "body.ply").write_text("ours")
+    storage.write_json(home / "out" / "body.ply.report.json", {"written": hostile(home, name)["files"]})
+    with pytest.raises(StorageError, match=r"report\.json"), beside(home / "out" / "body.ply") as space, \
+            space.staging("output") as staged:
+        (staged.folder / "body.ply").write_text("new")
+
+
+def test_a_record_without_what_it_needs_counts_as_none(home):
+    save_value(home / "out" / HOME / "done" / "in.npz", None, {"files": {"../profile": "x"}})
+    assert run_again(home).fresh == ("in",)
+
+
+@pytest.mark.parametrize("place", [HOME, f"{HOME}/making", f"{HOME}/ready", f"{HOME}/ready/in", f"{HOME}/done"])
+def test_a_link_where_scapekit_keeps_what_it_knows(home, place):
+    """Removing what a killed run left would remove it elsewhere."""
+    (home / "elsewhere" / "making").mkdir(parents=True)
+    (home / "elsewhere" / "making" / "mine").write_text("mine")
+    for path in (home / "out" / HOME / "done", home / "out" / HOME):
+        path.rmdir()
+    (home / "out" / place).parent.mkdir(parents=True, exist_ok=True)
+    (home / "out" / place).symlink_to(home / "elsewhere", target_is_directory=True)
+    with pytest.raises(ValueError, match="link"):
+        run_again(home)
+    assert (home / "elsewhere" / "making" / "mine").exists()
+
+
+@pytest.mark.parametrize("column", ["name", "file"])
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_set_names_a_mesh_of_somebody_else(home, column, name):
+    folder = home / "set"
+    template = Mesh(np.vstack([np.eye(3), np.zeros(3)]), [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    RegisteredSet.create(folder, template).add("anna", template)
+    os.symlink(home, folder / "link")
+    text = (folder / "set.csv").read_text()
+    before = {"name": "anna,", "file": ",meshes/anna.ply"}[column]
+    assert before in text
+    (folder / "set.csv").write_text(text.replace(before, before.replace("anna" if column == "name" else
+                                                                      "meshes/anna.ply", name)))
+    with pytest.raises(StorageError, match=r"set\.csv: line 2"):
+        RegisteredSet.load(folder)
+
+
+def test_a_worker_answers_with_the_name_of_a_file_of_somebody_else(home):
+    class Future:
+        exception = staticmethod(lambda: None)
+        result = staticmethod(lambda: (None, {"../profile": b"theirs"}))
+
+    with pytest.raises(StorageError, match="tcp://there"):
+        _outcome(Future, Job("in", None, home / "out"), "tcp://there")
+
+
+def test_the_run_ends_without_a_lock(home):
+    save_value(home / "out" / HOME / "done" / "in.npz", None, hostile(home, "../profile"))
+    with pytest.raises(StorageError):
+        run_again(home)
+    assert not (home / "out" / HOME / "lock").exists()
+    assert sorted(p.name for p in home.iterdir()) == ["in.txt", "out", "profile"]
+
+
+STRANGE = ("=1+1", "-anna", "+49 a", "@sum", "'=1", "''-x", "[red]anna[/red]", "<b>anna</b>", "anna;b", 'an"na')
+
+
+def test_a_table_gives_back_names_that_spreadsheets_would_run(tmp_path):
+    write_table(tmp_path / "a.csv", ["name", "value"], [(name, -0.5) for name in STRANGE])
+    assert [row["name"] for _, row in read_table(tmp_path / "a.csv", ["name", "value"])] == list(STRANGE)
+    cells = [row[0] for row in csv.reader((tmp_path / "a.csv").read_text().splitlines())][1:]
+    assert not [cell for cell in cells if cell[0] in "=+-@"]
+    assert all(row["value"] == "-0.5" for _, row in read_table(tmp_path / "a.csv", ["name", "value"]))
+    assert number_table(["=a", "b"], np.zeros((1, 2))).startswith("'=a,b\n")
+
+
+def test_what_a_terminal_is_told_does_not_steer_it(capsys):
+    name = "\x1b[2Jan\x07na\u202e\udce9 é\u00a0ü"
+    say(name)
+    with bar(name) as tell:
+        tell(1, 1)
+    show([Metric(name, "[red]x[/red]", "[bold]")])
+    out, err = capsys.readouterr()
+    for text in (out, err):
+        assert not {"\x1b", "\x07", "\u202e", "\udce9"} & set(text)
+    assert r"\x1b[2Jan\x07na\u202e\udce9 é" in err
+    assert "[red]x[/red]" in out and "[bold]" in out
+
+
+def test_a_scan_whose_name_is_no_text_is_named(tmp_path):
+    (tmp_path / "an\x1bna.ply").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"an\\x1bna\.ply.*rename"):
+        find_scans(tmp_path)
