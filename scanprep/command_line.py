@@ -155,7 +155,7 @@ class _Call:
             ranges.read(collect, lambda read: tyro.cli(read, args=argv, prog=prog))())
         self.force = self.given.pop(FORCE, False)
         self.output: Path | None = self.given.get(self.output_name or "")
-        self.inputs = _paths(self.given.get(p.name) for p in shown if _is_positional(hints[p.name]))
+        self.inputs = _paths(self.given.get(p.name) for p in shown if _is_positional(hints.get(p.name)))
         self.used = _paths(value for name, value in self.given.items() if name != self.output_name)
         self._staged: Path | None = None
 
