@@ -16,7 +16,7 @@ from scanned_shapes import ball as sphere
 from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import main
 from completion.mocap.animate.work import Work as Follow
-from completion.mocap.pose.robust import hardly_seen, motion_problem
+from completion.mocap.pose.robust import hardly_seen, motion_doubts, motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.person import PersonConfig
 from completion.motion import Motion
@@ -27,13 +27,14 @@ from completion.tracking.sequence import tracking_problem
 from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import judge_model, learn_scape, learning_problem
-from scanprep import Mesh, config_files, write_landmarks, write_mesh
+from scanprep import Mesh, command_line, config_files, write_landmarks, write_mesh
 from scanprep.alignment.views import align_views, views_problem
 from scanprep.batch.room import Room
-from scanprep.console import Metric
+from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
+from scanprep.console import Metric, Outcome
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.judgement import Judgement
+from scanprep.judgement import Judgement, beyond_people, carried, judge_many, read_judgement, size
 from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.registration.schedule import RegistrationConfig
@@ -294,3 +295,96 @@ def test_registrations_by_their_figures(far, seen, off, stretch, words):
                        {}, 0, np.ones(count), far)
     told = registration_problem(body, body, fit, True)
     assert (told is None) if words is None else all(word in told for word in words), told
+
+
+def test_an_outcome_always_says_what_it_is_worth():
+    with pytest.raises(TypeError, match="judgement"):
+        Outcome(None, [])
+
+
+COMMANDS = ("prep clean good.ply -o clean.ply", "prep fill good.ply -o filled.ply",
+            "prep decimate good.ply --faces 300 -o fewer.ply", "prep align good.ply template.ply -o aligned.ply",
+            "model info model.npz", "model mesh model.npz -o mesh.ply", "model sample model.npz -n 2 -o sampled",
+            "model export model.npz -o body.bvh", "model export model.npz -o body.ply",
+            "model resample model.npz --vertices 200 -o small.npz")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_first_row_of_every_command_is_a_verdict(place, monkeypatch, command):
+    shown = []
+    monkeypatch.setattr(command_line, "show", shown.extend)
+    worm_with_prior().save("model.npz")
+    assert main(command.split()) == 0
+    assert shown[0].name == "judgement" and shown[0].value in ("good", "check")
+    if "-o" in command:
+        output = Path(command.split()[-1])
+        report = output / "report.json" if output.is_dir() else Path(f"{output}.report.json")
+        assert json.loads(report.read_text())["judgement"]["verdict"] == shown[0].value
+
+
+def reported(path, verdict, *reasons, written=None):
+    """A file, and the report that a command would have written beside it."""
+    Path(f"{path}.report.json").write_text(json.dumps({
+        "judgement": {"verdict": verdict, "reasons": reasons}, **({} if written is None else {"written": written})}))
+
+
+def test_a_verdict_travels_with_the_body_into_what_uses_it(place, capsys):
+    command = "prep clean good.ply -o out.ply"
+    reported("good.ply", "failed", "the template is not on it")
+    assert main(command.split()) == 1
+    assert "good.ply: its own report says that it failed: the template is not on it" in capsys.readouterr().err
+    assert json.loads(Path("out.ply.report.json").read_text())["judgement"]["verdict"] == "failed"
+    reported("good.ply", "check", "an arm is missing")
+    assert main([*command.split(), "--force"]) == 0 and "an arm is missing" in capsys.readouterr().err
+    reported("good.ply", "failed", "another body", written={"good.ply": "0123"})        # since then it was replaced
+    assert main([*command.split(), "--force"]) == 0 and "another body" not in capsys.readouterr().err
+
+
+def test_doubts_of_what_is_only_taken_along_stay_its_own(tmp_path):
+    model, body = tmp_path / "model.npz", tmp_path / "body.ply"
+    for path in (model, body):
+        path.write_bytes(b"x")
+        reported(path, "check", "look")
+    assert carried([body], [body, model]).reasons == (f"{body}: its own report says to look at it: look",)
+    reported(model, "failed", "nothing learned")
+    assert carried([body], [body, model]).verdict == "failed"
+    for report in ('{"judgement": 3}', "[]", '{"judgement": {"verdict": "superb", "reasons": []}}', "{"):
+        Path(f"{model}.report.json").write_text(report)
+        assert read_judgement(model) is None
+
+
+def test_many_results_are_as_good_as_the_worst_of_them():
+    good, bad = Judgement(), Judgement.of("nothing there")
+    assert judge_many({"a": good, "b": good}).verdict == "good"
+    assert judge_many({"a": good, "b": bad}).reasons == ("1 of 2 failed", "b: nothing there")
+    assert judge_many({"a": good, "b": bad}).verdict == judge_many({"a": good}, failures=1).verdict == "check"
+    assert judge_many({"b": bad}).verdict == judge_many({}, failures=2).verdict == "failed"
+
+
+@pytest.mark.parametrize(("stature", "volume", "betas", "verdict", "word"), [
+    (1.75, 75, 2.0, "good", ""), (1.50, 45, 4.0, "good", ""), (2.00, 140, 4.0, "good", ""),
+    (2.61, 290, 20.0, "failed", "scale"), (4.04, 1150, 46.0, "failed", "scale"), (0.93, 12, 6.0, "failed", "scale"),
+    (1.20, 25, 5.0, "check", "child"), (2.20, 120, 5.0, "check", "giant"), (1.75, 190, 5.0, "check", "second person"),
+    (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 14.0, "check", "standard deviations"),
+    (1.75, 75, 20.0, "failed", "scale")])
+def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
+    found = beyond_people(stature, volume, np.eye(18)[0] * betas)
+    assert found.verdict == verdict and word in found.why, found
+
+
+def test_time_that_is_told_wrongly_is_seen_in_the_speed_of_markers():
+    model, layout = worm_with_prior(), MarkerLayout(LABELS, ROWS, 0.012)
+    markers = walk(layout)
+    motion = SimpleNamespace(residuals=np.full(markers.positions.shape[:2], 0.004), distrusted=(), labels=LABELS)
+    assert motion_doubts([motion], [markers], model.template) == ()
+    (told,) = motion_doubts([motion], [dataclasses.replace(markers, rate=300.0)], model.template)
+    assert told.endswith("frames in another order, or the wrong rate?")
+    off = SimpleNamespace(residuals=motion.residuals + 0.02 * size(model.template), distrusted=(), labels=LABELS)
+    assert "mm from where the body has them" in motion_doubts([off], [markers], model.template)[0]
+
+
+def test_a_second_person_is_no_furniture():
+    one, many = sphere(3, 0.5), np.array([[0, 0, 0], [3.0, 0, 0]])
+    both = Mesh(np.vstack([one.vertices + at for at in many]), np.vstack([one.faces, one.faces + len(one.vertices)]))
+    assert cleaning_doubts(clean_scan(one)) == []
+    assert "a second person?" in cleaning_doubts(clean_scan(both))[0]
