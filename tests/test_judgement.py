@@ -34,7 +34,7 @@ from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.console import Metric, Outcome
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.judgement import Judgement, beyond_people, carried, judge_many, read_judgement, size
+from scanprep.judgement import Judgement, beyond_people, carry_judgements, judge_many, read_judgement, size
 from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.registration.schedule import RegistrationConfig
@@ -345,9 +345,9 @@ def test_doubts_of_what_is_only_taken_along_stay_its_own(tmp_path):
     for path in (model, body):
         path.write_bytes(b"x")
         reported(path, "check", "look")
-    assert carried([body], [body, model]).reasons == (f"{body}: its own report says to look at it: look",)
+    assert carry_judgements([body], [body, model]).reasons == (f"{body}: its own report says to look at it: look",)
     reported(model, "failed", "nothing learned")
-    assert carried([body], [body, model]).verdict == "failed"
+    assert carry_judgements([body], [body, model]).verdict == "failed"
     for report in ('{"judgement": 3}', "[]", '{"judgement": {"verdict": "superb", "reasons": []}}', "{"):
         Path(f"{model}.report.json").write_text(report)
         assert read_judgement(model) is None
