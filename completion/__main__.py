@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import sys
 
-from scanprep.command_line import dispatch
+from scanprep.interrupts import leave_at_once
 
 COMMANDS = {
     "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),
@@ -22,13 +22,23 @@ COMMANDS = {
                "completion.mocap.marker_sets.cli:group"),
     "statue": ("One scan -> a layered character that moves, with all its detail.", "model.statue.cli:group"),
     "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),
+    "completion": ("What a shell needs to complete these commands and their flags.", "completion.shells:write_shell"),
 }
 
 
 def main(argv: list[str] | None = None) -> int:
     """The command line."""
-    lead = "From raw 3D body scans to moving people."
-    return dispatch(COMMANDS, "scape", sys.argv[1:] if argv is None else argv, lead)
+    if argv is None:
+        argv = sys.argv[1:]
+        leave_at_once()
+    if argv in (["--version"], ["-V"]):
+        from importlib.metadata import version
+
+        sys.stdout.write(f"scapekit {version('scapekit')}\n")
+        return 0
+    from scanprep.command_line import dispatch
+
+    return dispatch(COMMANDS, "scape", argv, "From raw 3D body scans to moving people.")
 
 
 if __name__ == "__main__":

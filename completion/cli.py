@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
+from scanprep.arguments import Alias, Called
 from scanprep.console import Metric, bar, say
 
-ModelFile = Annotated[Path, tyro.conf.arg(aliases=["-m"])]
-ModelOrNone = Annotated[Path | None, tyro.conf.arg(aliases=["-m"])]
-Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+ModelFile = Annotated[Path, Alias("-m")]
+ModelOrNone = Annotated[Path | None, Alias("-m")]
+Out = Annotated[Path, Alias("-o"), Called("--output")]
 
 
 def read_model(path: Path | None) -> tuple[BodyModel, str]:

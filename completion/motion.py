@@ -95,8 +95,7 @@ class Motion:
             "surface_model_type": np.array(SURFACE_MODEL), "marker_residuals": self.residuals,
             "marker_labels": np.array(self.labels, dtype=str), "converged": self.converged,
             "marker_trusted": self.trusted, **more}
-        with storage.writing(path) as beside, open(beside, "wb") as out:
-            np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        storage.save_arrays(path, arrays)
 
     @staticmethod
     def of(found: BodyMotion) -> Motion:

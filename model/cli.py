@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
-from scanprep.cli import Output, Unit
+from scanprep.arguments import Place
+from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome
 from scanprep.dataset import RegisteredSet
@@ -19,7 +19,7 @@ from .body import BodyModel
 from .files import load_model
 
 ANNY = "anny"                        # as `scape model import anny`
-ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.npz")]
+ModelArg = Annotated[Path, Place("MODEL.npz")]
 
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),
@@ -36,6 +36,10 @@ COMMANDS = {
 }
 
 
+LEFT_OUT = "poses left out of the learning, mean error"
+TOLD = ("left_out_error", "digest", "features")          # of a model's own notes: told in other rows, or for programs
+
+
 def group(argv: list[str]) -> int:
     """The commands of `scape model`."""
     return dispatch(COMMANDS, "scape model", argv, "Look into a body model and pose it.")
@@ -45,25 +49,29 @@ def info(model: ModelArg) -> Outcome:
     """What a model holds and how it was made.
 
     Example: scape model info model.npz
+
+    Args:
+        model: Model file.
     """
     from .learning.scape import judge_model
 
     loaded = load_model(model)
     facts = [Metric(name.replace("_", " "), value) for name, value in loaded.info.items()
-             if isinstance(value, str | int | float)]
+             if isinstance(value, str | int | float) and name not in TOLD]
     return Outcome(None, [
-        Metric("kind", loaded.kind), Metric("vertices", len(loaded.template.vertices)),
-        Metric("triangles", len(loaded.template.faces)), Metric("parts", ", ".join(loaded.skeleton.names)),
-        *about(loaded), Metric("landmarks", len(loaded.info.get("landmarks", {}))), *facts],
-                   judgement=judge_model(loaded))
+        Metric("kind", loaded.kind), *about(loaded), Metric("parts", ", ".join(loaded.skeleton.names)),
+        Metric("vertices", len(loaded.template.vertices)), Metric("triangles", len(loaded.template.faces)),
+        Metric("landmarks", len(loaded.info.get("landmarks", {}))), *facts], judgement=judge_model(loaded))
 
 
 def about(model: BodyModel) -> list[Metric]:
-    """What a model is made of."""
-    rows = [Metric("pose features", model.n_features), Metric("shape components", model.n_betas)]
+    """What a model is worth and made of: first how well it predicts poses that were left out of the learning."""
+    left_out = model.info.get("left_out_error")
+    rows = [] if left_out is None else [Metric(LEFT_OUT, MM * float(left_out), "mm")]
+    rows.append(Metric("shape components", model.n_betas))
     if model.n_betas:
-        rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
-    return rows
+        rows.append(Metric("differences between the people that they explain", 100 * float(model.explained[-1]), "%"))
+    return [*rows, Metric("numbers that a pose is described by", model.n_features, detail=True)]
 
 
 def import_file(model: ModelArg, output: Output) -> Outcome:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.mesh import Mesh
+
 AT_ONCE = 20_000                     # entries of S that are near the processor together
 
 
@@ -79,8 +81,16 @@ class ShapeSpace:
         return ShapeSpace(mean, np.zeros((0, n_faces, 3, 3), dtype=np.float32), np.zeros(0), 0.0)
 
 
-def learn_shape_space(S: np.ndarray, components: int) -> ShapeSpace:
+def body_volumes(template: Mesh, bodies: np.ndarray) -> np.ndarray:
+    """Volume (P,) of bodies (P, N, 3), cubic metres, wherever they stand; of a body with holes, about its middle."""
+    return np.array([template.with_vertices(body - body.mean(axis=0)).volume for body in bodies])
+
+
+def learn_shape_space(S: np.ndarray, components: int, volumes: np.ndarray | None = None) -> ShapeSpace:
     """Principal components of shape deformations (P, F, 3, 3), fewer where the people do not span as many.
+
+    The sign of a component is free. With the volumes (P,) of the people it is chosen so that who has more of it has
+    more volume.
 
     [SCAPE] Eq. 7
     """
@@ -93,6 +103,7 @@ def learn_shape_space(S: np.ndarray, components: int) -> ShapeSpace:
     count = min(components, int((variances > 1e-9 * max(variances[0], 1e-30)).sum()), P - 1)
     # unit variance of betas: component k is one standard deviation, Σ_p modes[p, k] centred[p] / √P
     directions = modes[:, :count].T.astype(centred.dtype) @ centred / np.sqrt(P)
-    directions *= np.where(modes[np.abs(modes[:, :count]).argmax(axis=0), np.arange(count)] < 0, -1, 1)[:, None]
+    if volumes is not None:
+        directions *= np.where((volumes - volumes.mean()) @ modes[:, :count] < 0, -1, 1)[:, None]
     return ShapeSpace(mean.astype(np.float32), directions.reshape(count, *S.shape[1:]).astype(np.float32),
                       variances[:count], float(variances.sum()))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import tyro
 
+from .arguments import Alias, Called, Place
 from .command_line import dispatch
 from .console import Metric
 
@@ -17,10 +17,11 @@ if TYPE_CHECKING:               # imported where they are used: this module must
     from .geometry.mesh import Mesh
 
 Unit = Literal["m", "mm", "cm", "in"]
-ScanArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
-MeshArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")]
-SetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET")]
-Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+ScanArg = Annotated[Path, Place("SCAN")]
+MeshArg = Annotated[Path, Place("MESH")]
+SetArg = Annotated[Path, Place("SET")]
+Output = Annotated[Path, Alias("-o")]
+Person = Called("--person")         # whose scans; `--subject` is a body elsewhere: betas or a mesh
 MM = 1000.0
 
 COMMANDS = {
@@ -29,7 +30,9 @@ COMMANDS = {
     "page": ("The page of a registered set: every scan with pictures and figures, worst first.",
              "scanprep.pipeline.cli:page"),
     "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.surfaces.cli:clean"),
-    "template": ("Range views with known cameras -> a closed template.", "scanprep.surfaces.cli:template_of_views"),
+    "template": ("Your best scan, or several views -> a closed template.", "scanprep.surfaces.cli:template"),
+    "repair": ("Make a mesh manifold: degenerate, repeated and inverted triangles go.",
+               "scanprep.surfaces.cli:repair_mesh"),
     "views": ("Bring range views into one frame.", "scanprep.surfaces.cli:align_cameras"),
     "merge": ("Range views with known cameras -> one surface.", "scanprep.surfaces.cli:merge"),
     "fill": ("Close the holes of a mesh.", "scanprep.surfaces.cli:fill"),

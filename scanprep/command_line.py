@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 import inspect
 import os
+import re
 import sys
 import time
 import typing
@@ -16,8 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from . import config_files, ranges
+from .arguments import Argument, UsageError, make_parser, near, read_line, sentences
 from .config_files import Flag
 from .console import JUDGEMENT, Metric, Outcome, say, show, write_report
+from .interrupts import tidy_up
 from .threads import one_thread
 
 OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
@@ -41,6 +44,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
                 return 0
             call = _Call(function, prog, argv)
             wrong = 1
+            tidy_up()
             outcome, report = call.carried_out(start)
         except KeyboardInterrupt:
             goes_on = call is not None and call.wants_space
@@ -51,17 +55,20 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             if os.environ.get(TRACEBACK):
                 raise
             told = _told(error)
-            say(f"{prog}: {told if call is None else call.real(told)}")
-            return wrong
+            say(f"{prog}: {told if call is None else call.real(call.arguments.as_flags(told))}")
+            return 2 if isinstance(error, UsageError) else wrong
     judgement = outcome.judgement
     failed = judgement is not None and judgement.verdict == "failed"
     if judgement is not None and judgement.reasons:
         say(f"{prog}: {'THE RESULT MEANS NOTHING' if failed else 'LOOK AT THE RESULT'}: {judgement.why}")
     judged = [] if judgement is None else [Metric(JUDGEMENT, judgement.verdict)]
-    show([*judged, *(m for m in outcome.metrics if m.name != JUDGEMENT),
-          Metric("time", time.perf_counter() - start, "s")])
+    if judged or outcome.metrics:
+        show([*judged, *(m for m in outcome.metrics if m.name != JUDGEMENT),
+              Metric("time", time.perf_counter() - start, "s")])
     if outcome.output is not None:
         say(call.real(f"written: {outcome.output}" + (f" (figures in {report})" if report else "")))
+    if outcome.following and not failed:
+        say(f"next: {call.real(outcome.following)}")
     for failure in outcome.failures:
         say(call.real(f"{prog}: failed: {failure}"))
     return 1 if outcome.failures or failed else 0
@@ -118,44 +125,60 @@ class _Settings:
         return {**given, **values}
 
 
+class Arguments:
+    """What a command takes: the arguments of its function, its settings that are flags, and what all commands take."""
+
+    def __init__(self, function: Callable[..., Outcome], prog: str, argv: list[str]) -> None:
+        self.prog = prog
+        hints = typing.get_type_hints(function, include_extras=True)
+        parameters = inspect.signature(function).parameters.values()
+        self.wants_space = any(p.name == SPACE for p in parameters)
+        self.beside = self.wants_space and typing.get_origin(hints[SPACE]) is not None      # Annotated: FileWorkspace
+        self.settings = _Settings({p.name: p.default for p in parameters if isinstance(p.default, ranges.Settings)},
+                                  argv)
+        self.text, told = sentences(function)
+        self.listed = [Argument(p.name, hints[p.name], p.default, told.get(p.name, "")) for p in parameters
+                       if p.name != SPACE and p.name not in self.settings.values]
+        self.output_name = next((a.name for a in self.listed if a.name in OUTPUTS), None)
+        flags = self.settings.flags
+        if self.output_name is not None:
+            flags[FORCE] = Flag((), bool, False, "Do all anew, whatever is done already.")
+        self.listed += [Argument(name, flag.annotation, flag.value, flag.sentence) for name, flag in flags.items()]
+
+    def parser(self, tell: Callable[[Argument, argparse.Action], None]) -> argparse.ArgumentParser:
+        """The parser that prints help; `tell` is called with every argument and its action."""
+        return make_parser(self.prog, self.text, self.listed, tell)
+
+    def read(self, argv: list[str]) -> dict[str, Any]:
+        """The values of a command line, every number in its range and every file there; nothing is done yet."""
+        given = read_line(self.prog, self.text, self.listed, argv)
+        for check in (Argument.check_numbers, Argument.check_files):
+            for argument in self.listed:
+                check(argument, given[argument.name])
+        return given
+
+    def as_flags(self, text: str) -> str:
+        """A message of a function with flags in place of the names of its arguments."""
+        for argument in self.listed:
+            name = rf"(?<![\w.\-]){argument.name}"
+            text = re.sub(rf"{name}=['\"]?([\w.]+)['\"]?", rf"{argument.flag} \1", text)
+            text = re.sub(rf"{name}(?:=|(?=: expected))", argument.flag, text)
+        return text
+
+
 class _Call:
     """A function with what the command line gives it."""
 
     def __init__(self, function: Callable[..., Outcome], prog: str, argv: list[str]) -> None:
-        import tyro
-
         self.function, self.command = function, f"{prog} {' '.join(argv)}"
-        hints = typing.get_type_hints(function, include_extras=True)
-        parameters = inspect.signature(function).parameters.values()
-        self.wants_space = any(p.name == SPACE for p in parameters)
-        self.settings = _Settings({p.name: p.default for p in parameters if isinstance(p.default, ranges.Settings)},
-                                  argv)
-        shown = [p.replace(annotation=hints[p.name]) for p in parameters
-                 if p.name != SPACE and p.name not in self.settings.values]
-        self.output_name = next((p.name for p in shown if p.name in OUTPUTS), None)
-        self.beside = self.wants_space and typing.get_origin(hints[SPACE]) is not None      # Annotated: FileWorkspace
-        flags = self.settings.flags
-        if self.output_name is not None:
-            flags[FORCE] = Flag((), bool, False, "Do all anew, whatever is done already.")
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        shown += [inspect.Parameter(name, keyword, default=flag.value, annotation=flag.annotation)
-                  for name, flag in flags.items()]
-        signature = inspect.Signature(shown)
-
-        def collect(*args: Any, **named: Any) -> dict[str, Any]:
-            given = signature.bind(*args, **named)
-            given.apply_defaults()
-            return given.arguments
-
-        told = "".join(f"\n    {name}: {flag.sentence}" for name, flag in flags.items())
-        collect.__doc__ = (inspect.getdoc(function) or "") + told
-        collect.__annotations__ = {p.name: p.annotation for p in shown}
-        collect.__signature__ = signature                            # type: ignore[attr-defined]
-        self.given = self.settings.taken_from(
-            ranges.read(collect, lambda read: tyro.cli(read, args=argv, prog=prog))())
+        self.arguments = Arguments(function, prog, argv)
+        self.wants_space, self.beside = self.arguments.wants_space, self.arguments.beside
+        self.output_name = self.arguments.output_name
+        self.given = self.arguments.settings.taken_from(self.arguments.read(argv))
         self.force = self.given.pop(FORCE, False)
         self.output: Path | None = self.given.get(self.output_name or "")
-        self.inputs = _paths(self.given.get(p.name) for p in shown if _is_positional(hints.get(p.name)))
+        # what stands at its place is the thing itself that a command works on; flags name what is taken along
+        self.inputs = _paths(self.given.get(argument.name) for argument in self.arguments.listed if argument.place)
         self.used = _paths(value for name, value in self.given.items() if name != self.output_name)
         self._staged: Path | None = None
 
@@ -173,10 +196,10 @@ class _Call:
     def carried_out(self, start: float) -> tuple[Outcome, Path | None]:
         """What the function did, and where its report is."""
         from .batch.opening import beside, workspace
-        from .judgement import carried
+        from .judgement import carry_judgements
 
         # before anything is written: an output may be one of the inputs
-        self.before = carried(self.inputs, self.used)
+        self.before = carry_judgements(self.inputs, self.used)
         if self.output is None:
             return self.judged(self.function(**self.given)), None
         if self.wants_space and not self.beside:
@@ -197,14 +220,6 @@ class _Call:
             return outcome, write_report(outcome, self.command, time.perf_counter() - start, written)
 
 
-def _is_positional(hint: Any) -> bool:
-    """Whether an argument is the thing itself that a command works on, not an option."""
-    import tyro
-
-    marker = typing.get_args(tyro.conf.Positional[int])[1]
-    return marker in getattr(hint, "__metadata__", ())
-
-
 def _paths(values: Iterable[Any]) -> list[Path]:
     """The files and folders among the values of arguments."""
     found = [path for value in values for path in (value if isinstance(value, tuple) else (value,))]
@@ -217,13 +232,20 @@ def _notes(prog: str) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=r"(scanprep|model|completion)(\.|$)")
-        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {message}")
+        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {_as_flags(str(message))}")
         yield
+
+
+def _as_flags(text: str) -> str:
+    """A message of the library on one line, with its argument for units as the flag of the command line."""
+    return re.sub(r"\bunit='(\w+)'", r"--unit \1", " ".join(text.split()))
 
 
 def _told(error: Exception) -> str:
     """One line for what went wrong; with the way to the traceback where nobody foresaw it."""
     text = " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return f"there is too little memory{': ' + text if text else ''}; give fewer triangles, or --workers 1"
     if isinstance(error, ValueError | OSError | ModuleNotFoundError):
         return text
     return f"unforeseen {type(error).__name__}: {text} (this is a fault of scapekit; {TRACEBACK}=1 shows where)"
@@ -235,17 +257,39 @@ def dispatch(commands: Mapping[str, tuple[str, str]], prog: str, argv: list[str]
     A module is imported when its command is called, so that help answers at once. A function called `group` has
     commands of its own.
     """
-    if not argv or argv[0] in ("-h", "--help"):
+    first = argv[0] if argv else ""
+    if first == "help":                                              # `scape help prep run` is `scape prep run --help`
+        return dispatch(commands, prog, [*argv[1:], "--help"], lead)
+    if first in ("", "-h", "--help"):
         width = max(map(len, commands))
         listing = "\n".join(f"  {name:<{width}}  {text}" for name, (text, _) in commands.items())
         sys.stdout.write(f"usage: {prog} COMMAND ...\n\n{lead}\n\n{listing}\n\n"
                          f"`{prog} COMMAND --help` tells the rest.\n")
         return 0 if argv else 2
-    if argv[0] not in commands:
-        say(f"{prog}: no command '{argv[0]}'; there are: {', '.join(commands)}")
+    if first not in commands:
+        everywhere = {path.split()[-1]: path for path in listed(commands, prog)}
+        at = everywhere.get(first)
+        hint = f"; did you mean {at}?" if at else near(first, commands) or near(first, everywhere)
+        say(f"{prog}: no command '{first}'{hint or '; there are: ' + ', '.join(commands)}")
         return 2
-    module, function = commands[argv[0]][1].split(":")
-    target = getattr(importlib.import_module(module), function)
-    if function == "group":
+    target = load(commands[first][1])
+    if target.__name__ == "group":
         return target(argv[1:])
-    return run(target, f"{prog} {argv[0]}", argv[1:])
+    return run(target, f"{prog} {first}", argv[1:])
+
+
+def load(target: str) -> Callable[..., Any]:
+    """The function of a command, "module:function"."""
+    module, function = target.split(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def listed(commands: Mapping[str, tuple[str, str]], prog: str) -> dict[str, str]:
+    """Every command below a group, as it is typed, with its "module:function"."""
+    found: dict[str, str] = {}
+    for name, (_, target) in commands.items():
+        if target.endswith(":group"):
+            found |= listed(importlib.import_module(target.split(":")[0]).COMMANDS, f"{prog} {name}")
+        else:
+            found[f"{prog} {name}"] = target
+    return found

@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import sys
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,11 +23,12 @@ Progress = Callable[[int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """One row of the closing table."""
+    """One row of the closing table; a `detail` stands in the page and in report.json only."""
 
     name: str
     value: float | int | str
     unit: str = ""
+    detail: bool = False
 
     def text(self) -> str:
         """The value as printed: three significant digits for a fraction, "none" where there is no value."""
@@ -42,7 +44,7 @@ class Outcome:
     """What a command did: where it wrote, the figures, and what failed on the way.
 
     `judgement` says what the result is worth; the files are there whatever it says. None is for commands that make
-    none, and show or write down only what a user does.
+    none, and show or write down only what a user does. `following` is what to do next, in one sentence.
     """
 
     output: Path | None
@@ -50,6 +52,15 @@ class Outcome:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
     judgement: Judgement | None = dataclasses.field(kw_only=True)
+    following: str = ""
+
+
+MOST_ROWS = 12                       # of the closing table: what is read at a glance
+
+
+def details(metrics: Iterable[Metric]) -> list[Metric]:
+    """The same rows for the page and report.json only."""
+    return [dataclasses.replace(m, detail=True) for m in metrics]
 
 
 JUDGEMENT = "judgement"              # name of the row of figures that says what they are worth
@@ -89,7 +100,7 @@ def bar(what: str) -> Iterator[Progress]:
     Bars that are open at the same time stand below each other.
     """
     with _display() as shown:
-        task = shown.add_task(what, total=None, start=False, visible=False)
+        task = shown.add_task(visible(what), total=None, start=False, visible=False)
 
         def tell(done: int, total: int) -> None:
             shown.start_task(task)
@@ -110,8 +121,9 @@ def _display() -> Iterator[Any]:
     if _open_displays:
         yield _open_displays[-1]
         return
-    columns = (progress.TextColumn("{task.description:<34}"), progress.BarColumn(), progress.MofNCompleteColumn(),
-               progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn())
+    columns = (progress.TextColumn("{task.description:<34}", markup=False), progress.BarColumn(),
+               progress.MofNCompleteColumn(), progress.TimeElapsedColumn(), progress.TextColumn("left"),
+               progress.TimeRemainingColumn())
     with progress.Progress(*columns, console=Console(stderr=True)) as shown:
         _open_displays.append(shown)
         try:
@@ -120,20 +132,44 @@ def _display() -> Iterator[Any]:
             _open_displays.pop()
 
 
+# categories of Unicode that are no text: control, format (also what turns the direction), lone surrogates, separators
+_NO_TEXT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+def visible(text: str) -> str:
+    """Text fit for a terminal: characters that steer it, as names of files may hold, are written as `\\x1b`.
+
+    Line breaks stay.
+    """
+    return "".join(c if c == "\n" or unicodedata.category(c) not in _NO_TEXT else
+                   c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
+
+
+def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]]:
+    """The rows that the closing table shows, in order and at most twelve, and the rest."""
+    metrics = list(metrics)
+    main = [m for m in metrics if not m.detail][:MOST_ROWS]
+    return main, [m for m in metrics if m not in main]
+
+
 def say(text: str) -> None:
-    """One line on standard error, for what a user should know while a command runs."""
-    sys.stderr.write(text + "\n")
+    """A line on standard error, for what a user should know while a command runs."""
+    sys.stderr.write(visible(text) + "\n")
 
 
 def show(metrics: list[Metric]) -> None:
-    """Print the closing table of metric, value, unit."""
+    """Print the closing table of figure, value, unit: what comes first, and how many more there are."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table("metric", "value", "unit")
+    table = Table("figure", "value", "unit")
     table.columns[1].justify = "right"
-    for metric in metrics:
-        table.add_row(metric.name, metric.text(), metric.unit)
+    main, more = split_figures(metrics)
+    for metric in main:          # as text: names may hold what rich takes for markup
+        table.add_row(*(Text(visible(cell)) for cell in (metric.name, metric.text(), metric.unit)))
+    if more:
+        table.caption = f"{len(more)} more in report.json"
     Console().print(table)
 
 

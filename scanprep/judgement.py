@@ -114,7 +114,7 @@ def read_judgement(result: Path) -> Judgement | None:
     return None if changed or judgement.verdict not in ("good", "check", "failed") else judgement
 
 
-def carried(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judgement:
+def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judgement:
     """What results made of others have from them: a failure of any, a doubt of the `inputs` that they are made of.
 
     `used` are things that are taken along, as a model: what is doubtful in them is not in all that is made with them.

@@ -4,11 +4,9 @@ A number without a mark is finite and not negative. A mark stands in the annotat
 """
 from __future__ import annotations
 
-import contextvars
 import dataclasses
 import functools
-import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
@@ -67,52 +65,20 @@ class Settings:
     """Base of settings: a frozen dataclass whose numbers are in their ranges, or it is not made."""
 
     def __post_init__(self) -> None:
-        if not _reading.get():
-            _check(vars(self), type(self), "")
-
-
-def read(function: Callable[..., Result], parse: Callable[[Callable[..., Any]], Any]) -> Callable[[], Result]:
-    """The call that a command line stands for, with every number in its range and nothing done yet.
-
-    `parse` calls the function that it gets, which has the signature of `function`, with what the user wrote.
-    OutOfRange names the option.
-    """
-    @functools.wraps(function)
-    def later(*args: Any, **named: Any) -> Any:
-        return inspect.signature(function).bind(*args, **named)
-
-    token = _reading.set(True)          # a parser would frame what the settings say, without the name of the option
-    try:
-        given = parse(later)
-    finally:
-        _reading.reset(token)
-    _check(given.arguments, function, "--")
-    return functools.partial(function, *given.args, **given.kwargs)
-
-
-_reading = contextvars.ContextVar("reading", default=False)
-
-
-def _check(values: Mapping[str, Any], owner: Any, prefix: str) -> None:
-    """All numbers of a function's arguments or of settings, those inside other settings too."""
-    for name, (allowed, unnamed) in ranges(owner).items():
-        value = values.get(name)
-        flag = prefix + (name.replace("_", "-") if prefix else name)
-        allowed.check(value, flag)
-        for inner in value if isinstance(value, tuple) else (value,):
-            if dataclasses.is_dataclass(inner) and not isinstance(inner, type):
-                _check(vars(inner), type(inner), prefix if unnamed or not prefix else f"{flag}.")
+        owner: Any = type(self)
+        for name, allowed in ranges(owner).items():
+            allowed.check(getattr(self, name), name)
 
 
 @functools.cache
-def ranges(owner: Any) -> dict[str, tuple[Range, bool]]:
-    """Of every argument of a function or field of settings: its range, and whether flags leave its name out."""
-    found = {}
-    for name, annotation in get_type_hints(owner, include_extras=True).items():
-        told = list(marks(annotation))
-        found[name] = (next((m for m in told if isinstance(m, Range)), NOT_NEGATIVE),
-                       any(getattr(m, "name", None) == "" for m in told))
-    return found
+def ranges(owner: Any) -> dict[str, Range]:
+    """The range of every argument of a function or field of settings."""
+    return {name: range_of(annotation) for name, annotation in get_type_hints(owner, include_extras=True).items()}
+
+
+def range_of(annotation: Any) -> Range:
+    """The range that stands beside the type in an annotation."""
+    return next((mark for mark in marks(annotation) if isinstance(mark, Range)), NOT_NEGATIVE)
 
 
 def marks(annotation: Any) -> Iterator[Any]:

@@ -59,7 +59,7 @@ def demo_folder(run_folder):
 
         code = None
         try:
-            code = run(demo, "scape demo", ["--quick", "--out", str(folder)])
+            code = run(demo, "scape demo", ["--quick", "--output", str(folder)])
         finally:
             ended.write_text(str(code))
     assert ended.read_text() == "0"

@@ -72,17 +72,19 @@ def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
     assert run(place / "one.ply", place / "two.ply", "-m", place / "model.npz", "--subject", "template", "-o", out,
                "--mask", place / "mask.npy", *quick(place)) == 0
     metrics, written = told(out)
-    assert metrics["views"] == 2 and metrics["landmarks used"] == 7 and metrics["vertices with data"] > 70
+    assert metrics["views"] == 2 and metrics["landmarks used"] == 7
+    assert metrics["share of the body that was measured"] > 70
     assert metrics["scan points masked"] > 0 and str(place / "model.npz") in metrics["model"]
     assert written["settings"]["complete"]["random_starts"] == 3
     done = load_completion(out)
     assert done.betas is None and done.rms * 1000 == pytest.approx(
-        metrics["distance of the scan to the completed mesh, RMS"])
+        metrics["what the scan leaves beside the body that was bent onto it, RMS"])
     colors = read_mesh(out / "completed.ply").colors
     np.testing.assert_allclose(colors[done.seen & (colors != 0.6).any(axis=1)], 0.2, atol=0.01)
     assert ((colors[:, 0] - 0.2)**2 < 1e-3).mean() > 0.5
     page = (out / "report.html").read_text()
-    for wanted in ("What the colours say", "Distance of the scan", "clothing or hair", "scan points explained"):
+    for wanted in ("What the colours say", "Distance of the scan", "clothing or hair",
+                   "share of the scan that lies on the body"):
         assert wanted in page
     scene, = scenes_of(page)
     body = scene.layer("completed body")
@@ -93,7 +95,7 @@ def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
     assert len(scene.layer("landmarks")["labels"]) == 7 and set(scene.layer("landmarks")["labels"]) == set(MARKS)
     assert not scene.layer("predicted body")["visible"] and not scene.layer("scan over it")["visible"]
     assert page.count("<img") == 1 and [p.name for p in out.glob(".*")] == [".scapekit"]
-    assert "distance of the scan" in capsys.readouterr().out
+    assert "share of the scan" in capsys.readouterr().out
 
 
 def test_without_landmarks_it_says_so_and_goes_on(place, tmp_path, capsys):

@@ -146,6 +146,6 @@ def test_other_commands_read_the_same_motions(place, tmp_path):
         assert any(row["metric"] == "motion copied" and "° off" in row["value"] for row in rows), rows
         found = read_motion(out / "out.bvh", small_people())
         assert np.abs(found.poses - read_motion(file, small_people()).poses).max() < 1e-6
-        assert main(["model", "repose", str(model), str(tmp_path / "body.ply"), "--poses", file, "-o",
+        assert main(["model", "repose", str(model), str(tmp_path / "body.ply"), "--motion", file, "-o",
                      str(out / "reposed")]) == 0
         assert len(list((out / "reposed").glob("*.ply"))) == len(random_poses())

@@ -118,8 +118,10 @@ def test_normals_of_mixed_sign_are_turned_outward_and_missing_ones_estimated(bod
 
 @pytest.mark.parametrize("scan, viewpoint, message", [
     ([], None, "at least one view, got none"),
-    ([np.random.default_rng(0).normal(size=(40, 3)), np.full((40, 3), np.inf)], None, "view 1: 40 points are not finite"),
-    ([np.random.default_rng(0).normal(size=(40, 3)), np.zeros((40, 4))], None, r"view 1: expected points of shape \(n, 3\), or \(n, 6\)"),
+    ([np.random.default_rng(0).normal(size=(40, 3)), np.full((40, 3), np.inf)], None,
+     "view 1: 40 points are not finite"),
+    ([np.random.default_rng(0).normal(size=(40, 3)), np.zeros((40, 4))], None,
+     r"view 1: expected points of shape \(n, 3\), or \(n, 6\)"),
     (PointCloud(np.zeros((40, 3)), np.zeros((39, 3))), None, "expected one normal for each of 40 points"),
     ([np.eye(3)] * 2, np.zeros((3, 3)), r"viewpoint: expected 3 finite numbers, or 3 for each of the 2 views"),
 ])

@@ -189,7 +189,7 @@ def test_the_command_has_root_names_ground_and_front(files, model, rig, motion):
     for name in ("a.glb", "b.bvh"):
         assert run(export, "scape model export", [
             str(files / "named.npz"), "-o", str(files / name), "--motion", str(files / "motion.npz"), "--root",
-            "pelvis", "--names", "mixamo", "--ground", "--up", "1"]) == 0
+            "pelvis", "--names", "mixamo", "--ground", "--up", "y"]) == 0
         told.append({m["metric"]: m["value"] for path in files.glob(f"{name[0]}*.json")
                      for m in json.loads(path.read_text())["metrics"]})
         assert told[-1]["root"] == "mixamorig:Hips" and told[-1]["parts without a name of mixamo"] == "tail"

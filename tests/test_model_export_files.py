@@ -13,6 +13,7 @@ from model.export.cli import export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
 from model.export.rig import turn_up
+from model.motion.onto import BodyMotion
 from scanprep.command_line import run
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
@@ -192,14 +193,14 @@ def exported(files, output, *arguments):
 
 
 def test_the_command_writes_what_the_name_says(files, model, rig, motion):
-    figures = exported(files, "a.glb", "--motion", str(files / "motion.npz"), "--up", "1", "--correctives", "2")
+    figures = exported(files, "a.glb", "--motion", str(files / "motion.npz"), "--up", "y", "--correctives", "2")
     glb = Glb((files / "a.glb").read_bytes())
     assert len(glb.json["meshes"][0]["extras"]["targetNames"]) == 8 == figures["shape targets"] + 2
     off = np.stack([glb.skinned(t) for t in range(5)]) - model.subject(BETAS).vertices(*motion)
     assert figures["distance from exact body, mean"] == pytest.approx(
         1000 * np.linalg.norm(off, axis=2).mean(), rel=1e-3)
     assert figures["frames"] == 5 and figures["joints"] == 4
-    exported(files, "a.bvh", "--betas", "0.5", "-1", "--unit", "m", "--up", "1")
+    exported(files, "a.bvh", "--betas", "0.5", "-1", "--unit", "m", "--up", "y")
     places = Bvh((files / "a.bvh").read_text()).positions(0)
     assert np.allclose([places[name] for name in rig.skeleton.names], rig.skeleton.joints, atol=1e-5)
     figures = exported(files, "a.npz")
@@ -207,6 +208,8 @@ def test_the_command_writes_what_the_name_says(files, model, rig, motion):
         "distance from exact body, skinning alone, mean"]
     exported(files, "a.ply", "--own-body")
     assert np.abs(read_mesh(files / "a.ply", "m").vertices - model.vertices(np.zeros((4, 3)))).max() < 1e-12
+    figures = exported(files, "slow.glb", "--motion", str(files / "motion.npz"), "--up", "1", "--fps", "2")
+    assert figures["frames"] == 3
     assert exported(files, "frames", "--motion", str(files / "motion.npz"))["meshes"] == 5
     assert len(list((files / "frames").glob("*.ply"))) == 5
 
@@ -216,15 +219,31 @@ def test_the_command_writes_what_the_name_says(files, model, rig, motion):
     (["-o", "b.npz", "--betas", "1"], "--betas: it says nothing about a npz"),
     (["-o", "b.ply", "--motion", "motion.npz"], "name a folder for the meshes of a motion"),
     (["-o", "b.glb", "--correctives", "3"], "name it with --motion"),
+    (["-o", "b.ply", "--fps", "24"], "--fps: it says nothing about a mesh"),
     (["-o", "nothing"], "name it with --motion"),
     (["-o", "b.glb", "--own-body", "--betas", "1"], "the template's own body has no betas"),
-    (["-o", "b.glb", "--own-body", "--shapes", "2"], "shapes: the template's own body has none"),
+    (["-o", "b.glb", "--own-body", "--morphs", "2"], "shapes: the template's own body has none"),
     (["-o", "b.bvh", "--motion", "model.npz"], "expected a motion, it lacks poses and trans")])
 def test_the_command_refuses_in_one_line(files, arguments, words, capsys, monkeypatch):
     monkeypatch.chdir(files)
     assert run(export, "scape model export", ["model.npz", *arguments]) == 1
     assert words in capsys.readouterr().err
     assert not list(files.glob("b.*")) and not (files / "nothing").exists()
+
+
+@pytest.mark.parametrize("rate", [24.0, 30.0, 48.0, 120.0])
+def test_a_motion_at_another_rate_is_the_same_motion(rate):
+    """Joints that turn at constant speed about a slanted axis, beyond half a turn, and a straight way."""
+    axis, speed = np.array([0.6, 0.0, 0.8]), np.array([[1.0], [-4.0]])
+
+    def at(times):
+        turned = rotations.log(rotations.exp(times[:, None, None] * speed * axis))
+        return BodyMotion(turned, np.outer(times, [1.0, 2.0, 0.0]), None, 120.0)
+
+    found, wanted = at(np.arange(121) / 120).at_rate(rate), at(np.arange(int(rate) + 1) / rate)
+    assert found.rate == rate and len(found.poses) == int(rate) + 1
+    np.testing.assert_allclose(rotations.exp(found.poses), rotations.exp(wanted.poses), atol=1e-9)
+    np.testing.assert_allclose(found.trans, wanted.trans, atol=1e-12)
 
 
 @pytest.mark.parametrize(("change", "words"), [

@@ -114,7 +114,7 @@ def test_commands(tmp_path, model, motion, capsys, monkeypatch):
     model.save(tmp_path / "m.npz")
     np.savez(tmp_path / "w.npz", poses=motion[0].reshape(10, -1), trans=motion[1], betas=BETAS,
              mocap_frame_rate=np.array(RATE), surface_model_type=np.array("scape"))
-    words = [str(tmp_path / "m.npz"), "--motion", str(tmp_path / "w.npz"), "--up", "2", "-o"]
+    words = [str(tmp_path / "m.npz"), "--motion", str(tmp_path / "w.npz"), "--up", "z", "-o"]
     for wrong, told in ((["w.points.usd", "--root", "a"], "--root: it says nothing about a point cache"),
                         (["w.usd", "--unit", "cm"], "--unit: it says nothing about a usd")):
         assert run(export, "scape model export", [*words, str(tmp_path / wrong[0]), *wrong[1:]]) == 1

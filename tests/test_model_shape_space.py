@@ -42,6 +42,16 @@ def test_zero_is_the_mean_and_none_the_template(people):
     np.testing.assert_array_equal(space.gradients([0.5]), space.gradients([0.5, 0.0]))
 
 
+@pytest.mark.parametrize("flipped", [1, -1])
+def test_more_of_a_component_is_more_volume(people, flipped):
+    """Whatever sign the decomposition gives."""
+    S, U = people
+    volumes = 0.07 + 0.01 * flipped * (S.reshape(40, -1) @ U.T) @ [1.0, -2.0, 3.0]
+    space = learn_shape_space(S, 3, volumes)
+    betas = space.betas_of(S)
+    assert ((volumes - volumes.mean()) @ betas > 0).all()
+
+
 def test_never_more_components_than_people_allow():
     S = np.random.default_rng(1).normal(size=(4, 20, 3, 3))
     assert learn_shape_space(S, 40).count == 3

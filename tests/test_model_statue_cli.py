@@ -148,7 +148,8 @@ def test_bad_input_is_refused_by_name(made, tmp_path, capsys):
     np.savez(tmp_path / "motion.npz", poses=np.zeros((2, 15)), trans=np.zeros((2, 3)), mocap_frame_rate=30.0)
     scan = made / "scan.ply"
     for words, reason in (
-            (("fit", cloud), "no faces"), (("fit", scan, "--features", strange), "left antenna"),
+            (("fit", cloud), "at least 100 points at different places, got 50"),
+            (("fit", scan, "--features", strange), "left antenna"),
             (("fit", tmp_path / "empty"), "found none"), (("reconstruct", tmp_path / "empty"), "statue.json"),
             (("animate", made / "statue", tmp_path / "motion.npz"), "17 parts"),
             (("animate", made / "statue", tmp_path / "none.bvh"), "none.bvh")):

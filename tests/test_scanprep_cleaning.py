@@ -149,6 +149,25 @@ def test_near_pieces_stay_and_specks_go(person):
     assert clean.kept.sum() == len(person.vertices) + len(hat.vertices)
 
 
+def test_an_arm_seen_in_steps_stays_and_a_thing_beyond_its_hand_goes():
+    # A depth camera sees a body 10 mm apart, and of an arm that points away from it slices 45 mm behind each other.
+    body = grid(0.5, 1.7)
+    arm = [moved(grid(0.08, 0.08), [0.3 + 0.045 * i, 0.5, 0.045 * i]) for i in range(6)]
+    thing = moved(grid(0.3, 0.3), [0.9, 0.5, 0.25])
+    clean = clean_scan(joined(body, *arm, thing).vertices, CleanScanConfig(planes=0))
+    assert clean.kept[:-len(thing.vertices)].all() and not clean.kept[-len(thing.vertices):].any()
+    assert [row.reason for row in clean.components] == [LARGEST, FAR, *[NEAR] * 5]
+    dense = clean_scan(joined(grid(0.5, 1.7, 0.005), *arm[1:], thing).vertices, CleanScanConfig(planes=0))
+    assert [row.reason for row in dense.components] == [LARGEST, FAR, *[FAR] * 5]      # no camera takes such steps
+
+
+def test_what_a_depth_camera_did_not_see_is_not_taken_for_the_body(person):
+    rng = np.random.default_rng(3)
+    unseen = np.column_stack([rng.uniform(-15, 15, (200, 2)), np.full(200, 65.535)])
+    clean = clean_scan(np.concatenate([person.vertices, unseen]))
+    assert clean.kept[:-200].all() and not clean.kept[-200:].any()
+
+
 def test_views_side_by_side_are_one_piece():
     one = ball(4)
     left, right = (one.submesh(s * one.corners[:, :, 0].mean(axis=1) > -0.01)[0] for s in (1, -1))

@@ -164,7 +164,7 @@ def test_decimate_keeps_landmarks(place, tmp_path):
 
 
 def test_decimate_set(place, tmp_path, capsys):
-    assert run("decimate", place / "set", "--faces", 500, "--method", "fast", "-o", tmp_path / "no") == 1
+    assert run("decimate", place / "set", "--faces", 500, "--method", "fast", "-o", tmp_path / "no") == 2
     assert "--method: it says nothing about a registered set" in capsys.readouterr().err
     assert run("decimate", place / "set", "--faces", 500, "-o", tmp_path / "small") == 0
     small, whole = RegisteredSet.load(tmp_path / "small"), RegisteredSet.load(place / "set")
@@ -195,7 +195,8 @@ def test_fill(tmp_path):
     closed, figures = read_mesh(tmp_path / "closed.ply"), report(tmp_path / "closed.ply.report.json")
     assert closed.is_closed and figures["holes before"] == 1 and figures["fair patches"] == 1
     np.testing.assert_array_equal(closed.vertices[:len(open_body.vertices)], open_body.vertices)
-    assert run("fill", tmp_path / "open.ply", "--method", "diffusion", "-o", tmp_path / "diffused.ply") == 0
+    (tmp_path / "fill.toml").write_text('method = "diffusion"')
+    assert run("fill", tmp_path / "open.ply", "--config", tmp_path / "fill.toml", "-o", tmp_path / "diffused.ply") == 0
     assert report(tmp_path / "diffused.ply.report.json")["diffusion patches"] == 1
 
 
@@ -219,7 +220,8 @@ def test_views_come_together(tmp_path):
     write_landmarks(tmp_path / "marks" / "a.json", marks)
     write_landmarks(tmp_path / "marks" / "b.json", {name: R @ p + t for name, p in marks.items()})
     assert run("views", tmp_path / "views", "--landmarks", tmp_path / "marks", "-o", tmp_path / "by_marks") == 0
-    assert run("merge", tmp_path / "aligned", "--voxel", 0.03, "-o", tmp_path / "merged.ply") == 0
+    (tmp_path / "merge.toml").write_text("voxel = 0.03")
+    assert run("merge", tmp_path / "aligned", "--config", tmp_path / "merge.toml", "-o", tmp_path / "merged.ply") == 0
 
 
 def test_correspondences_in_a_file(place, tmp_path, capsys, quick):

@@ -1,4 +1,6 @@
 import json
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from completion.partial.upright import PICTURE, Upright
 from scanprep.depth_camera.person import find_person, room_planes
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import rotations
+from scanprep.synthetic.people import Person
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 ROW, COLUMN = np.indices((240, 320))
@@ -128,3 +131,14 @@ def test_a_depth_picture_is_read_with_its_camera(tmp_path):
         read_depth(path)
     with pytest.raises(ValueError, match="expected metres"):
         DepthPicture.of(1000 * depth, K)
+
+
+@pytest.mark.parametrize("spell", [str, lambda name: "_".join(name.split("_")[::-1]) if name.endswith("t") else name,
+                                   lambda name: re.sub(r"(.*)_(l|r)(eft|ight)$", r"\2_\1", name)],
+                         ids=["ours", "side first", "of old"])
+def test_which_way_is_up_in_a_body_whatever_its_parts_are_called(spell):
+    """Also the built-in people, whose thighs were called l_thigh: --up was refused with them."""
+    person = Person()
+    skeleton = replace(person.skeleton, names=tuple(map(spell, person.names)))
+    found = Upright.of(person.mesh, skeleton, (0.0, 2.0, 0.0), picture=False)
+    assert found is not None and (found.of_body == [0, 0, 1]).all() and (found.ups == [[0, 1, 0]]).all()

@@ -1,4 +1,5 @@
 """Folders that come from somebody else: what they name outside of themselves is neither read, moved nor removed."""
+import csv
 import dataclasses
 import os
 
@@ -13,8 +14,11 @@ from scanprep.batch.ownership import HOME
 from scanprep.batch.room import Job
 from scanprep.batch.values import save_value
 from scanprep.batch.workspace import RECORD, Task
+from scanprep.console import Metric, bar, say, show
 from scanprep.geometry import storage
 from scanprep.geometry.storage import StorageError, path_inside
+from scanprep.geometry.tables import number_table, read_table, write_table
+from scanprep.pipeline.scans import find_scans
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +46,7 @@ def home(tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_leads_out_of_the_folder(home, name):
-    with pytest.raises(StorageError, match="report.json.*(inside|expected)"):
+    with pytest.raises(StorageError, match=r"report\.json.*(inside|expected)"):
         path_inside(home / "out", name, "report.json")
 
 
@@ -80,7 +84,7 @@ def test_a_result_on_its_way_names_the_file_of_somebody_else(home, name):
     ready.mkdir(parents=True)
     (home / "out" / HOME / "ready" / "profile").write_text("theirs")
     save_value(ready / RECORD, None, hostile(home, name))
-    with pytest.raises(StorageError, match="record.npz"):
+    with pytest.raises(StorageError, match=r"record\.npz"):
         run_again(home)
 
 
@@ -88,7 +92,7 @@ def test_a_result_on_its_way_names_the_file_of_somebody_else(home, name):
 def test_a_report_names_the_file_of_somebody_else(home, name):
     (home / "out" / "body.ply").write_text("ours")
     storage.write_json(home / "out" / "body.ply.report.json", {"written": hostile(home, name)["files"]})
-    with pytest.raises(StorageError, match="report.json"), beside(home / "out" / "body.ply") as space, \
+    with pytest.raises(StorageError, match=r"report\.json"), beside(home / "out" / "body.ply") as space, \
             space.staging("output") as staged:
         (staged.folder / "body.ply").write_text("new")
 
@@ -143,3 +147,34 @@ def test_the_run_ends_without_a_lock(home):
         run_again(home)
     assert not (home / "out" / HOME / "lock").exists()
     assert sorted(p.name for p in home.iterdir()) == ["in.txt", "out", "profile"]
+
+
+STRANGE = ("=1+1", "-anna", "+49 a", "@sum", "'=1", "''-x", "[red]anna[/red]", "<b>anna</b>", "anna;b", 'an"na')
+
+
+def test_a_table_gives_back_names_that_spreadsheets_would_run(tmp_path):
+    write_table(tmp_path / "a.csv", ["name", "value"], [(name, -0.5) for name in STRANGE])
+    assert [row["name"] for _, row in read_table(tmp_path / "a.csv", ["name", "value"])] == list(STRANGE)
+    cells = [row[0] for row in csv.reader((tmp_path / "a.csv").read_text().splitlines())][1:]
+    assert not [cell for cell in cells if cell[0] in "=+-@"]
+    assert all(row["value"] == "-0.5" for _, row in read_table(tmp_path / "a.csv", ["name", "value"]))
+    assert number_table(["=a", "b"], np.zeros((1, 2))).startswith("'=a,b\n")
+
+
+def test_what_a_terminal_is_told_does_not_steer_it(capsys):
+    name = "\x1b[2Jan\x07na\u202e\udce9 é\u00a0ü"
+    say(name)
+    with bar(name) as tell:
+        tell(1, 1)
+    show([Metric(name, "[red]x[/red]", "[bold]")])
+    out, err = capsys.readouterr()
+    for text in (out, err):
+        assert not {"\x1b", "\x07", "\u202e", "\udce9"} & set(text)
+    assert r"\x1b[2Jan\x07na\u202e\udce9 é" in err
+    assert "[red]x[/red]" in out and "[bold]" in out
+
+
+def test_a_scan_whose_name_is_no_text_is_named(tmp_path):
+    (tmp_path / "an\x1bna.ply").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"an\\x1bna\.ply.*rename"):
+        find_scans(tmp_path)

@@ -1,6 +1,7 @@
 """Bad files of meshes: one line with the name of the file, what was expected, what came."""
 import gzip
 import json
+import os
 import struct
 
 import numpy as np
@@ -9,7 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, quiet, refused
 
+from scanprep.geometry import storage
 from scanprep.geometry.files import MeshFileError, read_mesh, read_points, write_mesh
+from scanprep.geometry.landmarks import read_landmarks
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb"])
@@ -36,7 +39,7 @@ def test_a_file_cut_off_anywhere_is_refused(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_coordinates_that_are_not_finite_are_refused(tmp_path, suffix, bad):
+def test_a_vertex_that_is_not_finite_is_left_out_with_its_triangles(tmp_path, suffix, bad):
     vertices = np.where(TETRAHEDRON.vertices == 1.5, 1.25, TETRAHEDRON.vertices)
     write_mesh(tmp_path / f"a{suffix}", TETRAHEDRON.with_vertices(vertices), "single")
     data = (tmp_path / f"a{suffix}").read_bytes()
@@ -45,7 +48,12 @@ def test_coordinates_that_are_not_finite_are_refused(tmp_path, suffix, bad):
     else:
         data = data.replace(struct.pack("<f", 1.25), struct.pack("<f", bad))
     (tmp_path / f"a{suffix}").write_bytes(data)
-    refused(tmp_path / f"a{suffix}", "not finite")
+    with pytest.warns(UserWarning, match="points are not finite and were left out, with 3 triangles"):
+        mesh = read_mesh(tmp_path / f"a{suffix}")
+    assert sorted(mesh.vertices.tolist()) == sorted(TETRAHEDRON.vertices[:3].tolist()) and len(mesh.faces) == 1
+    np.testing.assert_array_equal(np.cross(*np.diff(mesh.corners[0], axis=0)), [0, 0, -1])
+    if suffix != ".stl":
+        assert mesh.of_file.tolist() == [0, 1, 2, -1]
 
 
 STL = "solid\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n"
@@ -86,20 +94,23 @@ STL = "solid\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendlo
     ("a.stl", STL.replace("endsolid\n", ""), ["truncated", "endsolid"]),
     ("a.xyz", "0 0 0\n1 0\n", ["line 2", "1 0"]),
     ("a.xyz", "0 0 0\n1 0 x\n", ["line 2", "1 0 x"]),
-    ("a.xyz", "0 0 0\n1 0 nan\n", ["not finite", "point 1"]),
+    ("a.xyz", "nan 0 0\n1 0 nan\n", ["none of its 2 points is finite"]),
+    ("a.xyz", "1.5,2.5,3.5\n1,5 2.5 3,5\n", ["line 2"]),
+    ("a.csv", "1,5;2.5;3,5\n", ["line 1", "both points and commas"]),
+    ("a.csv", "x;y;height\n1;2;3\n", ["line 1", "x, y and z"]),
     ("a.xyz", "# nothing\n", ["found none"]),
     ("a.pcd", "VERSION 0.7\nFIELDS x y\nSIZE 4 4\nTYPE F F\nCOUNT 1 1\nPOINTS 1\nDATA ascii\n0 0\n", ["x, y, z"]),
     ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n0 0 0\n", ["truncated"]),
     ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA binary\nshort", ["truncated"]),
     ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA binary_compressed\n",
-     ["binary_compressed", "save the file as binary"]),
+     ["truncated", "24 bytes of 2 points"]),
     ("a.pcd", "VERSION 0.7\nFIELDS x y z\nSIZE 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n", ["agree"]),
     ("a.pcd", "VERSION 0.7\nFIELDS x y z\n", ["DATA"]),
     ("a.pcd", "hello\nworld\n", ["line 1", "hello"]),
 ])
 def test_a_bad_file_says_where(tmp_path, name, text, words):
     (tmp_path / name).write_text(text)
-    refused(tmp_path / name, *words, read=read_points if name.endswith(("xyz", "pcd")) else read_mesh)
+    refused(tmp_path / name, *words, read=read_points if name.endswith(("xyz", "pcd", "csv")) else read_mesh)
 
 
 def test_a_glb_with_a_face_out_of_range_or_damaged_json(tmp_path):
@@ -121,7 +132,7 @@ def test_a_name_of_no_known_format(tmp_path):
     (tmp_path / "a.fbx").touch()
     refused(tmp_path / "a.fbx", ".ply", "'.fbx'")
     (tmp_path / "a").touch()
-    refused(tmp_path / "a", ".ply", "found none")
+    refused(tmp_path / "a", ".ply", "found 'none'")
     with pytest.raises(MeshFileError, match=r"a\.fbx.*'\.fbx'"):
         write_mesh(tmp_path / "a.fbx", TETRAHEDRON)
 
@@ -139,6 +150,35 @@ def test_a_damaged_file_is_read_or_refused_but_never_breaks(tmp_path, suffix, da
         assert len(quiet(read_mesh, tmp_path / f"bad{suffix}").faces)
     except MeshFileError as error:
         assert f"bad{suffix}" in str(error) and "\n" not in str(error)
+
+
+@pytest.mark.parametrize("ending", [".ply", ".obj", ".json", ".npz"])
+def test_what_is_no_plain_file_is_refused_at_once(tmp_path, ending):
+    os.mkfifo(tmp_path / f"pipe{ending}")
+    (tmp_path / f"device{ending}").symlink_to("/dev/zero")
+    read = {".json": read_landmarks, ".npz": storage.load_arrays}.get(ending, read_mesh)
+    for name in ("pipe", "device"):
+        with pytest.raises(storage.StorageError, match=f"{name}{ending}: expected .*, found a pipe or a device"):
+            read(tmp_path / f"{name}{ending}")
+
+
+@pytest.mark.parametrize(("ending", "words"), [(".las", "CloudCompare"), (".fbx", "Blender"), (".usdz", "Blender")])
+def test_formats_that_nobody_reads_say_what_makes_another(tmp_path, ending, words):
+    (tmp_path / f"a{ending}").write_bytes(b"x")
+    refused(tmp_path / f"a{ending}", words)
+
+
+def test_lists_of_negative_length(tmp_path):
+    head = PLY_HEADER.replace("ascii", "binary_little_endian").replace("list uchar", "list char").encode()
+    body = np.arange(15, dtype="<f4").tobytes()
+    for faces in (struct.pack("<b3ib3i", -1, 0, 1, 2, 3, 0, 1, 2), struct.pack("<b3ib3i", 3, 0, 1, 2, -3, 0, 1, 2)):
+        (tmp_path / "a.ply").write_bytes(head + body + faces)
+        refused(tmp_path / "a.ply", "element face", "a list of -")
+
+
+def test_a_landmark_on_a_face_that_is_a_truth_value(tmp_path):
+    (tmp_path / "a.json").write_text('{"nose": {"face": false, "bary": [1, 0, 0]}}')
+    refused(tmp_path / "a.json", "nose", read=lambda path: read_landmarks(path, TETRAHEDRON))
 
 
 def test_nothing_half_written_is_left_behind(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, quiet, refused
 
-from scanprep.geometry.files import list_meshes, name_of, read_mesh, read_registered, write_mesh
+from scanprep.geometry.files import UNITS, list_meshes, name_of, read_mesh, read_registered, write_mesh
 from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, Person
@@ -212,9 +212,41 @@ def test_units_become_metres(tmp_path, unit, factor, suffix):
     np.testing.assert_allclose(mesh.corners, TETRAHEDRON.corners, atol=1e-6)
 
 
-@pytest.mark.parametrize(("factor", "says"), [(1000, "unit='mm'"), (100, "unit='cm'"), (1 / 0.0254, "unit='in'"),
+@pytest.mark.parametrize("stature", [1.4, 1.75, 2.2])
+@pytest.mark.parametrize("far", [0, 4e6])
+@pytest.mark.parametrize("unit", ["mm", "cm", "in"])
+def test_the_unit_in_which_it_is_a_person_is_taken(tmp_path, unit, far, stature):
+    person = TETRAHEDRON.with_vertices(TETRAHEDRON.vertices * stature / 1.5 / UNITS[unit] + far)
+    write_mesh(tmp_path / "person.ply", person)
+    with pytest.warns(UserWarning, match=rf"person\.ply: read with unit='{unit}', .* {stature:.2f} m") as caught:
+        mesh = read_mesh(tmp_path / "person.ply")
+    assert len(caught) == 1
+    np.testing.assert_array_equal(mesh.vertices, UNITS[unit] * person.vertices)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(read_mesh(tmp_path / "person.ply", "m").vertices, person.vertices)
+
+
+def test_a_person_far_from_the_origin_is_in_metres(tmp_path):
+    person = TETRAHEDRON.with_vertices(TETRAHEDRON.vertices * 1.75 / 1.5 + [500_000, 4e6, 100])
+    write_mesh(tmp_path / "person.ply", person)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(read_mesh(tmp_path / "person.ply").vertices, person.vertices)
+
+
+def test_what_belongs_together_has_one_unit(tmp_path):
+    for name, stature in (("a", 1750), ("child", 1100), ("hand", 190)):
+        write_mesh(tmp_path / f"{name}.ply", TETRAHEDRON.with_vertices(TETRAHEDRON.vertices * stature / 1.5))
+    with pytest.warns(UserWarning) as caught:
+        bodies = read_registered(tmp_path)
+    assert [str(w.message).split(",")[0] for w in caught] == [f"{tmp_path / 'a.ply'}: read with unit='mm'"]
+    np.testing.assert_allclose(np.ptp(bodies.vertices, axis=1).max(axis=1), [1.75, 1.1, 0.19])
+
+
+@pytest.mark.parametrize(("factor", "says"), [(500, "unit='mm'"), (65, "unit='cm'"), (16, "unit='in'"),
                                               (1e-3, "divided by 1000")])
-def test_a_giant_or_a_dwarf_warns_and_says_which_unit_it_looks_like(tmp_path, factor, says):
+def test_a_giant_or_a_dwarf_of_no_certain_unit_warns_and_stays(tmp_path, factor, says):
     person = TETRAHEDRON.with_vertices(TETRAHEDRON.vertices * factor * 1.75 / 1.5)
     write_mesh(tmp_path / "person.ply", person)
     with pytest.warns(UserWarning, match=says) as caught:

@@ -54,5 +54,18 @@ def test_text_points_with_a_heading_commas_and_colours(tmp_path):
 def test_points_have_units_too(tmp_path):
     write_points(tmp_path / "a.xyz", PointCloud(np.array([[0, 0, 0], [0, 0, 1800.0]])))
     with pytest.warns(UserWarning, match=r"a\.xyz.*unit='mm'"):
-        read_points(tmp_path / "a.xyz")
+        np.testing.assert_allclose(read_points(tmp_path / "a.xyz").points, [[0, 0, 0], [0, 0, 1.8]])
     np.testing.assert_allclose(read_points(tmp_path / "a.xyz", unit="mm").points, [[0, 0, 0], [0, 0, 1.8]])
+
+
+def test_what_a_depth_camera_writes_where_it_saw_nothing_is_no_size(tmp_path):
+    # A bust in metres, and 3% of the pixels at 65.535 m, which alone would be 1.66 m in inches.
+    rng = np.random.default_rng(0)
+    bust = rng.uniform(-0.3, 0.3, (1000, 3)) + [0, 0, 0.9]
+    nothing = np.column_stack([rng.uniform(-15, 15, (30, 2)), np.full(30, 65.535)])
+    write_points(tmp_path / "bust.ply", PointCloud(np.concatenate([bust, nothing]), None, None))
+    with pytest.warns(UserWarning, match="a few points lie far off the rest, which spans 0.5"):
+        assert read_points(tmp_path / "bust.ply").points[:1000] == pytest.approx(bust, abs=1e-6)
+    write_points(tmp_path / "mm.ply", PointCloud(3000 * bust, None, None))
+    with pytest.warns(UserWarning, match="mm"):
+        read_points(tmp_path / "mm.ply")

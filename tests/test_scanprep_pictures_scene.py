@@ -69,7 +69,8 @@ def test_heat_goes_over_in_254_steps_and_without_a_value_is_grey(body):
     index = read.columns[first["index"]].ravel()
     known = np.isfinite(values)
     np.testing.assert_allclose(index[known] / 254 * 0.01, values[known].clip(0, 0.01), atol=0.51 * 0.01 / 254)
-    assert index[7] == 255 and first["legend"] == {"title": "distance", "low": 0.0, "high": 0.01, "unit": "mm"}
+    assert index[7] == 255
+    assert first["legend"] == {"title": "distance", "low": 0.0, "high": 0.01, "unit": "mm", "more": True}
     np.testing.assert_allclose(read.colors(first, 0) / 255, shade.colors(), atol=0.02)
     assert sure["name"] == "sure" and sure["legend"]["unit"] == "%" and sure["palette"] != first["palette"]
 
@@ -102,7 +103,10 @@ def test_dots_are_coloured_by_values_with_a_legend(body):
     heat = Heat(np.array([0.0, 0.02, np.nan]), 0.0, 0.05, "off")
     read = SceneReader(pack_scene([pane(Dots(body.vertices[:3], heat, name="marks"))]))
     (shade,) = read.layer("marks")["shades"]
-    assert shade["legend"] == {"title": "off", "low": 0.0, "high": 0.05, "unit": "mm"}
+    assert shade["legend"] == {"title": "off", "low": 0.0, "high": 0.05, "unit": "mm", "more": False}
+    beyond = Heat(np.array([0.0, 0.06, np.nan]), 0.0, 0.05, "off")
+    (over,) = SceneReader(pack_scene([pane(Dots(body.vertices[:3], beyond, name="marks"))])).layer("marks")["shades"]
+    assert over["legend"]["more"]
     np.testing.assert_allclose(read.colors(shade, 3), 255 * heat.colors(), atol=2)
 
 

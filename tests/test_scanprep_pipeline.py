@@ -176,7 +176,7 @@ def test_bad_scans_stop_no_other(scans, template, tmp_path):
 
 
 def test_a_scan_in_another_unit_is_refused_at_once(scans, template, tmp_path):
-    for name, factor in (("body0", 1000), ("body1", 0.001)):
+    for name, factor in (("body0", 3000), ("body1", 0.001)):             # no person in any unit
         body = read_mesh(scans / f"{name}.ply")
         write_mesh(scans / f"{name}.ply", body.with_vertices(factor * body.vertices))
     with pytest.warns(UserWarning, match="when read as metres"):

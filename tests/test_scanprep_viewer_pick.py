@@ -14,7 +14,7 @@ from scanprep.pictures.shading import sphere
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import Person
 from scanprep.viewer.cli import pick_landmarks
-from scanprep.viewer.clicked import KEPT, Clicked, predict_landmarks
+from scanprep.viewer.clicked import KEPT, Clicked, camera_like, camera_of, predict_landmarks
 from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
 from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
@@ -361,3 +361,106 @@ def test_a_landmark_is_dragged(new_page, folder, person):
         assert page.errors == []
     shift = app.scans[0].places["navel"] - before
     assert 0.03 < shift[2] < 0.2 and len(app.done) == 2                # up, and the drag is one change
+
+
+def click_at(app, person, pane, at, name=None):
+    """A click on a landmark of the template or the scan, from where it is seen; what the page is told."""
+    v = landmarks()[at]
+    ends = person.mesh.vertices[v] + [[0, 0, 0], 0.02 * person.mesh.vertex_normals[v]]
+    place, beyond = moved(ends) if pane else ends
+    return click(app, place, name or app.chosen, pane, (beyond - place) / 0.02)[-1].fields
+
+
+def clicked(app, person, *clicks):
+    """Clicks on (pane, name) as the page sends them, with the name that is chosen; what the app then offers."""
+    offered = []
+    for pane, at in clicks:
+        click_at(app, person, pane, at)
+        offered.append((app.chosen, app.alternating))
+    return offered
+
+
+def test_left_right_left_right_as_in_wrap_and_meshlab(folder, person):
+    """A click on the other pane takes the same name; the next name comes when both have it."""
+    (folder / "template.landmarks.json").unlink()
+    app = app_of(folder)
+    crown, navel, left = TEN[:3]
+    assert app.chosen == crown
+    assert clicked(app, person, (0, crown), (1, crown), (0, navel), (1, navel)) == [
+        (crown, 0), (navel, None), (navel, 0), (left, None)]
+    assert clicked(app, person, (1, left), (0, left))[-1][0] == TEN[3]         # also the scan first
+    assert set(app.template.places) == set(app.scans[0].places) == {crown, navel, left}
+
+
+def test_all_on_the_template_first_works_too(folder, person):
+    (folder / "template.landmarks.json").unlink()
+    app = app_of(folder)
+    for name in TEN[:4]:
+        click_at(app, person, 0, name)
+    assert list(app.template.places) == list(TEN[:4])
+    for name in TEN[:4]:
+        np.testing.assert_allclose(app.template.places[name], person.mesh.vertices[landmarks()[name]], atol=0.05)
+    sent(app, "choose", name=TEN[0])                                           # chosen by hand, it is placed anew
+    click(app, person.mesh.vertices[landmarks()["navel"]] + [0, 0, 0.1], app.chosen, 0)
+    assert set(app.template.places) == set(TEN[:4])
+
+
+def test_names_that_a_file_has_under_other_words_are_not_offered_twice(folder):
+    write_landmarks(folder / "template.landmarks.json", {"crown": 1, "LeftHand": 2, "knee in right leg": 3})
+    app = app_of(folder)
+    assert app.names[:3] == ("crown", "LeftHand", "knee in right leg") and len(app.names) == 10
+
+
+def test_a_click_far_from_the_prediction_is_questioned(folder, person):
+    app = app_of(folder)
+    true = {name: moved(person.mesh.vertices[landmarks()[name]]) for name in ("navel", "chin", *FOUR)}
+    app.scans[0].predicted = dict(true)
+    near = click_at(app, person, 1, "navel", "navel")
+    assert near["question"] is None and near["chosen"] != "navel"
+    far = click_at(app, person, 1, "chin", "left toe")
+    away = np.linalg.norm(app.scans[0].places["left toe"] - true["left toe"])
+    assert far["question"]["text"] == f"This is {100 * away:.0f} cm from where “left toe” was expected: keep it?"
+    assert far["chosen"] == "left toe" and away > 1
+    moved_there = sent(app, "confirm", names=["left toe"])[-1].fields
+    assert moved_there["question"] is None
+    np.testing.assert_allclose(app.scans[0].places["left toe"], true["left toe"])
+    click_at(app, person, 1, "chin", "right toe")
+    kept = sent(app, "keep", name="right toe")[-1].fields
+    assert kept["question"] is None and kept["chosen"] != "right toe"
+    assert np.linalg.norm(app.scans[0].places["right toe"] - true["right toe"]) > 1
+
+
+@pytest.mark.parametrize("azimuth", [0, 90, 180, 215])
+@pytest.mark.parametrize("known", [False, True])
+def test_the_scan_is_shown_from_the_side_of_the_template(person, azimuth, known):
+    """A body that is turned by any angle: both panes show it from the front, also where its outline does not tell."""
+    R = rotations.exp(np.radians([0.0, 0.0, azimuth]))
+    first = camera_of(person.mesh)
+    cut = person.mesh.submesh(person.mesh.corners.mean(axis=1)[:, 2] > 0.25)[0]           # without feet, which tell
+    body = cut.with_vertices(cut.vertices @ R.T + 3)
+    marks = person.mesh.vertices[[landmarks()[name] for name in FOUR]]
+    found = camera_like(first, person.mesh.vertices, body, (marks, marks @ R.T + 3) if known else None)
+    assert found.axes[2] @ R @ first.axes[2] > np.cos(np.radians(20 if known else 31))
+
+
+@pytest.mark.parametrize("width", [1400, 420])
+def test_the_instruction_stands_above_the_bodies(folder, person, new_page, width):
+    """Also on a telephone, where it was below the fold; and the question about a far click with its buttons."""
+    app = app_of(folder)
+    app.scans[0].predicted = {"left toe": moved(person.mesh.vertices[landmarks()["left toe"]])}
+    with Server(app) as server:
+        page = new_page(viewport={"width": width, "height": 860})
+        page.goto(server.address)
+        wait_until(page, DRAWN)
+        above = "(() => { const s = document.querySelector('%s').getBoundingClientRect();" \
+            "const c = document.querySelector('canvas').getBoundingClientRect();" \
+            "return s.height > 0 && s.top >= 0 && s.bottom <= c.top + 1 && c.top < 200 })()"
+        wait_until(page, above % ".sk-status")
+        assert page.locator(".sk-status").inner_text().startswith("Click “")
+        place = moved(person.mesh.vertices[landmarks()["right toe"]]) + [0, 0, 0.2]
+        page.evaluate("(place) => program.send('place', place)", {
+            "pane": 1, "name": "left toe", "origin": place.tolist(), "direction": [0, 0, -1]})
+        wait_until(page, above % ".sk-question")
+        page.locator(".sk-question button").filter(has_text="keep").click()
+        wait_until(page, "program.state.question === null && document.querySelector('.sk-question').hidden")
+        assert "left toe" in app.scans[0].places and not page.errors

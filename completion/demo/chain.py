@@ -4,7 +4,7 @@
 """
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -22,10 +22,9 @@ from scanprep.geometry import storage, tables
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
+from scanprep.pipeline.prepare import SCANS, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
 from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
-from scanprep.skeleton.find import SkeletonConfig
 from scanprep.surfaces.template import TemplateConfig, make_template
 from scanprep.synthetic.data_set import (
     SUBJECT,
@@ -39,7 +38,7 @@ from scanprep.synthetic.data_set import (
     write_scan,
 )
 from scanprep.synthetic.people import MARKERS, Person, random_pose, walk
-from scanprep.synthetic.scanner import ScannerConfig, scan
+from scanprep.synthetic.scanner import RangeView, ScannerConfig, scan
 from scanprep.threads import one_thread
 
 from ..mocap.files.markers import MarkerSequence, read_markers, write_markers
@@ -47,9 +46,8 @@ from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion, save_completion
-from .truth import TruthMap
+from .truth import TruthMap, surface_error
 
-PARTS = 16                               # left to itself, the search finds rings at the shoulders, moved by the skin
 TEMPLATE_VIEWS = 12                      # sides from which the careful scan is taken that the template is made of
 LANDMARKS = 7                            # that are marked on the half view
 MARKER_NOISE = 0.001                     # metres
@@ -102,6 +100,15 @@ def write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], fo
 
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
+
+
+def write_views(folder: Path, views: Sequence[RangeView]) -> None:
+    """Range views as `scape prep template` reads them: a mesh each, and where the cameras stood."""
+    names = [f"view_{k:02d}" for k in range(len(views))]
+    for name, view in zip(names, views, strict=True):
+        write_mesh(folder / f"{name}.ply", view.mesh)
+    storage.write_json(folder / "cameras.json", {name: view.camera.tolist()
+                                                 for name, view in zip(names, views, strict=True)})
 
 
 @dataclass(frozen=True)
@@ -167,6 +174,7 @@ class Demo:
                 place = folder / "template_scan"
                 write_scan(place, "rest", careful, self.rest, marks)
                 views = read_views(place / "views" / "rest.npz")
+                write_views(place / "range_views", views)
                 mesh = make_template(views, self.config.faces, settings, progress)
             landmarks = read_landmark_vertices(place / "rest.landmarks.json", mesh)
             write_landmarks(folder / "template.landmarks.json", landmarks)
@@ -188,9 +196,6 @@ class Demo:
     @cached_property
     def prepared(self) -> Prepared:
         """The registered set, with its skeleton."""
-        # registration slides some millimetres along the skin: less than that is not motion. The value was chosen
-        # on these very scans, so the agreement with the true parts shows what can be reached, not what to expect.
-        config = PrepareConfig(skeleton=SkeletonConfig(parts=PARTS, tolerance=0.003))
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
         with workspace(self.folder / "set", self.space.force) as space:
@@ -200,7 +205,7 @@ class Demo:
             for name in stale:
                 space.drop(name)
             with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:
-                done = prepare(tasks, template, marks, space.folder, config, first, second)
+                done = prepare(tasks, template, marks, space.folder, None, first, second)
         if done.failures:
             raise ValueError("; ".join(done.failures))
         return done
@@ -230,6 +235,13 @@ class Demo:
     def truths(self) -> dict[str, GroundTruth]:
         """What stood in the scanner, by the name of the scan."""
         return {s.name: GroundTruth.load(s.truth) for s in self.scans}
+
+    @cached_property
+    def off_surface(self) -> dict[str, np.ndarray]:
+        """Distance (N,) of every registered vertex to the true surface, metres, by the name of the scan."""
+        registered = self.prepared.registered
+        return {name: surface_error(self.template.with_vertices(vertices), self.truths[name])
+                for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
 
     @cached_property
     def person(self) -> Person:

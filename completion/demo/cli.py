@@ -4,12 +4,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
-from scanprep.console import Outcome, bar, say
+from scanprep.console import Outcome, bar
 from scanprep.ranges import Seed
 
 from ..cli import Out
 from .chain import FULL, QUICK, Demo, DemoConfig
+
+NEXT = "open {} in a browser; then your own scans: scape prep run scans --template template.ply -o set"
 
 
 def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False, seed: Seed = DemoConfig.seed,
@@ -27,14 +30,14 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
         full: A large run: more scans, finer.
         seed: Another seed scans other people.
     """
-    from .figures import figures, judge_demo
+    from .figures import figures, judge
     from .page import write_page
 
     if quick and full:
-        raise ValueError("--quick, --full: expected at most one of the two")
+        raise UsageError("--quick, --full: expected at most one of the two")
     run = Demo(space, replace(QUICK if quick else FULL if full else DemoConfig(), seed=seed), bar)
     metrics = figures(run)
+    judgement = judge(run, metrics)
     with bar("drawing the report") as progress, space.staging("page") as staged:
-        write_page(run, metrics, progress, staged.folder)
-    say(f"open {out / 'report.html'} in a browser; {out / 'animation' / 'walk.glb'} in any 3D viewer")
-    return Outcome(out, metrics, {"demo": run.config}, judgement=judge_demo(run))
+        write_page(run, metrics, judgement, progress, staged.folder)
+    return Outcome(out, metrics, {"demo": run.config}, judgement=judgement, following=NEXT.format(out / "report.html"))

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,28 +12,33 @@ from scanprep.console import Metric
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import CLAY, Dots, Heat, Solid, part_colors
-from scanprep.pictures.sheets import save_png, webp_bytes
+from scanprep.pictures.sheets import save_png
 from scanprep.pictures.thinning import thinned
 
 from ..mocap.files.motion_files import write_glb
 from ..motion_pictures import MARKER, chart_residuals, moving_pane, played
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
-from .chain import PARTS, Demo
-from .truth import surface_error
+from .chain import Demo
+from .figures import distance
+from .truth import mean_over_area, surface_error
 
 FAR = 0.01                 # metres at the end of the heat maps
+WORST = 6                  # scans in the table of registrations
 SMALL = 15_000             # triangles of one of many bodies
 
 
-def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], None], to: Path) -> None:
+def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Callable[[int, int], None],
+               to: Path) -> None:
     """Write `report.html`, the animated GLB and pictures into a folder."""
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on synthetic people, whose true shape, pose and correspondence are known.")
-    page.table([(m.name, m.text(), m.unit) for m in metrics], ("against the ground truth", "value", "unit"))
+    page.verdict(judgement, "Next, your own scans: `scape prep run scans --template template.ply -o set`")
+    page.figures(metrics, ("measured against the truth", "value", "unit"))
     stages: tuple[Callable[[Demo, Page], None], ...] = (
         _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),
         partial(_animation, to=to))
@@ -98,28 +102,27 @@ def _registration(demo: Demo, page: Page) -> None:
     page.section("Registration", "The template on the scans: first bent by the landmarks, then drawn to the scan, at "
                  "last following it to its noise.")
     registered = demo.prepared.registered
-    names = registered.names
-    errors = {}
-    meshes = {}
-    for name, vertices in zip(names, registered.vertices(), strict=True):
-        meshes[name] = demo.template.with_vertices(vertices)
-        errors[name] = surface_error(meshes[name], demo.truths[name])
-    order = sorted(names, key=lambda name: -errors[name].mean())
+    meshes = {name: demo.template.with_vertices(vertices)
+              for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
+    means = {name: 1000 * mean_over_area(off, demo.template) for name, off in demo.off_surface.items()}
+    order = sorted(means, key=lambda name: -means[name])
     panes = []
     for name in order[:4]:
-        fits, off = meshes[name].vertices, Heat(errors[name], 0, FAR, "distance to the truth")
+        fits, off = meshes[name].vertices, Heat(demo.off_surface[name], 0, FAR, "distance to the truth")
         panes += [_pane(demo, read_mesh(demo.folder / "scans" / f"{name}.ply"), fits, name),
                   _pane(demo, Solid(meshes[name], off, shades={"plain": np.array(CLAY)}), fits,
-                        f"{1000 * errors[name].mean():.1f} mm from the truth")]
+                        f"{means[name]:.2f} mm from the truth")]
     _in_rows(page, panes, "the worst: the scan, and the template on it")
-    page.table([(f.name, 1000 * f.distance, 1000 * float(errors[f.name].mean()), 100 * f.seen)
-                for f in sorted(demo.prepared.figures, key=lambda f: -errors[f.name].mean())],
-               ("scan", "to the scan (mm)", "to the truth (mm)", "with data (%)"))
+    figures = {one.name: one for one in demo.prepared.figures}
+    page.table([(name, 1000 * figures[name].distance, means[name], 100 * figures[name].seen)
+                for name in order[:WORST]],
+               (f"the worst {min(WORST, len(order))} of {len(order)} scans", "to the scan (mm)", "to the truth (mm)",
+                "with data (%)"))
 
 
 def _skeleton(demo: Demo, page: Page) -> None:
-    page.section("Skeleton", f"The {PARTS} parts that move most rigidly, found from the registered "
-                 "poses of the subject, and the joints between them.")
+    page.section("Skeleton", "The parts that move rigidly, found from the registered poses of the subject without "
+                 "being told how many, and the joints between them.")
     skeleton = demo.model.skeleton
     page.bodies(parts_panes(demo.template, skeleton), "parts and joints")
 
@@ -137,11 +140,11 @@ def _poses(demo: Demo, page: Page) -> None:
     for truth in demo.held_out:
         wanted = demo.truth_map.vertices(truth)
         found = demo.fitted(wanted)
-        error = np.linalg.norm(found - wanted, axis=1)
+        error = distance(found, wanted)
         off = Heat(error, 0, 3 * FAR, "distance of corresponding points")
         panes += [_pane(demo, truth.mesh, found, "truth"),
                   _pane(demo, Solid(demo.template.with_vertices(found), off), found,
-                        f"model, {1000 * error.mean():.1f} mm")]
+                        f"model, {1000 * mean_over_area(error, demo.template):.1f} mm")]
     _in_rows(page, panes, "the truth, and the model beside it")
 
 
@@ -152,16 +155,13 @@ def _completion(demo: Demo, page: Page, to: Path) -> None:
     done = demo.completion
     image = picture_completion(half, done, demo.template)
     save_png(to / "completed" / "completion.png", image)
-    error = np.linalg.norm(done.completed.vertices - demo.truth_map.vertices(truth), axis=1)
+    error = distance(done.completed.vertices, demo.truth_map.vertices(truth))
     names, vertices, points = match_landmarks(demo.template_landmarks, marks)
     scan, whole = completion_panes(half, done, demo.template, landmarks=(vertices, points),
                                    names=dict(zip(vertices.tolist(), names, strict=True)))
-    title = "distance of corresponding points"
-    shades = {title: Heat(error, 0, 3 * FAR, title)}
-    shapes = [replace(shape, shades={**shape.shades, **shades}) if isinstance(shape, Solid) and
-              shape.name == "completed body" else shape for shape in whole.shapes]
-    page.bodies([scan, replace(whole, shapes=shapes)], f"{len(marks)} landmarks and the scan, what became of it, and "
-                "as a colour how far it is from the truth", HEIGHT, webp_bytes(image))
+    off = Solid(done.completed, Heat(error, 0, 3 * FAR, "distance of corresponding points"), name="error")
+    page.bodies([scan, whole, Pane([off], whole.camera, "how far it is from the truth")],
+                f"{len(marks)} landmarks and the scan, what became of it, and its error", HEIGHT)
 
 
 def _animation(demo: Demo, page: Page, to: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
 from model.files import load_model
@@ -16,6 +15,7 @@ from model.measurement.measure import Measurements, measure, stands
 from model.measurement.tapes import Tapes
 from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
 from model.posing.transfer import own_body
+from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.files import write_mesh
@@ -27,7 +27,7 @@ from ..cli import ModelOrNone, read_model
 from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
 from .page import measures_page
 
-BodiesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[BODY ...]")]
+BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
 TOLD = 3                             # reasons of each kind that a judgement names
 
 
@@ -54,7 +54,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     """
     if to:
         if bodies:
-            raise ValueError("--to makes a body from measurements: expected no BODY with it")
+            raise UsageError("--to makes a body from measurements: expected no BODY with it")
         return _wanted(to, output, *read_model(model), landmarks)
     if not bodies:
         raise ValueError("BODY: expected at least one body to measure, or --to with measurements of one to make")
@@ -188,5 +188,5 @@ def read_measurements(words: Sequence[str]) -> dict[str, float]:
         except ValueError:
             sign = ""
         if not sign or not np.isfinite(given[name]):
-            raise ValueError(f"--to: expected name=metres, such as waist=0.85, got {word}")
+            raise UsageError(f"--to: expected name=metres, such as waist=0.85, got {word}")
     return given

@@ -5,8 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
+from scanprep.arguments import Place, UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
@@ -21,7 +20,7 @@ from .folder import FolderCall, body_of, kept_results, told, written
 from .settings import CompletionConfig
 from .work import Inputs, Work, marks_of_template
 
-ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN [SCAN ...]")]
+ScansArg = Annotated[tuple[Path, ...], Place("SCAN [SCAN ...]")]
 AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
         "z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0)}
 
@@ -64,7 +63,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         workers: Who completes the scans of a folder.
     """
     if not scans and not interactive:
-        raise ValueError("SCAN: expected at least one scan, or a folder of scans")
+        raise UsageError("SCAN: expected at least one scan, or a folder of scans")
     if unit == "unknown":
         config, unit = replace(config, free_scale=True), None
     if up is not None:
@@ -82,7 +81,9 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
         say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
     with bar("completing") as progress:
         done = space.run(work, [Task("completion", inputs)], inside=progress).only
-    return Outcome(output, done, {"complete": config, "model": name}, judgement=judgement_of(done))
+    return Outcome(output, done, {"complete": config, "model": name}, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}, then scape measure {output} "
+                                 f"-m {model or 'MODEL.npz'} -o measures.csv")
 
 
 def _folder(call: FolderCall, space: Workspace, workers: Workers) -> Outcome:
@@ -135,5 +136,5 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
 
 def _only(masks: tuple[Path, ...]) -> Path | None:
     if len(masks) > 1:
-        raise ValueError(f"--mask: expected one folder of masks for a folder of scans, got {len(masks)}")
+        raise UsageError(f"--mask: expected one folder of masks for a folder of scans, got {len(masks)}")
     return masks[0] if masks else None

@@ -11,12 +11,13 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import HOME, Results, Task, Workspace
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, failures_of, judgement_of, judgement_of_many
 from scanprep.geometry.files import name_of
-from scanprep.pictures.page import Page
+from scanprep.pictures.page import Page, link_to
 from scanprep.pictures.scene import SCENE, worst_that_turn
 from scanprep.pictures.sheets import small_picture
 from scanprep.pipeline.scans import find_scans
@@ -24,7 +25,7 @@ from scanprep.pipeline.scans import find_scans
 from ..cli import read_model
 from .colors import ColorConfig
 from .settings import CompletionConfig
-from .work import MEANS, Inputs, Work, marks_of_template
+from .work import EXPLAINED, MEANS, Inputs, Work, marks_of_template
 
 GRAVEST = ("failed", "check", "good", "new")                          # verdicts, and what was not completed yet
 PAGE = "page"                        # name of the result that keeps what failed, beside the page
@@ -70,7 +71,7 @@ def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyMod
 def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> dict[str, Inputs]:
     """The scans of a folder by name, with their landmarks, in their folder or its own, and masks of their names."""
     if masks is not None and not masks.is_dir():
-        raise ValueError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
+        raise UsageError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
     found = {}
     for task in find_scans(folder, landmarks):
         mine = sorted(p for p in masks.iterdir() if name_of(p) == task.name) if masks else []
@@ -125,9 +126,9 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
     turning = worst_that_turn([folder / name / SCENE for name in names])
     for name, scene in zip(names, turning, strict=True):
         told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
-        shown = f'<img src="{escape(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
+        shown = f'<img src="{link_to(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
             page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        title = f'<a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>'
+        title = f'<a href="{link_to(name)}/report.html"><b>{escape(name)}</b></a>'
         page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
     return page
 
@@ -135,5 +136,5 @@ def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
 def gravity(metrics: Sequence[Metric]) -> tuple[int, float]:
     """By which scans are sorted: failed ones first, and among equals those whose points the body explains worst."""
     judgement = judgement_of(metrics)
-    explained = next((float(m.value) for m in metrics if m.name == MEANS[1]), 0.0)
+    explained = next((float(m.value) for m in metrics if m.name == EXPLAINED), 0.0)
     return GRAVEST.index("new" if judgement is None else judgement.verdict), explained

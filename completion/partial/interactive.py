@@ -120,7 +120,7 @@ class CompleteApp(PickApp):
         """The template, the scan, and the whole body once there is one."""
         panes = [self.template.pane("the model")]
         if self.scan is not None:
-            panes.append(self.scan.pane(self.scan.path.name))
+            panes.append(self.scan_pane())
             if (result := self._result_pane()) is not None:
                 panes.append(replace(result, label="the whole body"))
         return Message("scene", {}, pack_scene(panes))

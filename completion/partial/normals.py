@@ -3,10 +3,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.sparse import spanning_tree
 from scanprep.threads import search_threads
 
 COARSE = 2000                        # points that show the form at large
@@ -69,8 +69,7 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     kept = distance[:, 1:].ravel() <= reach
     a, b = a[kept], b[kept]
     turn = 1.001 - np.abs(np.einsum("nd,nd->n", normals[a], normals[b]))
-    graph = coo_array((turn, (a, b)), shape=(n, n)).tocsr()
-    tree = minimum_spanning_tree(graph)
+    tree = spanning_tree(a, b, turn, n)
     tree = tree + tree.T
     patches, patch = connected_components(tree, directed=False)
     roots, flipped = np.unique(patch, return_index=True)[1], np.zeros(n, dtype=bool).tolist()

@@ -3,11 +3,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
@@ -128,14 +128,14 @@ def _shades(scan: View | Sequence[View], completion: Completion, masked: np.ndar
     return shades
 
 
-def completion_page(panes: Sequence[Pane], name: str, rows: list[tuple[str, Any, str]], picture: np.ndarray,
+def completion_page(panes: Sequence[Pane], name: str, metrics: Sequence[Metric], picture: np.ndarray,
                     masked: bool = False) -> Page:
-    """The page of `scape complete`: `completion_panes`, name of the scan, rows (metric, value, unit), a picture."""
+    """The page of `scape complete`: `completion_panes`, name of the scan, its figures, a picture."""
     page = Page(f"{name}, completed", "Blue was measured, yellow was filled in by the body model."
                 + (" Violet is clothing or hair: the body is somewhere inside." if masked else ""))
     page.bodies(panes, "Drag to turn. The list of colours shows how far the scan is from the body, and how far each "
                 "part of the surface may be off.", HEIGHT, webp_bytes(picture))
-    page.table(rows, ("metric", "value", "unit"))
+    page.figures(metrics)
     return page.section("What the colours say").text(
         "Distance of the scan: grey has no data. The completed body follows the scan, up to its noise; the predicted "
         "body is the model's own, and where it is far off the model cannot follow.\n\n"

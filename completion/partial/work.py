@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,16 +10,16 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
-from scanprep.console import Metric, Outcome, judgement_of, judgement_row, write_report
+from scanprep.console import Metric, Outcome, details, judgement_of, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
-from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
+from scanprep.geometry.files import PointCloud, common_unit, read_view
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
@@ -34,7 +33,10 @@ from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
 from .worn import worn_markers, write_worn
 
-MEANS = ("distance of the scan to the completed mesh, RMS", "scan points explained", "vertices with data")
+EXPECTED, EXPLAINED = "expected error of the body, mean", "share of the scan that lies on the body"
+MEASURED = "share of the body that was measured"
+LEFT = "what the scan leaves beside the body that was bent onto it, RMS"
+MEANS = (EXPECTED, EXPLAINED, MEASURED, LEFT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,18 +95,16 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
 
     The first says what the completion is worth.
     """
-    with warnings.catch_warnings():
-        if work.config.free_scale:
-            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        depth = read_picture(inputs.scans, work.unit)
-        files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
-        surface = files.mesh or (all_points(files.views) if files.views else None)
-        named = read_landmarks(inputs.landmarks, surface, work.unit) if inputs.landmarks else {}
-        landmarks = _landmarks(work, inputs.landmarks, named)
-        masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
+    unit = "m" if work.config.free_scale else work.unit            # then as it stands in the files
+    depth = read_picture(inputs.scans, work.unit)
+    files = read_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
+    surface = files.mesh or (all_points(files.views) if files.views else None)
+    named = read_landmarks(inputs.landmarks, surface, unit) if inputs.landmarks else {}
+    landmarks = _landmarks(work, inputs.landmarks, named)
+    masked = read_masks(inputs.masks, files, unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
-            raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
+            raise UsageError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
         files = person_in(depth, work.body.template, landmarks)
     scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
@@ -124,11 +124,10 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
     metrics = [judgement_row(done.judgement), *figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
-    rows = [(m.name, m.value, m.unit) for m in metrics]
     name = ", ".join(path.name for path in inputs.scans)
     panes = completion_panes(views, done, work.body.template, masked, landmarks,
                              {vertex: name for name, vertex in work.marks.items()})
-    completion_page(panes, name, rows, picture, masked is not None).write(output / "report.html")
+    completion_page(panes, name, metrics, picture, masked is not None).write(output / "report.html")
     if work.command:
         storage.write(output / SCENE, small_scene(panes))
     return metrics
@@ -137,22 +136,24 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
 def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.ndarray, np.ndarray] | None,
             masked: np.ndarray | None) -> list[Metric]:
     """The rows of the closing table."""
-    rows = [Metric("distance of the scan to the completed mesh, RMS", MM * done.rms, "mm"),
-            Metric("scan points explained", 100 * done.explained, "%"),
-            Metric("vertices with data", 100 * float(done.seen.mean()), "%")]
+    rows = [Metric(EXPLAINED, 100 * done.explained, "%"),
+            Metric(MEASURED, 100 * float(done.seen.mean()), "%")]
+    if done.expected_error is not None:
+        rows.insert(0, Metric(EXPECTED, MM * float(np.nanmean(done.expected_error)), "mm"))
     if landmarks is None:
         rows.append(Metric("landmarks used", "none"))
     else:
         rows += [Metric("landmarks used", len(landmarks[0])),
-                 Metric("distance of landmarks, predicted mesh, RMS", MM * done.landmark_rms, "mm")]
+                 Metric("landmarks to the model's own body, RMS", MM * done.landmark_rms, "mm")]
     if len(inputs.scans) > 1:
         rows.append(Metric("views", len(inputs.scans)))
     if masked is not None:
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
-    return [*rows, Metric("converged", "yes" if done.converged else "no"), Metric("rounds", done.iterations),
-            Metric("model", work.model)]
+    return [*rows, Metric(LEFT, MM * done.rms, "mm"),
+            Metric("model", work.model), *details([Metric("settled", "yes" if done.converged else "no"),
+                                                   Metric("rounds", done.iterations)])]
 
 
 def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> np.ndarray | None:
@@ -162,7 +163,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
     if len(paths) == 1:
         return read_mask(paths[0], all_points(files.views), unit)
     if len(paths) != len(files.views):
-        raise ValueError(f"--mask: expected one file, or one for each of the {len(files.views)} views, "
+        raise UsageError(f"--mask: expected one file, or one for each of the {len(files.views)} views, "
                          f"got {len(paths)}")
     starts = np.cumsum([0, *map(point_count, files.views)])
     points = all_points(files.views)
@@ -186,7 +187,8 @@ def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -
 
 
 def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
-    """Read the views of a scan."""
+    """Read the views of a scan, which share one unit."""
+    unit = common_unit(paths, unit) if len(paths) > 1 else unit
     views = tuple(read_view(path, unit) for path in paths)
     return ScanFiles(views, tuple(read_texture(path, unit) if isinstance(view, Mesh) else None
                                   for path, view in zip(paths, views, strict=True)))
@@ -219,15 +221,3 @@ def marks_of_template(model: BodyModel, given: Path | None, name: str, wanted: b
     if wanted and not kept:
         raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
     return {name: int(vertex) for name, vertex in kept.items()}
-
-
-def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
-    """A mesh, or the points of a file without triangles with the normals and colours that it has."""
-    if path.suffix.lower() in POINT_ENDINGS:
-        return read_points(path, unit)
-    try:
-        return sanitise(read_mesh(path, unit), str(path))
-    except ValueError as error:
-        if "no faces" in str(error):
-            return read_points(path, unit)
-        raise

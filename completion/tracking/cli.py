@@ -6,24 +6,24 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
 from model.linear import Subject
 from model.posing.cli import read_subject
+from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.judgement import Judgement, extent, unit_problem
 from scanprep.ranges import Positive
 
-from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
+from ..cli import ModelOrNone, read_landmark_pairs, read_model
 from ..motion import Motion
 from .folder import FrameFolder, follow_folder
 from .sequence import Tracker, as_motion, tracking_problem
 from .settings import TrackConfig
 
-FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
+FramesArg = Annotated[Path, Place("FRAMES")]
 
 
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
@@ -79,7 +79,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
 
     of_motion = done.key, config.smoothing
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
-    space.step("motion", (of_motion, rows(metrics), frames.name), write)
+    space.step("motion", (of_motion, metrics, frames.name), write)
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
                    judgement=Judgement.of(wrong_size(found, person) or tracking_problem(motion)))
 
@@ -107,4 +107,4 @@ def _page(output: Path, motion: Motion, person: Subject, frames: FrameFolder, na
     def cloud(t: int) -> np.ndarray[Any, Any]:
         return np.concatenate([np.zeros((0, 3)), *(view.points for view in frames[t])])
 
-    track_page(motion, person, cloud, name, frames.numbers, rows(metrics)).write(output / "report.html")
+    track_page(motion, person, cloud, name, frames.numbers, metrics).write(output / "report.html")

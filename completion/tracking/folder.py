@@ -8,14 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.arguments import UsageError
 from scanprep.batch.workspace import Workspace
-from scanprep.geometry.files import MeshFileError, PointCloud, name_of, read_points, write_mesh
+from scanprep.geometry.files import (
+    ENDINGS,
+    EmptyFileError,
+    MeshFileError,
+    PointCloud,
+    common_unit,
+    ending_of,
+    name_of,
+    read_points,
+    write_mesh,
+)
 
 from ..motion import Progress
 from .sequence import TrackedFrame, Tracker, TrackerState, without_points
-
-ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".pcd", ".xyz", ".txt", ".pts")
-NOTHING = ("holds no vertices", "the file is empty")
 
 
 class FrameFolder:
@@ -35,6 +43,7 @@ class FrameFolder:
         self._paths = cameras
         self.numbers = _numbers({n for files in cameras.values() for n in files})
         self.names = tuple(f"{n}" for n in self.numbers)
+        self.unit = common_unit([path for files in cameras.values() for path in files.values()], self.unit)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -54,8 +63,10 @@ class FrameFolder:
     def _read(self, path: Path) -> PointCloud | None:
         try:
             return read_points(path, self.unit)
+        except EmptyFileError:               # the camera saw nothing
+            return None
         except MeshFileError as error:
-            if not any(word in str(error) for word in NOTHING) and str(error) not in self.problems:
+            if str(error) not in self.problems:
                 self.problems.append(str(error))
             return None
 
@@ -74,7 +85,7 @@ def _by_folder(folder: Path) -> dict[str, dict[int, Path]]:
 
 def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
     if "{camera}" not in pattern or "{frame}" not in pattern:
-        raise ValueError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
+        raise UsageError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
     expression = re.escape(pattern).replace(r"\{camera\}", "(?P<camera>.+?)").replace(r"\{frame\}", r"(?P<frame>\d+)")
     found: dict[str, dict[int, Path]] = {}
     for path in sorted(folder.rglob("*")):
@@ -92,7 +103,7 @@ def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
 
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")
-                  and path.name.lower().endswith(ENDINGS))
+                  and ending_of(path) in ENDINGS)
 
 
 def _numbered(paths: list[Path]) -> dict[int, Path]:

@@ -58,7 +58,8 @@ def as_views(cloud: ScanPoints) -> list[PointCloud]:
 
 def _read(view: View, viewpoint: np.ndarray | None, number: int) -> _Points:
     if isinstance(view, Mesh):
-        points, rough = view.vertices, sanitise(view, f"frame: view {number}").vertex_normals if len(view.faces) else None
+        points, sound = view.vertices, sanitise(view, f"frame: view {number}")
+        rough = sound.vertex_normals if len(sound.faces) else None
     elif isinstance(view, PointCloud):
         points, rough = view.points, view.normals
     else:

@@ -1,12 +1,12 @@
 """The page of a tracked motion."""
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from model.linear import Subject
+from scanprep.console import Metric
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
@@ -34,7 +34,7 @@ def tracked_pane(motion: Motion, subject: Subject, cloud: Cloud) -> Pane:
 
 
 def track_page(motion: Motion, subject: Subject, cloud: Cloud, name: str, numbers: list[int],
-               rows: list[tuple[str, Any, str]]) -> Page:
+               metrics: Sequence[Metric]) -> Page:
     """The page of `scape track`; numbers are those of the frames in their files."""
     page = Page(f"{name}, tracked", "The body, and some of the points that were measured in each frame. Where it is "
                 "grey the frame was lost.")
@@ -44,7 +44,7 @@ def track_page(motion: Motion, subject: Subject, cloud: Cloud, name: str, number
     lost = np.array(numbers)[~motion.converged]
     if len(lost):
         page.text("Lost frames: " + _ranges(lost) + ". There the motion is what the frames around it suggest.")
-    return page.section("Figures").table(rows, ("metric", "value", "unit"))
+    return page.section("Figures").figures(metrics)
 
 
 def _ranges(numbers: np.ndarray) -> str:

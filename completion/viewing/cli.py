@@ -4,19 +4,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
+from scanprep.arguments import Alias, Place
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, say
 from scanprep.viewer.cli import Port
 
 from ..cli import ModelOrNone
 
-FilesArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[FILE ...]")]
+FilesArg = Annotated[tuple[Path, ...], Place("[FILE ...]")]
 
 
 def view_files(files: FilesArg = (), model: ModelOrNone = None, over: bool = False, unit: Unit | None = None,
-               serve: Port | None = None, save_in: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path()) -> Outcome:
+               serve: Port | None = None, save_in: Annotated[Path, Alias("-o")] = Path()) -> Outcome:
     """Look at meshes, scans, models, motions and results in the browser, and move models by sliders.
 
     Example: scape view scan.ply completed -m model.npz

@@ -11,12 +11,12 @@ from model.motion.files import is_motion
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import camera_file, is_picture
 from scanprep.geometry import storage
+from scanprep.geometry.files import ENDINGS, ending_of
 from scanprep.geometry.mesh import Mesh
 
 from ..mocap.files.markers import READERS
 from ..mocap.marker_sets.layout import MarkerLayout
 
-SURFACES = (".ply", ".obj", ".stl", ".off", ".glb", ".gz", ".xyz", ".pcd", ".pts", ".txt")
 CACHED = "cached at "                # in reports, before the file of the model of synthetic people
 
 
@@ -36,7 +36,7 @@ def kind_of(path: Path) -> str:
         return "markers"
     if is_picture(path):
         return "picture" if camera_file(path).exists() else f"a picture without {camera_file(path).name} beside it"
-    return "surface" if suffix in SURFACES else f"'{path.suffix or path.name}'"
+    return "surface" if ending_of(path) in ENDINGS else f"'{path.suffix or path.name}'"
 
 
 def reported_model(path: Path) -> Path | None:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
+from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
-from scanprep.cli import Output, Unit
+from scanprep.cli import Output, Person, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
@@ -29,11 +29,11 @@ from .single import Landmarks
 
 FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "score", "starts")
 
-ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
+ScansArg = Annotated[Path, Place("SCANS")]
 
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
-                     first: Path | None = None, subject: str = "template", unit: Unit | None = None,
+                     first: Path | None = None, subject: Annotated[str, Person] = "template", unit: Unit | None = None,
                      config: CoregistrationConfig = CoregistrationConfig(), *, space: Workspace  # noqa: B008
                      ) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 
+from scanprep.arguments import Alias, UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import storage
@@ -45,9 +45,9 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     """
     loaded = load_model(model)
     if poses is None and shapes is None:
-        raise ValueError("nothing to measure: give --poses, --shapes, or both")
+        raise UsageError("nothing to measure: give --poses, --shapes, or both")
     if shapes is None and train_shapes is not None:
-        raise ValueError("--train-shapes serves to judge people: give --shapes too")
+        raise UsageError("--train-shapes serves to judge people: give --shapes too")
     if shapes is not None and not loaded.n_betas:
         raise ValueError(f"{model}: it has no shape components, so it cannot be measured on people")
     nothing: tuple[None, tuple[str, ...]] = (None, ())
@@ -70,8 +70,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     metrics += [Metric("note", note) for note in notes]
     _write_tables(output, loaded, found)
     with bar("drawing the page") as progress:
-        page = evaluation_page(model.stem, loaded, found, [(m.name, m.value, m.unit) for m in metrics
-                                                           if m.name != "note"], notes, progress)
+        page = evaluation_page(model.stem, loaded, found, [m for m in metrics if m.name != "note"], notes, progress)
     page.write(output / "report.html")
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
                                      "train_shapes": train_shapes, "subject": subject},
@@ -88,8 +87,8 @@ def _problems(model: BodyModel, found: Findings) -> list[str]:
 
 
 def sample(model: ModelArg, output: Output,
-           count: Annotated[Count, tyro.conf.arg(aliases=["-n"])] = 9, seed: Seed = 0,
-           pose_too: bool = False, betas: Count | None = None) -> Outcome:
+           count: Annotated[Count, Alias("-n")] = 9, seed: Seed = 0,
+           pose_too: bool = False) -> Outcome:
     """Write random bodies of a model, a sheet of their pictures, and their betas and poses.
 
     Example: scape model sample model.npz -n 9 -o random
@@ -100,12 +99,11 @@ def sample(model: ModelArg, output: Output,
         count: How many bodies.
         seed: The same seed gives the same bodies.
         pose_too: Random poses as well, from the Gaussian of the training poses; else all stand at rest.
-        betas: Vary the first so many shape components only.
     """
     from scanprep.pictures.shading import save_png
 
     loaded = load_model(model)
-    drawn = sample_bodies(loaded, count, np.random.default_rng(seed), pose_too, betas)
+    drawn = sample_bodies(loaded, count, np.random.default_rng(seed), pose_too)
     width = len(str(count))
     for i, vertices in enumerate(drawn.vertices):
         name = f"body_{i + 1:0{width}d}"

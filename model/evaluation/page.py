@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
@@ -37,7 +38,7 @@ class Findings:
     samples: Samples | None = None
 
 
-def evaluation_page(name: str, model: BodyModel, found: Findings, rows: Sequence[tuple[str, Any, str]],
+def evaluation_page(name: str, model: BodyModel, found: Findings, metrics: Sequence[Metric],
                     notes: Sequence[str] = (), tell: Tell | None = None) -> Page:
     """The page, self-contained: the closing table (metric, value, unit), what a reader must know, pictures and curves.
     """
@@ -45,7 +46,7 @@ def evaluation_page(name: str, model: BodyModel, found: Findings, rows: Sequence
                 f"{model.n_betas} shape components, measured on bodies given to it.")
     for note in notes:
         page.text(f"Note: {note}.")
-    page.table(rows, ("metric", "value", "unit"))
+    page.figures(metrics)
     sections = [_pose_section if found.poses else None, _shape_section if found.shapes else None,
                 _space_section if model.n_betas else None]
     wanted = [s for s in sections if s]

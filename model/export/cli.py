@@ -4,17 +4,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from model.priors import sample_poses
+from scanprep.arguments import Called, UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import name_of, write_mesh
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import upright
-from scanprep.ranges import Beta
+from scanprep.ranges import Beta, Positive
 
 from ..body import BodyModel
 from ..cli import ModelArg
@@ -34,16 +35,18 @@ from .usd import USD, write_points_usd, write_skinned_usd
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
-_BONES = _PLACED | {"motion", "root", "names"}
+_BONES = _PLACED | {"motion", "fps", "root", "names"}
 _TAKES = {"glb": _BONES | {"shapes", "correctives"}, "usd": _BONES | {"shapes", "correctives"},
-          "point cache": {"betas", "own_body", "motion", "up"}, "bvh": _BONES | {"unit"}, "npz": {"motion"},
-          "mesh": _PLACED, "folder": {"betas", "own_body", "motion"}}
+          "point cache": {"betas", "own_body", "motion", "fps", "up"}, "bvh": _BONES | {"unit"},
+          "npz": {"motion", "fps"},
+          "mesh": _PLACED, "folder": {"betas", "own_body", "motion", "fps"}}
 
 
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
-           motion: Path | None = None, shapes: int | None = None, correctives: int | None = None,
-           unit: Unit | None = None, up: Literal[0, 1, 2] | None = None, root: str | None = None,
-           names: Names | None = None, ground: bool = False, front: bool = False) -> Outcome:
+           motion: Path | None = None, shapes: Annotated[int | None, Called("--morphs")] = None,
+           correctives: int | None = None, unit: Unit | None = None, up: Literal["x", "y", "z"] | None = None,
+           root: str | None = None, names: Names | None = None, ground: bool = False, front: bool = False,
+           fps: Positive | None = None) -> Outcome:
     """Write a model for other programs; what is written follows from the name of the output.
 
     OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
@@ -73,17 +76,20 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         names: Whose names the bones of a person have: mixamo, vrm, h-anim or opensim.
         ground: Soles on height 0, of the body and of the lowest frame.
         front: Face to the viewer: +z in GLB, USD and BVH, -y of a mesh with z up.
+        fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
     """
-    kind = _kind(output)
+    kind, axis = _kind(output), None if up is None else "xyz".index(up)
     _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "shapes": shapes,
                             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
-                            "names": names, "ground": ground, "front": front})
+                            "names": names, "ground": ground, "front": front, "fps": fps})
     loaded = load_model(model)
     judgement = person_judgement(loaded, np.array(betas)) if betas else Judgement()
     if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded), judgement=judgement)
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
     moves = None if motion is None else read_motion(motion, loaded, chosen)
+    if moves is not None and fps is not None:
+        moves = moves.at_rate(fps)
     if kind == "npz":
         assert moves is not None
         return Outcome(output, _amass(output, model, loaded, moves), judgement=judgement)
@@ -91,18 +97,18 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if kind == "folder":
         return Outcome(output, _folder(output, loaded, person, moves), judgement=judgement)
     if kind == "point cache":
-        return Outcome(output, _points(output, loaded, person, moves, up), judgement=judgement)
+        return Outcome(output, _points(output, loaded, person, moves, axis), judgement=judgement)
     if kind == "mesh":
         rest = np.zeros((len(loaded.skeleton.parents), 3))
         body = loaded.template.with_vertices(loaded.vertices(rest, person))
-        body = standing(body, body, up, ground, front)
+        body = standing(body, body, axis, ground, front)
         write_mesh(output, body)
         return Outcome(output, [Metric("vertices", len(body.vertices)), _size(output)], judgement=judgement)
     if shapes is None:
         # morph targets where nobody says how many
         shapes = 0 if person is None or kind == "bvh" else min(10, loaded.n_betas)
     rig = make_rig(loaded, person, shapes)
-    axis = upright(rig.mesh)[0] if up is None else up
+    axis = upright(rig.mesh)[0] if axis is None else axis
     rig, told = _measured_rig(kind, loaded, person, rig, moves, correctives)
     moves = moves or BodyMotion(np.zeros((0, len(loaded.skeleton.parents), 3)), np.zeros((0, 3)), person, 30.0)
     ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, root, names, ground, front)
@@ -148,14 +154,14 @@ def _refuse_the_rest(kind: str, given: dict[str, object]) -> None:
     wrong = [name for name, value in given.items() if value and name not in _TAKES[kind]]
     if wrong:
         hint = "; name a folder for the meshes of a motion" if (kind, wrong[0]) == ("mesh", "motion") else ""
-        raise ValueError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {kind}{hint}")
+        raise UsageError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {kind}{hint}")
 
 
 def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: BodyMotion | None
             ) -> np.ndarray | None:
     """Betas of the body that is asked for; None is the template's own."""
     if own_body and betas:
-        raise ValueError("--own-body: the template's own body has no betas")
+        raise UsageError("--own-body: the template's own body has no betas")
     if own_body or (moves is not None and moves.betas is None and not betas):
         return None
     if not model.n_betas:
@@ -228,7 +234,7 @@ def _measured_rig(kind: str, model: BodyModel, person: np.ndarray | None, rig: R
     subject = model.subject(person)
     if moves is None:
         if count:
-            raise ValueError("--correctives: expected the motion that they belong to; name it with --motion")
+            raise UsageError("--correctives: expected the motion that they belong to; name it with --motion")
         poses, frames = sample_poses(model, MEASURED, np.random.default_rng(0)), np.arange(MEASURED)
         where = f"{MEASURED} poses of the prior"
     else:

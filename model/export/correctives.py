@@ -14,7 +14,7 @@ from model.priors import sample_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import writing
+from scanprep.geometry.storage import save_arrays
 
 from ..body import BodyModel
 from ..features import RotationLift
@@ -152,8 +152,7 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
     elif draws and J > 1:
         poses = sample_poses(model, draws, np.random.default_rng(0))
         arrays["posedirs"] = pose_directions(rig, poses, model.subject(mean).vertices(poses)).astype(np.float32)
-    with writing(path) as beside, open(beside, "wb") as out:
-        np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    save_arrays(path, arrays)
     return arrays
 
 

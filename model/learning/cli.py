@@ -5,15 +5,16 @@ import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from scanprep.arguments import UsageError
 from scanprep.batch.opening import FileWorkspace
 from scanprep.batch.room import Step, T, inside
 from scanprep.batch.workspace import KeptSteps
-from scanprep.cli import Output, Unit, read_poses
-from scanprep.console import Metric, Outcome, bar
+from scanprep.cli import Output, Person, Unit, read_poses
+from scanprep.console import Metric, Outcome, bar, details
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
@@ -38,7 +39,7 @@ Kind = Literal["scape", "blendscape", "skinning", "mixed"]
 
 
 def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
-          skeleton: Path | None = None, landmarks: Path | None = None, subject: str | None = None,
+          skeleton: Path | None = None, landmarks: Path | None = None, subject: Annotated[str | None, Person] = None,
           unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", by_sex: bool = False,
           scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX,  # noqa: B008
           *, space: FileWorkspace) -> Outcome:
@@ -69,9 +70,9 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         mixed: Settings of a mix.
     """
     if kind == "mixed" and (shapes is not None or by_sex):
-        raise ValueError("--kind mixed: it learns one SCAPE model of --poses alone, without --shapes and --by-sex")
+        raise UsageError("--kind mixed: it learns one SCAPE model of --poses alone, without --shapes and --by-sex")
     if by_sex and (shapes is None or kind != "scape"):
-        raise ValueError("--by-sex: it needs --shapes and the kind scape")
+        raise UsageError("--by-sex: it needs --shapes and the kind scape")
     body, posed = read_poses(poses, template, subject, unit) if kind != "mixed" else _read_mix(poses)
     people = None if shapes is None else read_bodies(shapes, body, unit)[0]
     known = None if not by_sex or shapes is None else _read_sexes(shapes)
@@ -104,13 +105,14 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         kept.save(path)
         _draw(kept, path)
     return Outcome(output, [
-        Metric("kind", models["neutral"].kind), Metric("poses", len(posed)),
-        Metric("people", 0 if people is None else len(people)), Metric("triangles", len(body.faces)),
-        Metric("parts", len(tree.parents)), *about(models["neutral"]),
+        *about(models["neutral"]), Metric("poses", len(posed)),
+        Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
-        *_times(seconds, kept_steps.found)],
+        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)),
+                  *_times(seconds, kept_steps.found)])],
         {"scape": scape, "skinning": skinning, "mixed": mixed}, 
-        judgement=judge_model(models["neutral"], people))
+        judgement=judge_model(models["neutral"], people),
+        following=f"look at it: scape view {output}")
 
 
 def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: Step, progress: Progress) -> Skeleton:

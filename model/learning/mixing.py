@@ -21,7 +21,7 @@ from ..fitting import FitConfig, ShapeFitter
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
-from ..shape_space import ShapeSpace, learn_shape_space
+from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
 from .regression import Design, compress
 from .scape import Progress, Work, check_skeleton, checked_bodies, fit_poses, pose_examples, pose_prior
@@ -125,7 +125,13 @@ def _in_turns(mix: Mix, rounds: int, work: Work) -> tuple[State, ShapeSpace]:
     state = _start(mix)
     for number in range(rounds):
         state = _kept_round(mix, state, number, 1 / rounds, work)
-    return replace(state, S=np.zeros((0, 3, 3))), learn_shape_space(state.S, mix.config.components)
+    return replace(state, S=np.zeros((0, 3, 3))), _shape_space(mix, state)
+
+
+def _shape_space(mix: Mix, state: State) -> ShapeSpace:
+    """The space of the people's shapes, whose volumes are the means of their bodies."""
+    volumes = np.bincount(mix.who, body_volumes(mix.parts.template, mix.bodies)) / np.bincount(mix.who)
+    return learn_shape_space(state.S, mix.config.components, volumes)
 
 
 def held_out_errors(mix: Mix, work: Work) -> list[float]:
@@ -136,7 +142,7 @@ def held_out_errors(mix: Mix, work: Work) -> list[float]:
     state, errors, share = _start(train), list[float](), 0.5 / mix.config.refinements
 
     def error(_: Work) -> float:
-        model = _model(train, state, learn_shape_space(state.S, mix.config.components), {})
+        model = _model(train, state, _shape_space(train, state), {})
         fitter = ShapeFitter(model, FitConfig(sample=400, polish=0))
         return float(np.mean([fitter.fit(y).mean for y in mix.bodies[held]]))
 

@@ -29,7 +29,7 @@ from ..linear import Subject
 from ..pose_space import PoseSpace
 from ..priors import STIFF, stiff_joints
 from ..scape import BlendScapeModel, ScapeModel
-from ..shape_space import ShapeSpace, learn_shape_space
+from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
 from .regression import Design, Judge, by_edges, choose_design, compress, left_out
 
@@ -231,7 +231,8 @@ def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | 
 
     return work.step(
         "shape components", (parts, space, shapes, config.smoothness, config.components), 1 - POSES,
-        lambda inner: learn_shape_space(shape_deformations(parts, space, shapes, config, inner), config.components))
+        lambda inner: learn_shape_space(shape_deformations(parts, space, shapes, config, inner), config.components,
+                                        body_volumes(parts.template, shapes)))
 
 
 def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig, work: Work

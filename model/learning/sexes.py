@@ -16,7 +16,7 @@ from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel
 from ..digests import body_digests, digest
 from ..scape import ScapeModel
-from ..shape_space import ShapeSpace, learn_shape_space
+from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
 from .scape import POSES, Progress, Work, checked_training, learn_pose, seen_in_training, shape_deformations
 
@@ -61,7 +61,9 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
 
     def learn(inner: Work) -> tuple[dict[str, ShapeSpace], dict[str, object] | None]:
         S = shape_deformations(parts, learned.space, people, config, inner)
-        spaces = {name: learn_shape_space(S[chosen], config.components) for name, chosen in groups.items()}
+        volumes = body_volumes(template, people)
+        spaces = {name: learn_shape_space(S[chosen], config.components, volumes[chosen])
+                  for name, chosen in groups.items()}
         if not all(name in groups for name in SEXES):
             return spaces, None
         known = np.isin(sex, SEXES)

@@ -18,7 +18,7 @@ from ..digests import body_digest, digest
 from ..features import LinearLift, PoseFeatures, part_features
 from ..fitting import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import kept_directions
-from ..shape_space import learn_shape_space
+from ..shape_space import body_volumes, learn_shape_space
 from ..skinning import SkinningModel, unblended
 from .regression import ridge_operator
 from .scape import POSES, Progress, Work, checked_training, fit_poses, pose_examples, pose_prior
@@ -253,7 +253,7 @@ def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, wor
         fitter = ShapeFitter(model, quick) if k else PoseFitter(model.subject(), quick)
         people = np.stack([work.step(f"round {k}, person {body_digest(body)}", (model, quick, k, body), share,
                                      partial(_unposed_person, model, fitter, body)) for body in shapes])
-        space = learn_shape_space(people, components)
+        space = learn_shape_space(people, components, body_volumes(model.template, people))
         model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
                         shape_variances=space.variances, shape_total=space.total_variance)
     return model

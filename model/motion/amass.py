@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanprep.geometry.storage import writing
+from scanprep.geometry.storage import save_arrays
 from scanprep.skeleton.tree import Skeleton
 
 from ..export.rig import turn_up
@@ -85,5 +85,4 @@ def write_amass(path: str | Path, poses: np.ndarray, trans: np.ndarray, betas: n
         arrays["pose_hand"] = flat[:, -3 * FINGERS:]
     if J == 55:
         arrays |= {"pose_jaw": flat[:, 66:69], "pose_eye": flat[:, 69:75]}
-    with writing(path) as beside, open(beside, "wb") as out:
-        np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    save_arrays(path, arrays)

@@ -8,6 +8,7 @@ import numpy as np
 
 from scanprep.cli import MM
 from scanprep.console import Metric
+from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 
 from ..body import BodyModel
@@ -35,6 +36,19 @@ class BodyMotion:
     rest: str = ""                   # what is not certain about the rest of its own skeleton
     brought: Retargeted | None = None    # what followed what, and how well, of a motion of another skeleton
     fit: Followed | None = None
+
+    def at_rate(self, rate: float) -> BodyMotion:
+        """The motion with so many frames a second: joints turn the shortest way between frames, places go straight."""
+        if not rate > 0:
+            raise ValueError(f"rate: expected more than 0 frames a second, got {rate}")
+        last = len(self.poses) - 1
+        at = np.arange(int(last * rate / self.rate + 1e-9) + 1) * self.rate / rate          # in frames
+        before = np.minimum(at.astype(int), last)
+        after, share = np.minimum(before + 1, last), (at - before)[:, None]
+        R = rotations.exp(self.poses[before])
+        turn = rotations.log(np.swapaxes(R, -1, -2) @ rotations.exp(self.poses[after]))
+        return replace(self, poses=rotations.log(R @ rotations.exp(share[..., None] * turn)),
+                       trans=(1 - share) * self.trans[before] + share * self.trans[after], rate=rate)
 
     @property
     def told(self) -> list[Metric]:

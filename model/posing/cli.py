@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
+from scanprep.arguments import Alias, Called, Place, UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import rotations
@@ -28,14 +28,15 @@ from ..people import person_judgement
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
-CharacterArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")]
-BodyArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="BODY")]
+CharacterArg = Annotated[Path, Place("MESH")]
+BodyArg = Annotated[Path, Place("BODY")]
 
 
-def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Unit | None = None) -> Outcome:
+def repose(model: ModelArg, body: BodyArg, poses: Annotated[Path, Called("--motion")], output: Output,
+           unit: Unit | None = None) -> Outcome:
     """Put one registered body, with all its detail, into the poses of a motion.
 
-    Example: scape model repose model.npz man.ply --poses walk/motion.npz -o walking
+    Example: scape model repose model.npz man.ply --motion walk/motion.npz -o walking
 
     Args:
         model: Model file.
@@ -60,7 +61,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
         f"the body is {1e3 * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?"))
 
 
-def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
+def character(mesh: CharacterArg, model: Annotated[Path, Alias("-m")], output: Output,
               landmarks: Path | None = None, template_landmarks: Path | None = None, unit: Unit | None = None,
               config: CharacterMeshConfig = CharacterMeshConfig()  # noqa: B008
               ) -> Outcome:
@@ -139,7 +140,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
             raise ValueError(f"{pose}: {name}: expected [x, y, z] in radians, got {turn}") from None
     TURNS.check(turns, f"{pose}: turns")
     if (subject is not None) + bool(betas) + own_body > 1:
-        raise ValueError("--betas, --subject and --own-body: expected one of them")
+        raise UsageError("--betas, --subject and --own-body: expected one of them")
     if subject is not None or own_body:
         vertices = read_subject(loaded, subject).vertices(turns)
     elif not loaded.n_betas:

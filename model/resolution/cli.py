@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from model.priors import sample_poses
+from scanprep.arguments import UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import read_mesh
@@ -37,7 +38,7 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         config: Settings.
     """
     if (template is None) == (vertices is None):
-        raise ValueError("--template and --vertices: expected one of them")
+        raise UsageError("--template and --vertices: expected one of them")
     loaded = load_model(model)
     mesh = resample(loaded.template, vertices) if vertices is not None else read_mesh(Path(str(template)), unit)
     with bar("transferring the model") as progress:

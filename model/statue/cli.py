@@ -4,12 +4,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
+from scanprep.arguments import Place
 from scanprep.command_line import dispatch
 
-StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
-MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]
+StatueArg = Annotated[Path, Place("STATUE")]
+MotionArg = Annotated[Path, Place("MOTION")]
 LevelArg = Literal[0, 1, 2, 3, 4]
 
 COMMANDS = {

@@ -2,13 +2,13 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from scanprep.arguments import UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
@@ -27,7 +27,6 @@ from scanprep.console import (
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sanitise import sanitise
 from scanprep.judgement import NAMED, Judgement, beyond_people
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
@@ -35,6 +34,7 @@ from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
 from scanprep.skeleton.roles import in_words
+from scanprep.surfaces.cloud import read_surface
 
 from ..files import load_model
 from ..motion.onto import read_motion
@@ -90,13 +90,15 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
     work = Work(humanoid() if control is None else read_control(control), config, unit)
     if not scan.is_dir():
         if features is None and control is not None:
-            raise ValueError("--control: expected --features with the joints of that control model; only the generic "
+            raise UsageError("--control: expected --features with the joints of that control model; only the generic "
                              "humanoid is found by itself")
         with bar("fitting the statue") as progress:
             done = space.run(work, [Task("statue", ScanTask("statue", scan, features))], inside=progress).only
-        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done))
+        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}, then "
+                                 f"scape statue animate {output} walk.bvh -o walking")
     if features is not None and not features.is_dir():
-        raise ValueError(f"--features: expected a folder for a folder of scans, got {features}")
+        raise UsageError(f"--features: expected a folder for a folder of scans, got {features}")
     work = replace(work, command=f"scape statue fit {scan}")
     found = [one if features else replace(one, landmarks=None) for one in find_scans(scan, features)]
     with bar("fitting statues") as progress:
@@ -151,7 +153,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
             Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]
     picture = statue_picture(scan, statue, levels[-1])
     save_png(folder / "picture.png", picture)
-    statue_page(name, scan, statue, levels, [(m.name, m.value, m.unit) for m in rows], adaptive, in_motion(statue),
+    statue_page(name, scan, statue, levels, rows, adaptive, in_motion(statue),
                 picture).write(folder / "report.html")
     return rows
 
@@ -182,10 +184,8 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     Without a unit it is metres where features are given, which may be on anything, else that of a person.
     """
     sought = unit is None and inputs.landmarks is None
-    with warnings.catch_warnings():
-        if sought:
-            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        scan, texture = sanitise(read_mesh(inputs.scan, unit), str(inputs.scan)), read_texture(inputs.scan, unit)
+    unit = "m" if sought else unit
+    scan, texture = read_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
     metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
@@ -290,7 +290,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     detailed = Reconstruction(control, loaded.map, fine)
     if model is None:
         if registered is not None:
-            raise ValueError("--registered: expected --model with it")
+            raise UsageError("--registered: expected --model with it")
         moved = read_statue_motion(loaded, motion)
         bodies, rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
         output.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.camera import Camera
@@ -55,15 +56,15 @@ def first_panes(scan: Mesh, statue: Statue, level: Level) -> list[Pane]:
             Pane([level.mesh], camera, f"reconstruction, {level.name}")]
 
 
-def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], rows: list[tuple[str, Any, str]],
+def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], metrics: Sequence[Metric],
                 adaptive: Level, frames: Sequence[tuple[str, Mesh]], picture: np.ndarray) -> Page:
-    """The page of `scape statue fit`: levels, coarsest first, rows of the table, the statue in other poses."""
+    """The page of `scape statue fit`: levels, coarsest first, the figures, the statue in other poses."""
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
     page.bodies(first_panes(scan, statue, levels[-1]), THINNED + " The control mesh can also be coloured by what the "
                 "scan told: blue was measured, red is folded, not one-to-one with it, yellow is a hole of the scan.",
                 HEIGHT, webp_bytes(picture))
-    page.table(rows, ("metric", "value", "unit"))
+    page.figures(metrics)
     page.section("Joints", "Red: joint centres. Blue: feature points of the control model.")
     page.bodies([_inside(scan, statue)], height=HEIGHT)
     page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "

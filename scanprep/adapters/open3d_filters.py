@@ -9,6 +9,9 @@ import numpy as np
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 
+NEIGHBOURS = 20                        # points that tell a normal, and to which it is oriented
+DEEPEST = 10                           # octree of Poisson reconstruction: cells of 2 mm on a person
+
 
 class MissingLibrary(ImportError):
     """A library that a setting asks for is not there, or not the system's libraries it stands on."""
@@ -30,6 +33,35 @@ def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     cloud.normals = o3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
     closed, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return recolored(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
+
+
+def oriented_normals(points: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3) of points (n, 3), metres, that face the same way along the surface; inward or outward."""
+    o3d = library("open3d")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+    cloud.orient_normals_consistent_tangent_plane(NEIGHBOURS)
+    return np.asarray(cloud.normals).copy()
+
+
+def screened_poisson(points: np.ndarray, normals: np.ndarray, spacing: float) -> Mesh:
+    """A surface by screened Poisson reconstruction, its cells as large as the spacing of the points, metres."""
+    o3d = library("open3d")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
+    cloud.normals = o3d.utility.Vector3dVector(np.array(normals))
+    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(points, axis=0).max() / spacing)), 6, DEEPEST))
+    found, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
+
+
+def ball_pivoting(points: np.ndarray, normals: np.ndarray, spacing: float) -> Mesh:
+    """Triangles between the points where balls of 1.5, 2.5 and 4 times their spacing come to rest on three of them."""
+    o3d = library("open3d")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
+    cloud.normals = o3d.utility.Vector3dVector(np.array(normals))
+    radii = o3d.utility.DoubleVector([1.5 * spacing, 2.5 * spacing, 4.0 * spacing])
+    found = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
+    return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
 
 
 def recolored(mesh: Mesh, source: Mesh) -> Mesh:

@@ -161,4 +161,4 @@ def views_problem(found: AlignedViews) -> str | None:
     if found.trusted.any():
         return None
     return (f"no view is in its place, they share {100 * float(found.overlap.max()):.0f}% of their surface at most; "
-            "the wrong cameras, another unit (--unit), or a start that is too far off (--landmarks, --features)?")
+            "the wrong cameras, another unit (--unit), or a start that is too far off (--landmarks, --by-shape)?")

@@ -9,6 +9,7 @@ import time
 import weakref
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,8 @@ class Digests:
             return self.of([(name, path / name) for name in names if not f"/{name}".count("/.")])
         try:
             stat = path.stat()
+            if not S_ISREG(stat.st_mode):        # a pipe or device may never end
+                return "missing"
             now = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
             key = str(path.absolute())
             known = self._known.get(key)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -12,11 +11,12 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh
 from ..geometry.places import spacing
 from ..geometry.sanitise import sanitise
-from ..ranges import FLAG, Settings
+from ..ranges import Settings
 from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
-MUTUAL, SPARSE = 4, 3.0              # neighbours of a point where points are few, and how far off, in links
+MUTUAL, SPARSE = 6, 3.0              # neighbours of a point where points are few, and how far off, in links
+STEPS = 5.0                          # spacings between the steps of a depth camera on a surface that it sees slantwise
 # a piece left out that is so large against the body, and has so many of its points, may be a person: a child has half
 SECOND = (0.5, 0.25)
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
@@ -29,7 +29,8 @@ class CleanScanConfig(Settings):
     Attributes
     ----------
     gap : float, metres
-        Pieces closer than this to the body belong to it: hands and feet that the scanner saw apart.
+        Pieces closer than this to the body, or to one that belongs to it, belong to it too: hands and feet that the
+        scanner saw apart. Of a coarse scan at least `STEPS` times its spacing.
     min_points : int
         Smaller pieces are specks, wherever they are.
     planes : int
@@ -40,7 +41,7 @@ class CleanScanConfig(Settings):
         Points closer than this many times the median distance between neighbouring places belong together.
     """
 
-    gap: Annotated[float, FLAG] = 0.03
+    gap: float = 0.03
     min_points: int = 30
     planes: int = 3
     floor_area: float = 0.1
@@ -118,7 +119,8 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     points = mesh.vertices
     if not len(points):
         raise ValueError("scan: expected points, got none")
-    link = max(0.012, config.spacings * spacing(points))            # whether triangles join them or not
+    step = spacing(points)
+    link = max(0.012, config.spacings * step)                       # whether triangles join them or not
     label, planes = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):
@@ -132,13 +134,15 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     row_of[large] = np.arange(len(large))
     label[rest] = len(planes) + row_of[piece]
     body = cKDTree(points[rest[piece == main]])
+    near = _near_pieces([points[rest[piece == number]] for number in large], int(np.flatnonzero(large == main)[0]),
+                        max(config.gap, STEPS * step))
     rows = []
     for number in range(int(label.max()) + 1):
         mine = label == number
-        old = large[number - len(planes)] if len(planes) <= number < len(planes) + len(large) else None
-        gap = 0.0 if old == main else _gap(body, points[mine])
-        reason = (FLOOR if number < len(planes) else SPECKS if old is None else why if old == main
-                  else NEAR if gap <= max(config.gap, link) else FAR)
+        old = number - len(planes) if len(planes) <= number < len(planes) + len(large) else None
+        reason = (FLOOR if number < len(planes) else SPECKS if old is None else why if large[old] == main
+                  else NEAR if near[old] else FAR)
+        gap = 0.0 if reason == why else _gap(body, points[mine])
         rows.append(_component(mesh, mine, gap, reason in (why, NEAR), reason))
     kept = np.array([row.kept for row in rows])[label]
     floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
@@ -215,6 +219,17 @@ def _body_of(points: np.ndarray, piece: np.ndarray, config: CleanScanConfig, lan
         large = np.ones(len(piece), dtype=bool)
     found = piece[large][cKDTree(points[large]).query(np.reshape(landmarks, (-1, 3)))[1]]
     return int(np.bincount(found).argmax()), LANDMARKS
+
+
+def _near_pieces(clouds: list[np.ndarray], main: int, gap: float) -> np.ndarray:
+    """(n,) bool: pieces (m, 3) that a chain of pieces, each within `gap` metres of the next, joins to the main one."""
+    near = np.arange(len(clouds)) == main
+    last = near.copy()
+    while last.any():
+        tree = cKDTree(np.concatenate([clouds[i] for i in np.flatnonzero(last)]))
+        last = np.array([not seen and _gap(tree, cloud) <= gap for seen, cloud in zip(near, clouds, strict=True)])
+        near |= last
+    return near
 
 
 def _gap(body: cKDTree, points: np.ndarray) -> float:

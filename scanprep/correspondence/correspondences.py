@@ -88,6 +88,7 @@ def read_correspondences(path: str | Path) -> Correspondences:
                                 {name: np.nan if value is None else float(value)
                                  for name, value in stored.get("energies", {}).items()},
                                 bool(stored.get("converged", True)))
-        if (found.template_vertices < 0).any() or not (np.abs(found.scan_points) <= FARTHEST).all():
-            raise ValueError("a vertex below 0, or a point without end")
+        if (found.template_vertices < 0).any() or not (np.abs(found.scan_points) <= FARTHEST).all() \
+                or not np.isfinite(found.confidence).all():
+            raise ValueError("a vertex below 0, a point without end, or a confidence that is no number")
         return found

@@ -3,10 +3,11 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from ..geometry.farthest_points import farthest_points, thin
+from ..geometry.sparse import spanning_tree
 from ..geometry.target import Target
 
 
@@ -109,8 +110,7 @@ def _joined(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_arra
             best = int(distance.argmin())
             found.append((k, int(np.flatnonzero(large == b)[0]), mine[near[best]], other[best], distance[best]))
     ka, kb, i, j, length = (np.array(column) for column in zip(*found, strict=True))
-    cost = coo_array((length + 1e-9, (ka, kb)), shape=(len(large), len(large)))
-    chosen = minimum_spanning_tree(csr_array(cost)).tocoo()
+    chosen = spanning_tree(ka, kb, length + 1e-9, len(large)).tocoo()
     used = np.isin(ka * len(large) + kb, chosen.row * len(large) + chosen.col)
     return graph + _symmetric(i[used].astype(np.int64), j[used].astype(np.int64), length[used], len(points))
 
@@ -125,7 +125,7 @@ def _oriented(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarr
                          np.abs(np.einsum("nd,nd->n", normals[j], along)))
     cost = 1.001 - np.abs(np.einsum("nd,nd->n", normals[i], normals[j])) + 2 * through**2
     n = len(points)
-    tree = minimum_spanning_tree(csr_array(coo_array((cost, (i, j)), shape=(n, n))))
+    tree = spanning_tree(i, j, cost, n)
     tree = csr_array(tree + tree.T)
     normals, todo = normals.copy(), np.ones(n, dtype=bool)
     while todo.any():

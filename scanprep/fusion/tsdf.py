@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
 from ..geometry.surface import Rays, barycentric, mesh_and_camera
-from ..ranges import FLAG, Cell, Cosine, Range, Settings, Share
+from ..ranges import Cell, Cosine, Range, Settings, Share
 from ..repair.manifold import drop_small_components, split_vertices
 
 BLOCK = 4                      # voxels along the side of a block; the smallest piece of the volume that is stored
@@ -37,10 +37,10 @@ class MergeConfig(Settings):
         Pieces with a smaller share of the vertices of the largest one are dropped.
     """
 
-    voxel: Annotated[Cell, FLAG] = 0.004
+    voxel: Cell = 0.004
     truncation: Annotated[float, Range(1, BLOCK)] = 3.0
     min_cosine: Cosine = 0.1
-    carving: Annotated[float, FLAG] = 0.0
+    carving: float = 0.0
     min_component: Share = 0.02
 
 
@@ -225,8 +225,8 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     local = np.searchsorted(used, cells)
     values = distance[used]
     values[np.abs(values) < 1e-4 * voxel] = 1e-4 * voxel   # a surface through a corner would make flat triangles
-    vertices, faces, _ = igl.marching_cubes(values, np.ascontiguousarray(points[used]),
-                                            np.ascontiguousarray(local, dtype=np.int64), 0.0)
+    vertices, faces = igl.marching_cubes(values, np.ascontiguousarray(points[used]),
+                                         np.ascontiguousarray(local, dtype=np.int64), 0.0)[:2]
     return Mesh(vertices, faces)
 
 

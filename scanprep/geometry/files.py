@@ -9,25 +9,33 @@ from __future__ import annotations
 import gzip
 import re
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from . import format_glb, format_pcd, format_ply, format_stl, format_text, storage
-from .format_common import UNITS, Contents, MeshFileError, check_extent, load_bytes, metres_per_unit
+from . import format_draco, format_foreign, format_glb, format_pcd, format_ply, format_stl, format_text, storage
+from .format_common import (
+    UNITS,
+    Contents,
+    EmptyFileError,
+    MeshFileError,
+    check_extent,
+    load_bytes,
+    metres_per_unit,
+)
 from .mesh import Mesh
 from .sanitise import sanitise
 from .seams import merged_mean, seams_closed
+from .thinning import thin_scan
 
-__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "name_of", "read_mesh",
-           "read_points", "read_registered", "read_scan", "write_mesh", "write_points"]
+__all__ = ["ENDINGS", "SCAN_ENDINGS", "UNITS", "EmptyFileError", "MeshFileError", "PointCloud", "Registered",
+           "common_unit", "ending_of", "list_meshes", "name_of", "read_mesh", "read_points", "read_registered",
+           "read_scan", "read_scan_mesh", "read_view", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
-
-POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
 
 
 # an ending has a letter and no space: `.05` and `.01 anna` belong to the name; some endings are two
@@ -57,16 +65,32 @@ def name_of(path: str | Path) -> str:
 
 class _Format(NamedTuple):
     read: Callable[[Path, bytes], Contents]
-    encode: Callable[[Contents, bool], bytes]         # with coordinates in double precision, or not
+    encode: Callable[[Contents, bool], bytes] | None = None     # with coordinates in double precision, or not
 
 
-_PLY, _ROWS = _Format(format_ply.read, format_ply.encode), _Format(format_text.read_xyz, format_text.encode_xyz)
-_MESHES = {".ply": _PLY, ".obj": _Format(format_text.read_obj, format_text.encode_obj),
+# What is read here, by ending: a new format is a module and a line. `_MESHES` may hold triangles, `_POINTS` never do.
+_ROWS = _Format(format_text.read_xyz, format_text.encode_xyz)
+_MESHES = {".ply": _Format(format_ply.read, format_ply.encode),
+           ".obj": _Format(format_text.read_obj, format_text.encode_obj),
            ".stl": _Format(format_stl.read, format_stl.encode),
            ".off": _Format(format_text.read_off, format_text.encode_off),
-           ".glb": _Format(format_glb.read, format_glb.encode)}
-_POINTS = {".ply": _PLY, ".pcd": _Format(format_pcd.read, format_pcd.encode), ".xyz": _ROWS, ".txt": _ROWS,
-           ".pts": _ROWS}
+           ".glb": _Format(format_glb.read, format_glb.encode), ".gltf": _Format(format_glb.read_gltf),
+           ".drc": _Format(format_draco.read),
+           **{ending: _Format(format_foreign.read) for ending in format_foreign.MESHES}}
+_POINTS = {".pcd": _Format(format_pcd.read, format_pcd.encode), ".xyz": _ROWS, ".pts": _ROWS, ".txt": _ROWS,
+           ".asc": _Format(format_text.read_xyz), ".csv": _Format(format_text.read_xyz),
+           **{ending: _Format(format_foreign.read) for ending in format_foreign.POINTS}}
+_FORMATS = {**_MESHES, **_POINTS}
+
+ENDINGS = tuple(_FORMATS)
+# in a folder, text may be notes and tables as well as points
+SCAN_ENDINGS = tuple(ending for ending in ENDINGS if ending not in (".txt", ".csv"))
+
+
+def ending_of(path: str | Path) -> str:
+    """The ending of a name in small letters, that of what is packed in `.ply.gz`; empty where there is none."""
+    path = Path(path)
+    return (Path(path.stem) if path.suffix.lower() == ".gz" and Path(path.stem).suffix else path).suffix.lower()
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
@@ -75,33 +99,45 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     Parameters
     ----------
     path : str or Path
-        PLY, OBJ, STL, OFF or GLB, also packed as `.ply.gz`.
+        PLY, OBJ, STL, OFF, GLB, glTF or Draco (`.drc`), also packed as `.ply.gz`; through pymeshlab 3MF, DAE, 3DS, X3D,
+        WRL and others.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. When it is not given metres are assumed, with a UserWarning where the mesh would be
-        larger than 10 m or smaller than 0.1 m.
+        Unit of the file. When it is not given: the one other than metres in which the mesh is as large as a person,
+        with a UserWarning; else metres, with one where it would be larger than 10 m or smaller than 0.1 m.
 
     Returns
     -------
     Mesh
         In metres. From STL, which has no vertices of its own, equal corners make one vertex. In other formats the
         borders that run through the very same places are closed: a vertex that is repeated there becomes the first
-        of its place, with the mean of their colours, and `of_file` tells which. Other vertices stay as they are. A
-        UserWarning says so, and names the objects of a file that holds several.
+        of its place, with the mean of their colours, and `of_file` tells which. Vertices that are not finite are left
+        out with their triangles. Other vertices stay as they are. A UserWarning says so, and names the objects of a
+        file that holds several.
 
     Raises
     ------
     MeshFileError
-        Missing, truncated or of another format, no triangles, a coordinate that is not finite, a face that
-        refers to a vertex that is not there.
+        Missing, truncated or of another format, no triangles, a face that refers to a vertex that is not there.
     """
     path = Path(path)
-    contents = _read(path, _MESHES)
-    if contents.faces is None or not len(contents.faces):
+    contents = _read(path)
+    if not _has_faces(contents):
         raise MeshFileError(f"{path}: expected a mesh, found {len(contents.vertices)} vertices and no faces")
+    return _mesh(path, contents, unit)
+
+
+def _has_faces(contents: Contents) -> bool:
+    return contents.faces is not None and len(contents.faces) > 0
+
+
+def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
+    """The mesh of a file, in metres and with its seams closed."""
+    assert contents.faces is not None, "only files with triangles are meshes"
     try:
-        mesh = _seamless(path, Mesh(contents.vertices, contents.faces, contents.colors))
+        mesh = Mesh(contents.vertices, contents.faces, contents.colors, contents.of_file)
     except ValueError as error:
         raise MeshFileError(f"{path}: {error}") from None
+    mesh = _seamless(path, mesh)
     if len(contents.objects) > 1:
         told = ", ".join(f"{name} ({count} triangles)" for name, count in contents.objects[:6])
         more = ", ..." if len(contents.objects) > 6 else ""
@@ -119,7 +155,11 @@ def _seamless(path: Path, mesh: Mesh) -> Mesh:
     colors = None if mesh.colors is None else merged_mean(mesh.colors, vertex_of)
     warnings.warn(f"{path}: {len(vertex_of) - len(first)} of {len(vertex_of)} vertices repeat others along seams "
                   "(flat shading or textures) and were merged with them", stacklevel=3)
-    return Mesh(mesh.vertices[first], vertex_of[mesh.faces], colors, vertex_of)
+    if mesh.of_file is not None:             # -1 of what was left out before
+        vertex_of_file = np.where(mesh.of_file < 0, -1, vertex_of[mesh.of_file])
+    else:
+        vertex_of_file = vertex_of
+    return Mesh(mesh.vertices[first], vertex_of[mesh.faces], colors, vertex_of_file)
 
 
 def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") -> None:
@@ -157,7 +197,8 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     Parameters
     ----------
     path : str or Path
-        PLY, PCD, text (`.xyz`, `.txt`, `.pts`) or any format of `read_mesh`.
+        PLY, PCD, text (`.xyz`, `.txt`, `.pts`, `.asc`, `.csv`), through pymeshlab E57 and PTX, or any format of
+        `read_mesh`.
     unit : 'm', 'mm', 'cm' or 'in', optional
         As for `read_mesh`.
 
@@ -165,17 +206,19 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     -------
     PointCloud
         Normals are those of the file, zero where they are not finite, or of the triangles where there are triangles.
+        Points that are not finite are left out, with a UserWarning.
 
     Raises
     ------
     MeshFileError
-        Missing, truncated or of another format, no points, a coordinate that is not finite.
+        Missing, truncated or of another format, no points.
     """
     path = Path(path)
-    contents = _read(path, {**_MESHES, **_POINTS})
-    bad = np.flatnonzero(~np.isfinite(contents.vertices).all(axis=1))
-    if len(bad):
-        raise MeshFileError(f"{path}: {len(bad)} points are not finite, the first is point {bad[0]}")
+    return _cloud(path, _read(path), unit)
+
+
+def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
+    """The points of a file in metres, with unit normals where the file has some or there are triangles."""
     points = metres_per_unit(path, contents.vertices, unit) * contents.vertices
     normals = contents.normals
     if normals is not None:
@@ -185,21 +228,53 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     return PointCloud(points, normals, contents.colors)
 
 
+def read_scan_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """A mesh as a scan: thinned where it is finer than any work needs, its triangles made sound; both are told."""
+    return _sound(Path(path), read_mesh(path, unit))
+
+
+def _sound(path: Path, mesh: Mesh) -> Mesh:
+    return sanitise(thin_scan(mesh, str(path)), str(path))
+
+
+def read_view(path: str | Path, unit: str | None = None) -> Mesh | PointCloud:
+    """A scan as `read_scan_mesh`, or the points of a file without triangles with the normals and colours it has."""
+    path = Path(path)
+    contents = _read(path)
+    return _sound(path, _mesh(path, contents, unit)) if _has_faces(contents) else _cloud(path, contents, unit)
+
+
 def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
-    """A scan as a mesh, its triangles made sound (`sanitise`), or as points (n, 3) where the file has no triangles."""
-    if Path(path).suffix.lower() in POINT_ENDINGS:
-        return read_points(path, unit).points
-    try:
-        return sanitise(read_mesh(path, unit), str(path))
-    except ValueError as error:
-        if "no faces" in str(error):
-            return read_points(path, unit).points
-        raise
+    """A scan as `read_scan_mesh`, or as points (n, 3) where the file has no triangles."""
+    view = read_view(path, unit)
+    return view if isinstance(view, Mesh) else view.points
+
+
+def common_unit(paths: Sequence[Path], unit: str | None = None) -> str | None:
+    """One unit for files that belong together, as views, frames or registered meshes do.
+
+    That given, else that of the first file that can be read, where it tells one (`likely_unit`), with a UserWarning.
+    A smaller part of a person, or a child, is then in the unit of the others.
+    """
+    for path in () if unit is not None else paths:
+        try:
+            points = read_points(path, unit="m").points
+        except MeshFileError:                # whoever reads it says so
+            continue
+        scale = metres_per_unit(path, points, None)
+        return next((name for name in UNITS if UNITS[name] == scale), None) if scale != 1 else None
+    return unit
 
 
 def write_points(path: str | Path, cloud: PointCloud) -> None:
     """Write points in metres, whole or not at all: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
-    _write(Path(path), Contents(cloud.points, None, cloud.normals, cloud.colors), "double", _POINTS)
+    contents = Contents(cloud.points, None, cloud.normals, cloud.colors)
+    _write(Path(path), contents, "double", {".ply": _MESHES[".ply"], **_POINTS})
+
+
+def is_scan(path: Path) -> bool:
+    """Whether a name is that of a mesh or a point cloud."""
+    return ending_of(path) in ENDINGS
 
 
 def list_meshes(folder: str | Path) -> list[Path]:
@@ -209,7 +284,7 @@ def list_meshes(folder: str | Path) -> list[Path]:
         problem = "expected a folder, found a file" if folder.exists() else "no such folder"
         raise MeshFileError(f"{folder}: {problem}")
     inside = folder / "meshes" if (folder / "set.json").is_file() else folder
-    paths = sorted(p for p in inside.glob("*") if not p.name.startswith(".") and _suffix(p) in _MESHES)
+    paths = sorted(p for p in inside.glob("*") if not p.name.startswith(".") and ending_of(p) in _MESHES)
     if not paths:
         raise MeshFileError(f"{inside}: expected meshes ({', '.join(_MESHES)}), found none")
     return paths
@@ -226,7 +301,7 @@ class Registered(NamedTuple):
 def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
     """Every mesh of a folder, or of a RegisteredSet, sorted by name; MeshFileError where one has other triangles."""
     paths = list_meshes(folder)
-    meshes = []
+    unit, meshes = common_unit(paths, unit), []
     for path in paths:
         meshes.append(read_mesh(path, unit))
         check_same_topology(path, meshes[-1], paths[0], meshes[0])
@@ -246,36 +321,50 @@ def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -
                             f"expected {first.faces[k].tolist()}, found {mesh.faces[k].tolist()}")
 
 
-def _suffix(path: Path) -> str:
-    suffixes = [s.lower() for s in path.suffixes]
-    return suffixes[-2] if len(suffixes) > 1 and suffixes[-1] == ".gz" else "".join(suffixes[-1:])
-
-
-def _format(path: Path, formats: dict[str, _Format]) -> _Format:
-    suffix = _suffix(path)
-    if suffix not in formats:
-        found = f"'{suffix}'" if suffix else "none"
-        raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found {found}")
-    return formats[suffix]
-
-
-def _read(path: Path, formats: dict[str, _Format]) -> Contents:
-    if path.is_file():
-        _format(path, formats)           # a wrong name is told even of a file that holds nothing
-    data = load_bytes(path)
-    contents = _format(path, formats).read(path, data)
+def _read(path: Path) -> Contents:
+    """What a file of any format holds, without what is not finite."""
+    storage.check_regular(path, MeshFileError)
+    ending = ending_of(path)
+    if ending not in _FORMATS:           # also of a file that holds nothing
+        raise MeshFileError(f"{path}: expected a name ending in {', '.join(ENDINGS)}, found {ending or 'none'!r}"
+                            f"{format_foreign.advice(ending)}")
+    contents = _FORMATS[ending].read(path, load_bytes(path))
     if not len(contents.vertices):
-        raise MeshFileError(f"{path}: the file holds no vertices")
+        raise EmptyFileError(f"{path}: the file holds no vertices")
+    contents = _finite(path, contents)
     check_extent(path, "vertex", contents.vertices)
-    if contents.colors is not None and not np.isfinite(contents.colors).all():
-        raise MeshFileError(f"{path}: expected colours that are finite numbers, found others")
     return contents
+
+
+def _finite(path: Path, contents: Contents) -> Contents:
+    """Without the points that are not finite and their triangles, and without colours where one is not finite."""
+    if contents.colors is not None and not np.isfinite(contents.colors).all():
+        warnings.warn(f"{path}: colours that are not finite numbers; all colours were left out", stacklevel=2)
+        contents = replace(contents, colors=None)
+    finite = np.isfinite(contents.vertices).all(axis=1)
+    if finite.all():
+        return contents
+    if not finite.any():
+        raise EmptyFileError(f"{path}: none of its {len(finite)} points is finite")
+    of_file, faces, lost = np.where(finite, np.cumsum(finite) - 1, -1), contents.faces, ""
+    if faces is not None:
+        kept = finite[faces].all(axis=1)
+        faces, lost = of_file[faces[kept]], f", with {np.count_nonzero(~kept)} triangles" * (not kept.all())
+    warnings.warn(f"{path}: {np.count_nonzero(~finite)} of {len(finite)} points are not finite and were left out{lost}",
+                  stacklevel=2)
+    colors, normals = (None if values is None else values[finite] for values in (contents.colors, contents.normals))
+    return replace(contents, vertices=contents.vertices[finite], faces=faces, colors=colors, normals=normals,
+                   of_file=of_file)
 
 
 def _write(path: Path, contents: Contents, precision: Precision, formats: dict[str, _Format]) -> None:
     if precision not in ("double", "single"):
         raise ValueError(f"precision: expected 'double' or 'single', got {precision!r}")
-    data = _format(path, formats).encode(contents, precision == "double")
+    writers = {ending: one.encode for ending, one in formats.items() if one.encode is not None}
+    if ending_of(path) not in writers:
+        raise MeshFileError(f"{path}: expected a name ending in {', '.join(writers)}, "
+                            f"found {ending_of(path) or 'none'!r}")
+    data = writers[ending_of(path)](contents, precision == "double")
     if path.suffix.lower() == ".gz":
         data = gzip.compress(data, compresslevel=6, mtime=0)
     storage.write(path, data)

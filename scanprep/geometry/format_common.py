@@ -14,11 +14,17 @@ import numpy as np
 from . import storage
 
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
+MOST_INSIDE = 0.1                     # of the extent: where nine points in ten span less, the others are no body
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+PERSON = 1.3, 2.3                    # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
 
 
 class MeshFileError(storage.StorageError):
     """A file of a mesh, points or landmarks that cannot be read: which one, what was expected, what came."""
+
+
+class EmptyFileError(MeshFileError):
+    """A file without a single vertex: of a camera, that it saw nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,19 +36,16 @@ class Contents:
     normals: np.ndarray | None = None       # (N, 3)
     colors: np.ndarray | None = None        # (N, 3) in [0, 1]
     objects: tuple[tuple[str, int], ...] = ()       # name and triangles of each, where the format has objects
+    of_file: np.ndarray | None = None       # (M,) which vertex each of the file is here, -1 of one that was left out
 
 
 def load_bytes(path: Path) -> bytes:
     """The whole file, unpacked when its name ends in `.gz`; MeshFileError for one that is missing, damaged or empty."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        what = {FileNotFoundError: "no such file", IsADirectoryError: "expected a file, found a folder"}
-        raise MeshFileError(f"{path}: {what.get(type(error), f'cannot be read ({error.strerror or error})')}") from None
+    data = storage.read_bytes(path, error=MeshFileError)
     if path.suffix.lower() == ".gz":
         data = _unpacked(path, data)
     if not data:
-        raise MeshFileError(f"{path}: the file is empty")
+        raise EmptyFileError(f"{path}: the file is empty")
     return data
 
 
@@ -67,20 +70,39 @@ def check_extent(path: Path, what: str, points: np.ndarray) -> None:
                             f"expected coordinates below {FARTHEST:g}")
 
 
+def likely_unit(extent: float) -> str | None:
+    """The unit in which `extent` is that of a person, other than metres; None where none is or several may be."""
+    likely = [unit for unit in ("mm", "cm", "in") if PERSON[0] <= extent * UNITS[unit] <= PERSON[1]]
+    return likely[0] if len(likely) == 1 else None
+
+
 def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
     """What to multiply the coordinates of a file with to have metres.
 
-    Warns where metres are assumed and would make the points span more than 10 m or less than `smallest`.
+    Where no unit is given and the points span as much as a person in one other than metres, it is that one. Else they
+    are metres, with a warning where they would span more than 10 m or less than `smallest`. Only how far the points
+    span counts, not how far from the origin they lie.
     """
     if unit is not None:
         if unit not in UNITS:
             raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
         return UNITS[unit]
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if extent > 10:                          # 65.535 m is what many a depth camera writes where it saw nothing
+        inner = float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())
+        if inner < MOST_INSIDE * extent:
+            warnings.warn(f"{path}: a few points lie far off the rest, which spans {inner:.3g} m and alone tells the "
+                          "unit; scape prep clean drops them", stacklevel=3)
+            extent = inner
+    likely = likely_unit(extent)
+    if likely is not None:
+        warnings.warn(f"{path}: read with unit='{likely}', in which it is {extent * UNITS[likely]:.2f} m from end to "
+                      f"end; if these are metres, say unit='m'", stacklevel=3)
+        return UNITS[likely]
     if extent > 10:
-        likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
-        warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "
-                      f"it looks like unit='{likely}' ({extent * UNITS[likely]:.3g} m)", stacklevel=3)
+        nearest = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
+        warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; if it is not, say its unit: with "
+                      f"unit='{nearest}' it is {extent * UNITS[nearest]:.3g} m", stacklevel=3)
     elif 0 < extent < smallest:
         warnings.warn(f"{path}: {extent:.2g} m from end to end when read as metres; it looks as if millimetres "
                       f"had been divided by 1000 twice ({extent * 1000:.3g} m)", stacklevel=3)
@@ -175,6 +197,13 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     return faces
 
 
+def strip_triangles(strip: np.ndarray) -> np.ndarray:
+    """(F, 3) the triangles of a strip of vertices (n,), all turned the same way; those that repeat one are left out."""
+    faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return np.asarray(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
+
+
 def _folded(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
     """The polygons some of whose triangles (F, 3), `of` (F,) them, face away from the whole."""
     c = vertices[faces]
@@ -220,10 +249,15 @@ def _edge_key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
     return np.minimum(a, b) * count + np.maximum(a, b)
 
 
-def as_colors(values: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """Colours in [0, 1] of values stored as integers of full scale or as floats in [0, 1]."""
-    scale = np.iinfo(kind).max if kind.kind in "iu" else 1.0
-    return np.clip(np.asarray(values, dtype=np.float64) / scale, 0, 1)
+def as_colors(values: np.ndarray, whole: bool = False) -> np.ndarray:
+    """Colours (N, 3) in [0, 1] of a file that does not say which value is white.
+
+    It is 1, or 255 where a value is beyond that or all must be `whole` numbers, or 65535 where one is beyond 255.
+    Some programs write floats a little above 1 for highlights, so 255 begins at 2.
+    """
+    largest = np.nanmax(values, initial=0)
+    white = 1 if largest <= 2 and not whole else 255 if largest <= 255 else 65535
+    return np.clip(np.asarray(values, dtype=np.float64) / white, 0, 1)
 
 
 def as_seen(linear: np.ndarray) -> np.ndarray:

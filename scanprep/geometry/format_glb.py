@@ -1,4 +1,4 @@
-"""GLB, the binary form of glTF 2.0: all triangles of the scene, each mesh where its node puts it.
+"""glTF 2.0, in one file (GLB) or with files beside it: all triangles of the scene, each mesh where its node puts it.
 
 glTF has y up and no body here has an axis that is up, so what is written is turned: by `tallest`, or by the axis that
 the caller knows. The file names that axis in `asset.extras`, and the reader turns it back. A file that names none comes
@@ -6,16 +6,19 @@ from elsewhere, or was written before there was a name: it is read as it stands.
 """
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
-from . import storage
-from .format_common import Contents, MeshFileError, as_colors, as_light, as_seen, polygons, quote
+from . import format_draco, storage
+from .format_common import Contents, MeshFileError, as_light, as_seen, load_bytes, polygons, quote, strip_triangles
 from .mesh import Mesh
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -26,58 +29,187 @@ _TURNS = {"x": 0, "y": 1, "z": 2}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
+_DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
+# extensions that a file may require and that are read here, or that leave triangles as they are
+_KNOWN = (_DRACO, _INSTANCES, "KHR_mesh_quantization")
+_HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_",
+             "KHR_animation_", "KHR_xmp")
+
+
 def read(path: Path, data: bytes) -> Contents:
-    """The meshes of the scene one after the other, in scene coordinates; points and lines are left out.
+    """The meshes of the scene of a GLB file one after the other, in scene coordinates; points and lines are left out.
 
     The axes are those of the body where the file tells which of them was turned to y. A mesh that hangs on joints is
-    taken as it is stored, in its bind pose.
+    where the joints of the scene carry it, which is what every program shows.
     """
     tree, binary = chunks_of(path, data)
     with storage.taking_apart(path, "a whole GLB file", MeshFileError), np.errstate(all="ignore"):
         return _scene(path, tree, binary)
 
 
+def read_gltf(path: Path, data: bytes) -> Contents:
+    """As `read`, of a `.gltf` file: JSON with its numbers in it or in files beside it."""
+    tree = storage.parse_json(path, data, "a glTF file", MeshFileError)
+    with storage.taking_apart(path, "a whole glTF file", MeshFileError), np.errstate(all="ignore"):
+        if not str(tree["asset"]["version"]).startswith("2"):
+            raise MeshFileError(f"{path}: expected glTF version 2, found version {tree['asset']['version']}")
+        return _scene(path, tree, _one_buffer(path, tree, b""))
+
+
+def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
+    """All buffers of a file one after the other, `binary` the one inside it; its views are moved to where they are."""
+    buffers, starts = list[bytes](), list[int]()
+    for entry in tree.get("buffers", []):
+        uri = entry.get("uri")
+        if uri is None:
+            data = binary
+        elif uri.startswith("data:"):
+            try:
+                data = base64.b64decode(uri.partition(",")[2], validate=True)
+            except binascii.Error as problem:
+                raise ValueError(f"a buffer inside is damaged ({problem})") from None
+        else:
+            data = load_bytes(file_beside(path, uri))
+        starts.append(sum(map(len, buffers)))
+        buffers.append(data + b"\0" * (-len(data) % 4))
+    for view in tree.get("bufferViews", []):
+        view["byteOffset"] = view.get("byteOffset", 0) + item(starts, view["buffer"])
+    return b"".join(buffers)
+
+
+def file_beside(path: Path, name: str) -> Path:
+    """A file that another one names; MeshFileError where it does not lie in the folder of that one, or below."""
+    beside, folder = path.parent / unquote(name), path.parent.resolve()
+    if "\0" in name or not beside.resolve().is_relative_to(folder):
+        raise MeshFileError(f"{path}: expected files beside it, found {quote(name)}")
+    return beside
+
+
 def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
-    needed = tree.get("extensionsRequired", [])
-    if any("draco" in name.lower() or "meshopt" in name.lower() for name in needed):
-        raise MeshFileError(f"{path}: expected a GLB file that is not compressed, it needs {', '.join(needed)}")
+    needed = [str(name) for name in tree.get("extensionsRequired", [])]
+    unknown = [name for name in needed if name not in _KNOWN and not name.startswith(_HARMLESS)]
+    if unknown:
+        raise MeshFileError(f"{path}: it needs {', '.join(unknown)}, which is not read here "
+                            f"(known: {', '.join(_KNOWN)}); save it without, for example with Blender")
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
     objects: list[tuple[str, int]] = []
     start, most = 0, 10**6 + 4 * len(binary)    # many nodes may show one mesh, but not without end
-    for number, node, matrix in nodes_of(tree):
+    nodes = list(nodes_of(tree))
+    places = {number: matrix for number, _, matrix in nodes}
+    for number, node, matrix in nodes:
         if "mesh" not in node:
             continue
-        before = len(faces)
-        matrix = np.eye(4) if "skin" in node else matrix
-        placed: dict[int, int] = {}                      # primitives may share their vertices
-        for primitive in item(tree["meshes"], node["mesh"])["primitives"]:
-            if primitive.get("mode", 4) not in (4, 5, 6):         # triangles, a strip, a fan
-                continue
-            points = primitive["attributes"]["POSITION"]
-            if points not in placed:
-                local = accessor(tree, binary, points, "VEC3").astype(np.float64)
-                placed[points] = start
-                vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])      # what is not finite is refused later
-                colors.append(_colors(tree, binary, primitive, len(local)))
-                start += len(local)
-            count = tree["accessors"][points]["count"]
-            corners = triangles_of(tree, binary, primitive, count)
-            if np.linalg.det(matrix[:3, :3]) < 0:
-                corners = corners[:, ::-1]
-            faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), count) + placed[points])
-            most -= count + 3 * len(corners) + 1
-            if most < 0:
-                raise ValueError("it shows its meshes too often")
-        if len(faces) > before:
-            name = node.get("name") or tree["meshes"][node["mesh"]].get("name") or f"node {number}"
-            objects.append((str(name), sum(map(len, faces[before:]))))
+        name = node.get("name") or item(tree["meshes"], node["mesh"]).get("name") or f"node {number}"
+        joints = joint_matrices(tree, binary, item(tree["skins"], node["skin"]), places) if "skin" in node else None
+        for instance in _instances(tree, binary, node, matrix):
+            before = len(faces)
+            placed: dict[tuple[int, Any], int] = {}                # primitives may share their vertices
+            for primitive in tree["meshes"][node["mesh"]]["primitives"]:
+                if primitive.get("mode", 4) not in (4, 5, 6):             # triangles, a strip, a fan
+                    continue
+                primitive, own, data = _unpacked(path, tree, binary, primitive)
+                points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
+                local = accessor(own, data, points[0], "VEC3").astype(np.float64)
+                if own is not tree or points not in placed:
+                    placed[points] = start
+                    if joints is not None and points[1] is not None:
+                        vertices.append(skinned(local, weights_of(own, data, primitive, len(joints)), joints))
+                    else:
+                        vertices.append(local @ instance[:3, :3].T + instance[:3, 3])
+                    colors.append(_colors(own, data, primitive, len(local)))
+                    start += len(local)
+                corners = triangles_of(own, data, primitive, len(local))
+                if np.linalg.det((instance if joints is None else joints[0])[:3, :3]) < 0:
+                    corners = corners[:, ::-1]
+                faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), len(local)) + placed[points])
+                most -= len(local) + 3 * len(corners) + 1
+                if most < 0:
+                    raise ValueError("it shows its meshes too often")
+            if len(faces) > before:
+                objects.append((str(name), sum(map(len, faces[before:]))))
     if not faces:
-        raise MeshFileError(f"{path}: expected a mesh, found a GLB file without triangles")
+        raise MeshFileError(f"{path}: expected a mesh, found a glTF file without triangles")
     shades = [c for c in colors if c is not None]
     return Contents(np.concatenate(vertices) @ turn_up(up_of(tree)), np.concatenate(faces), None,
                     np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects))
+
+
+def _instances(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[np.ndarray]:
+    """The matrices (4, 4) of every time that a node shows its mesh: once, or as EXT_mesh_gpu_instancing says."""
+    told = node.get("extensions", {}).get(_INSTANCES)
+    if told is None:
+        return [matrix]
+    rows = {key: accessor(tree, binary, told["attributes"][name], kind).astype(np.float64).tolist()
+            for key, name, kind in (("translation", "TRANSLATION", "VEC3"), ("rotation", "ROTATION", "VEC4"),
+                                    ("scale", "SCALE", "VEC3")) if name in told["attributes"]}
+    count = min(map(len, rows.values()), default=0)
+    return [matrix @ _matrix({key: values[i] for key, values in rows.items()}) for i in range(count)]
+
+
+def _unpacked(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
+              ) -> tuple[dict[str, Any], dict[str, Any], bytes]:
+    """A primitive, and the tree and buffer that hold its numbers: one of its own where Draco has compressed them."""
+    packed = primitive.get("extensions", {}).get(_DRACO)
+    if packed is None or "bufferView" in item(tree["accessors"], primitive["attributes"]["POSITION"]):
+        return primitive, tree, binary           # not compressed, or also as it is for who does not know Draco
+    view = item(tree["bufferViews"], packed["bufferView"])
+    start = view.get("byteOffset", 0)
+    mesh = format_draco.decode(path, binary[start:start + view["byteLength"]])
+    glb = Glb()
+    glb.add_indices(np.asarray(mesh.faces))
+    attributes = {}
+    for name, identity in packed["attributes"].items():
+        if name == "POSITION" or name.startswith(("COLOR_", "JOINTS_", "WEIGHTS_")):
+            values = np.asarray(mesh.get_attribute_by_unique_id(identity)["data"])
+            entry = item(tree["accessors"], primitive["attributes"][name])
+            attributes[name] = glb.add_raw(values, entry["type"], entry.get("normalized", False))
+    return {"attributes": attributes, "indices": 0}, *glb.parts()
+
+
+def joint_matrices(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], places: dict[int, np.ndarray]
+                   ) -> np.ndarray:
+    """(J, 4, 4) how every joint of a skin carries the vertices from where they are stored to where they are shown."""
+    missing = [number for number in skin["joints"] if number not in places]
+    if missing:
+        raise ValueError(f"joint {missing[0]} does not stand in the scene")
+    motion = np.stack([places[number] for number in skin["joints"]])
+    if "inverseBindMatrices" in skin:
+        inverse = accessor(tree, binary, skin["inverseBindMatrices"], "MAT4").astype(np.float64)
+        motion = motion @ inverse[:len(motion)].reshape(len(motion), 4, 4).swapaxes(1, 2)
+    return motion
+
+
+def weights_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], joints: int) -> np.ndarray:
+    """(n, J) how much each joint moves every vertex of a primitive, one in all."""
+    attributes = primitive["attributes"]
+    count = item(tree["accessors"], attributes["POSITION"])["count"]
+    sets = sorted(name for name in attributes if name.startswith("WEIGHTS_"))
+    if not sets:
+        raise ValueError("it has no weights (WEIGHTS_0): nothing says how the joints move its vertices")
+    weights = np.zeros((count, joints))
+    for name in sets:
+        shares = accessor(tree, binary, attributes[name], "VEC4").astype(np.float64)
+        carriers = accessor(tree, binary, attributes[name.replace("WEIGHTS", "JOINTS")], "VEC4").astype(np.int64)
+        if len(carriers) != count or len(shares) != count or carriers.max(initial=0) >= joints:
+            raise ValueError(f"{name}: expected four of {joints} joints for each of {count} vertices")
+        if not (np.isfinite(shares).all() and (shares >= 0).all()):
+            raise ValueError(f"{name}: expected numbers of at least 0")
+        np.add.at(weights, (np.arange(count)[:, None], carriers), shares)
+    total = weights.sum(axis=1, keepdims=True)
+    bare = np.flatnonzero(total[:, 0] < 1e-3)
+    if len(bare):
+        raise ValueError(f"{len(bare)} vertices have no weights, the first is vertex {bare[0]}")
+    return np.asarray(weights / total)
+
+
+def skinned(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """(n, 3) vertices where their joints carry them: weights (n, J), matrices (J, 4, 4)."""
+    if np.allclose(joints, np.eye(4), atol=1e-6):            # in its bind pose: the very same numbers
+        return points
+    one = np.column_stack([points, np.ones(len(points))])
+    return np.asarray(np.einsum("nj,jab,nb->na", weights, joints, one, optimize=True)[:, :3])
 
 
 def turn_up(up: int) -> np.ndarray:
@@ -137,7 +269,8 @@ def chunks_of(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
     tree = storage.parse_json(path, chunks.get(b"JSON", b""), "a GLB file with a header", MeshFileError)
     if not isinstance(tree, dict):
         raise MeshFileError(f"{path}: damaged GLB file, its JSON is not a table")
-    return tree, chunks.get(b"BIN\0", b"")
+    with storage.taking_apart(path, "a whole GLB file", MeshFileError):
+        return tree, _one_buffer(path, tree, chunks.get(b"BIN\0", b""))
 
 
 def nodes_of(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any], np.ndarray]]:
@@ -175,21 +308,39 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> np.ndarray:
-    """(count, width) the values of an accessor of one of these types."""
+    """(count, width) the values of an accessor of one of these types; integers that mean 0..1 or -1..1 as floats."""
     entry = item(tree["accessors"], number)
     kind, count = np.dtype(_COMPONENTS[entry["componentType"]]), entry["count"]
     if entry["type"] not in types:
         raise ValueError(f"accessor {number} is of type {entry['type']!r}, expected {' or '.join(types)}")
-    if "sparse" in entry:
-        raise ValueError("sparse accessors are not read here")
-    view, size = item(tree["bufferViews"], entry["bufferView"]), kind.itemsize * _WIDTHS[entry["type"]]
+    width = _WIDTHS[entry["type"]]
+    if "bufferView" in entry:
+        values = _values(tree, binary, f"accessor {number}", entry, kind, count, width)
+    elif isinstance(count, int) and 0 <= count * width * kind.itemsize <= 10**6 + 100 * len(binary):
+        values = np.zeros((count, width), kind)
+    else:
+        raise ValueError(f"accessor {number}: {count} zeros")
+    if "sparse" in entry:                # some values are others
+        few = entry["sparse"]
+        which = _values(tree, binary, f"accessor {number}", few["indices"],
+                        np.dtype(_COMPONENTS[few["indices"]["componentType"]]), few["count"], 1)
+        values[which[:, 0]] = _values(tree, binary, f"accessor {number}", few["values"], kind, few["count"], width)
+    if entry.get("normalized") and kind.kind in "iu":
+        return np.maximum(values / np.iinfo(kind).max, -1.0)
+    return values
+
+
+def _values(tree: dict[str, Any], binary: bytes, what: str, entry: dict[str, Any], kind: np.dtype, count: int,
+            width: int) -> np.ndarray:
+    """(count, width) a copy of numbers in the buffer."""
+    view, size = item(tree["bufferViews"], entry["bufferView"]), kind.itemsize * width
     start = view.get("byteOffset", 0) + entry.get("byteOffset", 0)
     stride = view.get("byteStride", size)
     if start < 0 or count < 0 or stride < size:
-        raise ValueError(f"accessor {number}: {count} elements of {size} bytes from byte {start}, one every {stride}")
+        raise ValueError(f"{what}: {count} elements of {size} bytes from byte {start}, one every {stride}")
     if count and start + stride * (count - 1) + size > len(binary):
-        raise ValueError(f"truncated: accessor {number} needs {start + stride * count} bytes, found {len(binary)}")
-    return np.ndarray((count, _WIDTHS[entry["type"]]), kind, binary, start, (stride, kind.itemsize)).copy()
+        raise ValueError(f"truncated: {what} needs {start + stride * count} bytes, found {len(binary)}")
+    return np.ndarray((count, width), kind, binary, start, (stride, kind.itemsize)).copy()
 
 
 def triangles_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
@@ -201,9 +352,7 @@ def triangles_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any],
         return line[:len(line) // 3 * 3].reshape(-1, 3)
     if mode == 6:
         return np.stack([np.full(max(len(line) - 2, 0), line[0]), line[1:-1], line[2:]], axis=1)
-    strip = np.stack([line[:-2], line[1:-1], line[2:]], axis=1)
-    strip[1::2] = strip[1::2, [1, 0, 2]]
-    return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
+    return strip_triangles(line)
 
 
 def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray | None:
@@ -213,7 +362,7 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
     values = accessor(tree, binary, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4")
     if len(values) != count:
         raise ValueError(f"{len(values)} colours of {count} vertices")
-    return as_seen(as_colors(values[:, :3], values.dtype))
+    return as_seen(values[:, :3].astype(np.float64))
 
 
 def encode(contents: Contents, double: bool) -> bytes:
@@ -256,6 +405,15 @@ class Glb:
     def add_indices(self, faces: np.ndarray) -> int:
         """An accessor of the corners of triangles; its index."""
         return self._append(np.ascontiguousarray(faces, dtype="<u4"), faces.size, "SCALAR", _INDICES, {})
+
+    def add_raw(self, values: np.ndarray, kind: str, normalized: bool) -> int:
+        """An accessor of numbers of whatever type; its index."""
+        values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+        return self._append(values, len(values), kind, None, {"normalized": normalized})
+
+    def parts(self) -> tuple[dict[str, Any], bytes]:
+        """The tree that `accessor` reads and the buffer, without a file."""
+        return {"bufferViews": self._views, "accessors": self._accessors}, bytes(self._data)
 
     def add_joints(self, joints: np.ndarray) -> int:
         """An accessor of the four joints (n, 4) of every vertex, in one or two bytes; its index."""

@@ -1,6 +1,7 @@
-"""PCD, the point cloud file of PCL: ascii and binary."""
+"""PCD, the point cloud file of PCL: ascii, binary, and binary compressed by LZF."""
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT",
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The points, normals and colours of a PCD file; points that are not finite (no return) are left out."""
+    """The points, normals and colours of a PCD file; points without return are not finite."""
     header, start, line = _header(path, data)
     names = header[b"FIELDS"]
     try:
@@ -34,9 +35,11 @@ def read(path: Path, data: bytes) -> Contents:
                                 f"found {(len(data) - start) // row.itemsize}")
         table = np.frombuffer(data, row, count, start)
         columns = {name: table[name] for name in row.names or ()}
+    elif how == b"binary_compressed":
+        columns = _compressed(path, data[start:], row, count)
     else:
-        raise MeshFileError(f"{path}: expected DATA ascii or binary in the PCD header, found {quote(how)}; "
-                            f"save the file as binary")
+        raise MeshFileError(f"{path}: expected DATA ascii, binary or binary_compressed in the PCD header, "
+                            f"found {quote(how)}")
     with storage.taking_apart(path, "three normals and one colour of each point", MeshFileError):
         return _contents(columns)
 
@@ -84,17 +87,59 @@ def _ascii(lines: Lines, row: np.dtype, count: int) -> dict[str, np.ndarray]:
     return columns
 
 
+def _compressed(path: Path, data: bytes, row: np.dtype, count: int) -> dict[str, np.ndarray]:
+    """The columns one after the other, packed as a whole; before them their packed and unpacked sizes."""
+    packed, size = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
+    if len(data) < 8 + packed or size != row.itemsize * count:
+        raise MeshFileError(f"{path}: truncated or damaged: expected {row.itemsize * count} bytes of {count} points, "
+                            f"packed in {packed}, found {size} in {max(len(data) - 8, 0)}")
+    body = _lzf(path, data[8:8 + packed], size)
+    columns, at = {}, 0
+    for name in row.names or ():
+        field = row[name]
+        values = np.frombuffer(body, field.base, count * int(np.prod(field.shape)), at)
+        columns[name] = values.reshape(count, *field.shape)
+        at += count * field.itemsize
+    return columns
+
+
+def _lzf(path: Path, data: bytes, size: int) -> bytes:
+    """Unpack LZF, the format of Marc Lehmann's liblzf: runs of bytes as they are, and copies of what came before."""
+    out, at = bytearray(), 0
+    try:
+        while at < len(data):
+            control = data[at]
+            at += 1
+            if control < 32:             # so many bytes and one more as they are
+                out += data[at:at + control + 1]
+                at += control + 1
+                continue
+            length, distance = control >> 5, (control & 31) << 8
+            if length == 7:
+                length += data[at]
+                at += 1
+            length, distance, at = length + 2, distance + data[at] + 1, at + 1
+            if distance > len(out) or len(out) + length > size:
+                raise IndexError
+            run = out[-distance:][:length]                   # a copy may overlap itself: then it repeats
+            out += run if length <= distance else (run * (length // distance + 1))[:length]
+    except IndexError:
+        pass
+    if len(out) != size or at != len(data):
+        raise MeshFileError(f"{path}: damaged: its packed points cannot be unpacked")
+    return bytes(out)
+
+
 def _contents(columns: dict[str, np.ndarray]) -> Contents:
     points = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
-    kept = np.isfinite(points).all(axis=1)
     normals = colors = None
     if {"normal_x", "normal_y", "normal_z"} <= set(columns):
-        normals = np.stack([columns[f"normal_{a}"] for a in "xyz"], axis=1).astype(np.float64)[kept]
+        normals = np.stack([columns[f"normal_{a}"] for a in "xyz"], axis=1).astype(np.float64)
     packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
     if packed is not None and packed.dtype.itemsize == 4 and packed.ndim == 1:       # 0xrrggbb, maybe in a float
-        bits = np.ascontiguousarray(packed).view(np.uint32)[kept]
+        bits = np.ascontiguousarray(packed).view(np.uint32)
         colors = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255
-    return Contents(points[kept], None, normals, colors)
+    return Contents(points, None, normals, colors)
 
 
 def encode(contents: Contents, double: bool) -> bytes:

@@ -1,7 +1,12 @@
-"""PLY: ascii and binary of either byte order, with colours and normals; everything else is skipped."""
+"""PLY: ascii and binary of either byte order, with colours and normals; everything else is skipped.
+
+Triangles come from polygons, from strips (`tristrips`), or from the grid of a range scanner (`range_grid`).
+"""
 from __future__ import annotations
 
 import contextlib
+import re
+import warnings
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -9,7 +14,18 @@ from pathlib import Path
 import numpy as np
 
 from . import storage
-from .format_common import Contents, Lines, MeshFileError, as_bytes, as_colors, fields_of, polygons, quote, structured
+from .format_common import (
+    Contents,
+    Lines,
+    MeshFileError,
+    as_bytes,
+    as_colors,
+    fields_of,
+    polygons,
+    quote,
+    strip_triangles,
+    structured,
+)
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
@@ -52,19 +68,21 @@ def read(path: Path, data: bytes) -> Contents:
         counts = ", ".join(f"{e.count} {e.name}" for e in elements)
         raise MeshFileError(f"{path}: expected the end of the file after {counts}, found {rest} more "
                             f"{'lines' if lines else 'bytes'}")
-    return _contents(path, elements[names.index("vertex")], found)
+    rows = [int(line.split()[2]) for line in data[:start].splitlines() if line.startswith(b"obj_info num_rows ")]
+    return _contents(path, elements[names.index("vertex")], found, rows[0] if rows else 0)
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
     """Byte order, elements, and the place and line number where the body begins."""
     if not data.startswith(b"ply") or data[3:4] not in (b"\n", b"\r"):
         raise MeshFileError(f"{path}: expected a PLY file that begins with 'ply', found {quote(data[:20])}")
-    end = data.find(b"end_header")
-    if end < 0:
+    last_line = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\r|\n)", data)
+    if last_line is None:
         raise MeshFileError(f"{path}: truncated: the PLY header has no end_header")
-    after = end + len(b"end_header")
-    after += len(b"\r\n") if data[3:5] == b"\r\n" else 1
-    order, elements, lines = None, [], data[:end].splitlines()
+    # some programs end this line as no other; only where all end in CR alone is LF behind it a byte of the body
+    alone = data[3:4] == b"\r" and data[4:5] != b"\n" and last_line[1] == b"\r\n"
+    after = last_line.end() - alone
+    order, elements, lines = None, [], data[:last_line.start() + 1].splitlines()
     for number, line in enumerate(lines[1:], 2):
         words = line.split()
         try:
@@ -106,6 +124,8 @@ def _binary_element(path: Path, data: bytes, element: Element, start: int, order
         n = 1
         if p.length_kind:
             n = _length(data, at, p.length_kind, order) if element.count else 0
+            if n < 0:
+                raise MeshFileError(f"{path}: row 0 of element {element.name}: a list of {n} values")
             fields.append((f"length{i}", order + p.length_kind))
             at += int(p.length_kind[1])
         fields.append((f"value{i}", order + p.kind, (n,) if p.length_kind else ()))
@@ -138,7 +158,9 @@ def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: s
                 n = _length(data, start, p.length_kind, order)
                 start += int(p.length_kind[1])
             end = start + n * int(p.kind[1])
-            if n < 0 or end > len(data):
+            if n < 0:
+                raise MeshFileError(f"{path}: row {row} of element {element.name}: a list of {n} values")
+            if end > len(data):
                 raise _truncated(path, element, row)
             size.append(n)
             item += data[start:end]
@@ -198,7 +220,7 @@ def _ascii_rows(lines: Lines, element: Element, rows: range) -> dict[str, _Colum
     return columns
 
 
-def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]]) -> Contents:
+def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]], grid_rows: int) -> Contents:
     columns = found["vertex"]
 
     def triple(names: tuple[str, ...]) -> np.ndarray | None:
@@ -212,15 +234,70 @@ def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]])
         raise MeshFileError(f"{path}: expected properties x, y, z of element vertex, "
                             f"found {[p.name for p in vertex.properties]}")
     kinds = {p.name: np.dtype(p.kind) for p in vertex.properties}
-    colors = next((as_colors(c, kinds[names[0]]) for names in _COLORS if (c := triple(names)) is not None), None)
-    faces = None
-    if "face" in found:
-        lists = found["face"].get("vertex_indices", found["face"].get("vertex_index"))
+    # bytes are whole numbers of 255; other integers and floats may be of any scale
+    colors = next((as_colors(c, kinds[names[0]].kind in "iu") for names in _COLORS if (c := triple(names)) is not None),
+                  None)
+    return Contents(vertices, _faces(path, found, vertices, grid_rows), triple(("nx", "ny", "nz")), colors)
+
+
+def _faces(path: Path, found: dict[str, dict[str, _Column]], vertices: np.ndarray, grid_rows: int) -> np.ndarray | None:
+    """(F, 3) triangles of the first of these elements that holds anything; None of a cloud."""
+    for name in ("face", "tristrips", "range_grid"):
+        lists = found.get(name, {}).get("vertex_indices", found.get(name, {}).get("vertex_index"))
+        if name not in found or (isinstance(lists, tuple) and not len(lists[0])):
+            continue
         if not isinstance(lists, tuple):
-            raise MeshFileError(f"{path}: expected a property list vertex_indices of element face, "
-                                f"found {list(found['face'])}")
-        faces = polygons(path, lists[0], lists[1], len(vertices), vertices=vertices)
-    return Contents(vertices, faces, triple(("nx", "ny", "nz")), colors)
+            if not any(map(len, found[name].values())):              # an element without rows need not say what it has
+                continue
+            raise MeshFileError(f"{path}: expected a property list vertex_indices of element {name}, "
+                                f"found {list(found[name])}")
+        sizes, corners = lists
+        if name == "face":
+            return polygons(path, sizes, corners, len(vertices), vertices=vertices)
+        faces = _strips(sizes, corners) if name == "tristrips" else _grid(path, sizes, corners, grid_rows, vertices)
+        return polygons(path, np.full(len(faces), 3), faces.ravel(), len(vertices))
+    return None
+
+
+def _strips(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(F, 3) triangles of strips; a strip ends with its list, or at a -1 in it."""
+    ends = np.sort(np.r_[np.cumsum(sizes), np.flatnonzero(corners < 0)])
+    strips = [strip[strip >= 0] for strip in np.split(corners.astype(np.int64), ends)]
+    return np.concatenate([strip_triangles(strip) for strip in strips if len(strip) > 2] or [np.zeros((0, 3), int)])
+
+
+# of the edges between neighbours of a range scan, against their median: what is longer spans a jump from one surface to
+# another. Triangles seen at 75 degrees have edges four times as long as those seen from the front
+_JUMP = 4.0
+
+
+def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertices: np.ndarray) -> np.ndarray:
+    """(F, 3) triangles between neighbours in the grid of a range scanner, whose cells hold one vertex or none."""
+    if rows <= 0 or len(sizes) % rows or not np.isin(sizes, (0, 1)).all():
+        raise MeshFileError(f"{path}: expected a range_grid of one vertex or none a cell, and obj_info num_rows and "
+                            f"num_cols that agree with its {len(sizes)} cells; found {rows} rows")
+    if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
+        raise MeshFileError(f"{path}: the range_grid refers to vertices {corners.min()}..{corners.max()}, "
+                            f"expected 0..{len(vertices) - 1}")
+    numbers = np.full(len(sizes), -1)
+    numbers[sizes == 1] = corners
+    cells: np.ndarray = numbers.reshape(rows, -1)
+    a, b, c, d = (part.ravel() for part in (cells[:-1, :-1], cells[:-1, 1:], cells[1:, 1:], cells[1:, :-1]))
+    # two triangles a square, along its shorter diagonal; where a corner is missing the one that is left
+    shorter = np.linalg.norm(vertices[a] - vertices[c], axis=1) <= np.linalg.norm(vertices[b] - vertices[d], axis=1)
+    along_ac = (shorter & (a >= 0) & (c >= 0)) | (b < 0) | (d < 0)
+    faces = np.where(along_ac[:, None, None], np.stack([[a, d, c], [a, c, b]]).transpose(2, 0, 1),
+                     np.stack([[a, d, b], [b, d, c]]).transpose(2, 0, 1)).reshape(-1, 3)
+    faces = faces[(faces >= 0).all(axis=1)]
+    longest = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).max(axis=1, initial=0)
+    # range scanners look along -z, whichever way their rows run
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    if np.cross(b - a, c - a)[:, 2].sum() < 0:
+        faces = faces[:, ::-1]
+    kept = longest <= _JUMP * np.median(longest) if len(longest) else np.zeros(0, bool)
+    warnings.warn(f"{path}: a range grid of {rows} x {cells.shape[1]}: neighbours were joined by {kept.sum()} "
+                  f"triangles, {len(kept) - kept.sum()} that span jumps were left out", stacklevel=2)
+    return np.asarray(faces[kept])
 
 
 def encode(contents: Contents, double: bool) -> bytes:

@@ -1,6 +1,8 @@
 """STL, ascii and binary. Each triangle has its own corners there; equal ones become one vertex."""
 from __future__ import annotations
 
+import contextlib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +25,10 @@ def read(path: Path, data: bytes) -> Contents:
 
 
 def _is_ascii(data: bytes) -> bool:
-    """Binary files may begin with 'solid' too; their length gives them away."""
-    if not data.lstrip().startswith(b"solid"):
+    """Binary files may begin with 'solid' too; the zeros of their numbers, or their length, give them away."""
+    if data.lstrip()[:5].lower() != b"solid":
         return False
-    return len(data) != _length(data) and b"\0" not in data[:_HEADER]
+    return len(data) != _length(data) and b"\0" not in data[:_HEADER + 4 + 10 * _FACET.itemsize]
 
 
 def _length(data: bytes) -> int:
@@ -43,16 +45,19 @@ def _binary(path: Path, data: bytes) -> np.ndarray:
         count = (_length(data) - _HEADER - 4) // _FACET.itemsize
         raise MeshFileError(f"{path}: truncated or not an STL file: expected {count} triangles, "
                             f"found {(len(data) - _HEADER - 4) // _FACET.itemsize}")
-    if data[_length(data):].strip(b"\0\r\n\t "):
-        raise MeshFileError(f"{path}: expected {_length(data)} bytes of binary STL by its count of triangles, "
-                            f"found {len(data)}")
+    if rest := len(data[_length(data):].strip(b"\0\r\n\t ")):
+        if _length(data) == _HEADER + 4:
+            raise MeshFileError(f"{path}: its header says that it holds no triangles, but {rest} bytes follow")
+        count = (_length(data) - _HEADER - 4) // _FACET.itemsize
+        warnings.warn(f"{path}: {rest} bytes behind the {count} triangles that its header tells of were left out",
+                      stacklevel=2)
     facets = np.frombuffer(data, _FACET, (_length(data) - _HEADER - 4) // _FACET.itemsize, _HEADER + 4)
     return facets["corners"].astype(np.float64)
 
 
 def _ascii(path: Path, data: bytes) -> np.ndarray:
     lines = Lines(path, data)
-    starts = [line.split(None, 1)[0].lower() for line in lines.text]
+    starts = [line.lstrip()[:8].lower().split()[0] for line in lines.text]
     rows = [i for i, word in enumerate(starts) if word == b"vertex"]
     if b"endsolid" not in starts:
         raise MeshFileError(f"{path}: truncated: expected 'endsolid' at the end of the ascii STL file, "
@@ -60,14 +65,20 @@ def _ascii(path: Path, data: bytes) -> np.ndarray:
     facets = starts.count(b"facet")
     if len(rows) != 3 * facets:
         raise MeshFileError(f"{path}: expected 3 vertex lines for each of {facets} facets, found {len(rows)}")
-    corners = []
-    for row in rows:
-        try:
-            x, y, z = map(float, lines.text[row].split()[1:])
-        except ValueError:
-            raise lines.fail(row, "'vertex x y z'") from None
-        corners.append((x, y, z))
-    return np.array(corners).reshape(-1, 3, 3)
+    text = [lines.text[row].lstrip()[len("vertex"):] for row in rows]
+    with contextlib.suppress(ValueError):
+        table = np.loadtxt(text, ndmin=2, comments=None) if text else np.zeros((0, 3))
+        if table.shape[1] == 3:
+            return table.reshape(-1, 3, 3)
+    bad = next((row for row, line in zip(rows, text, strict=True) if not _is_vertex(line)), rows[0])
+    raise lines.fail(bad, "'vertex x y z'")
+
+
+def _is_vertex(line: bytes) -> bool:
+    try:
+        return len([float(word) for word in line.split()]) == 3
+    except ValueError:
+        return False
 
 
 def encode(contents: Contents, double: bool) -> bytes:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from .format_common import (
     Lines,
     MeshFileError,
     as_bytes,
+    as_colors,
     polygons,
     quote,
     text_rows,
@@ -30,7 +32,7 @@ def read_obj(path: Path, data: bytes) -> Contents:
     table = _vertices(lines, v_rows)
     corners, sizes = _corners(lines, v_rows, f_rows)
     faces = polygons(path, sizes, corners, len(v_rows), [lines.numbers[row] for row in f_rows], table[:, :3])
-    colors = np.clip(table[:, 3:6], 0, 1) if table.shape[1] >= 6 else None
+    colors = as_colors(table[:, 3:6]) if table.shape[1] >= 6 else None
     o_rows = [row for row, start in enumerate(starts) if start in (b"o ", b"o\t")]
     return Contents(table[:, :3], faces, None, colors, _objects(lines, o_rows, f_rows, sizes))
 
@@ -107,9 +109,11 @@ def read_off(path: Path, data: bytes) -> Contents:
     """The vertices, polygons as triangles, normals and vertex colours of an OFF file in ascii."""
     lines = Lines(path, data, comment=b"#")
     head = lines.text[0].split() if len(lines) else [b""]
-    kind = re.fullmatch(rb"(ST)?(C)?(N)?OFF", head[0])
+    kind = re.match(rb"(ST)?(C)?(N)?OFF(?=\d|$)", head[0])
     if kind is None:
         raise MeshFileError(f"{path}: expected a file that begins with OFF or COFF, found {quote(data[:20])}")
+    if kind.end() < len(head[0]):            # the counts are glued to it, as in ModelNet40
+        head[:1] = [kind[0], head[0][kind.end():]]
     if head[1:2] == [b"BINARY"]:
         raise MeshFileError(f"{path}: expected an ascii OFF file, found a binary one")
     counts, place = (head[1:], 1) if len(head) > 1 else (lines.text[1].split() if len(lines) > 1 else [], 2)
@@ -120,8 +124,7 @@ def read_off(path: Path, data: bytes) -> Contents:
     table = lines.table(range(place, place + n), f"{width} or more numbers of vertex 0..{n - 1}", width)
     colors = None
     if kind[2] and table.shape[1] >= width + 3:
-        colors = table[:, width:width + 3] / (255 if table[:, width:width + 3].max(initial=0) > 1 else 1)
-        colors = np.clip(colors, 0, 1)
+        colors = as_colors(table[:, width:width + 3])
     place += n
     if place + f != len(lines):
         found = len(lines) - place
@@ -144,39 +147,98 @@ def encode_off(contents: Contents, double: bool) -> bytes:
             + text_rows("3 %d %d %d", contents.faces)).encode()
 
 
-def read_xyz(path: Path, data: bytes) -> Contents:
-    """The points of a text file; a first line that is a heading or a count is skipped.
+# names of columns in headings of CloudCompare, ParaView, MeshLab and others, without marks and units
+_COLUMNS = {"points": {"x": "x", "y": "y", "z": "z", "points0": "x", "points1": "y", "points2": "z"},
+            "normals": {"nx": "x", "ny": "y", "nz": "z", "normalx": "x", "normaly": "y", "normalz": "z",
+                        "normals0": "x", "normals1": "y", "normals2": "z"},
+            "colors": {"r": "x", "g": "y", "b": "z", "red": "x", "green": "y", "blue": "z"}}
 
-    Three more columns are normals when every row of them has length one, otherwise colours, 0..255 or 0..1;
-    both may follow, in either order.
+
+def read_xyz(path: Path, data: bytes) -> Contents:
+    """The points of a text file, with columns parted by spaces, commas or semicolons.
+
+    A heading tells which columns are what. Without one the first three are coordinates; three more are normals when
+    every row of them has length one, colours when they are 0..255 or 0..1, else anything. In `.pts` an intensity may
+    stand before the colours. A line of one number is a count of points.
     """
     if b"\0" in data:
         raise MeshFileError(f"{path}: expected text with lines 'x y z', found a binary file")
-    lines = Lines(path, re.sub(rb"[,;]", b" ", data), comment=b"#")
-    first = 1 if len(lines) and not _is_point(lines.text[0]) and _is_heading(lines.text[0]) else 0
+    lines = Lines(path, data, comment=b"#")
+    # a heading, a count, or both in either order stand above the points
+    first, names = 0, list[str]()
+    while first < min(len(lines), 2) and not _is_point(lines.text[first]):
+        words = [re.sub(r"[\[(].*|[^a-z0-9]", "", word) for word in _words(lines.text[first].decode("latin-1").lower())]
+        if not words[0].isdigit() or len(words) > 1:
+            if not set(_COLUMNS["points"]) & set(words):
+                break
+            names = [word for word in words if word]
+        first += 1
     if len(lines) == first:
         raise MeshFileError(f"{path}: expected lines 'x y z', found none")
+    lines.text = _with_decimal_points(lines, first)
     table = lines.table(range(first, len(lines)), "numbers 'x y z', as many on every line", 3)
-    normals = colors = None
-    for start in range(3, table.shape[1] - 2, 3):
-        triple = table[:, start:start + 3]
-        if normals is None and np.allclose(np.linalg.norm(triple, axis=1), 1, atol=1e-2):
-            normals = triple
-        elif colors is None and triple.min() >= 0 and triple.max() <= 255:
-            colors = triple / (255 if triple.max() > 1 else 1)
-    return Contents(table[:, :3], None, normals, colors)
+    if names:
+        return _named_columns(lines, names, table)
+    return _guessed_columns(table, 4 if path.name.lower().endswith(".pts") and table.shape[1] in (4, 7) else 3)
+
+
+def _words(line: str) -> list[str]:
+    return [word for word in re.split(r"[\s,;]+", line) if word] or [""]
 
 
 def _is_point(line: bytes) -> bool:
     try:
-        return len([float(word) for word in line.split()]) >= 3
+        return len([float(word) for word in re.split(rb"[\s,;]+", line) if word]) >= 3
     except ValueError:
         return False
 
 
-def _is_heading(line: bytes) -> bool:
-    words = line.split()
-    return (len(words) == 1 and words[0].isdigit()) or words[0].lstrip(b'/"').lower() in (b"x", b"")
+def _with_decimal_points(lines: Lines, first: int) -> list[bytes]:
+    """The lines from `first` on with spaces between columns and points in numbers.
+
+    A comma is that of decimals where at least three words with at most one comma inside stand on every line, and no
+    point; otherwise it parts columns.
+    """
+    body = b"\n".join(lines.text[first:]).replace(b";", b" ")
+    if b"," in body:
+        words = [line.split() for line in body.split(b"\n")]
+        inside = all(len(row) >= 3 and all(re.fullmatch(rb"[^,]+(,[^,]+)?", word) for word in row) for row in words)
+        if inside and b"." in body:
+            row = next(k for k, line in enumerate(lines.text) if k >= first and b"," in line)
+            raise lines.fail(row, "decimals with a point, or a comma between columns; it has both points and commas")
+        if inside:
+            warnings.warn(f"{lines.path}: its commas were read as decimal points", stacklevel=2)
+        body = body.replace(b",", b"." if inside else b" ")
+    return [*lines.text[:first], *body.split(b"\n")]
+
+
+def _named_columns(lines: Lines, names: list[str], table: np.ndarray) -> Contents:
+    """The columns that a heading names; MeshFileError where it does not name x, y and z or has other columns."""
+    if len(names) > table.shape[1]:
+        raise lines.fail(0, f"a heading of {table.shape[1]} columns, as the points have")
+    found = {}
+    for what, known in _COLUMNS.items():
+        column = {known[name]: k for k, name in reversed(list(enumerate(names))) if name in known}
+        if {*column} == {"x", "y", "z"}:
+            found[what] = table[:, [column["x"], column["y"], column["z"]]]
+    if "points" not in found:
+        raise lines.fail(0, "a heading with x, y and z")
+    colors = as_colors(found["colors"]) if "colors" in found else None
+    return Contents(found["points"], None, found.get("normals"), colors)
+
+
+def _guessed_columns(table: np.ndarray, start: int) -> Contents:
+    """Normals and colours among the columns from `start` on; a column that begins neither is skipped."""
+    normals = colors = None
+    while start + 3 <= table.shape[1]:
+        triple = table[:, start:start + 3]
+        if normals is None and np.allclose(np.linalg.norm(triple, axis=1), 1, atol=1e-2):
+            normals, start = triple, start + 3
+        elif colors is None and triple.min() >= 0 and triple.max() <= 255:
+            colors, start = as_colors(triple), start + 3
+        else:
+            start += 1
+    return Contents(table[:, :3], None, normals, colors)
 
 
 def encode_xyz(contents: Contents, double: bool) -> bytes:

@@ -66,7 +66,8 @@ def _json(path: Path, data: bytes, unit: str | None) -> Found:
 def _json_entry(path: Path, name: str, value: Any) -> Entry:
     if isinstance(value, int) and not isinstance(value, bool):
         return value
-    if isinstance(value, dict) and isinstance(value.get("face"), int):
+    if isinstance(value, dict) and isinstance(value.get("face"), int) \
+            and not isinstance(value["face"], bool):
         bary = _numbers(value.get("bary"))
         if bary is not None and abs(bary.sum() - 1) < 1e-3:
             return {"face": value["face"], "bary": bary / bary.sum()}

@@ -275,7 +275,11 @@ def _place(path: Path, name: str, value: Entry, mesh: Mesh | np.ndarray | None) 
 def _vertex(path: Path, name: str, number: int, mesh: Mesh) -> int:
     """The vertex of a mesh that a file calls by this number, which is that in the file of the mesh."""
     _check_number(path, name, "vertex", number, len(mesh.vertices if mesh.of_file is None else mesh.of_file))
-    return number if mesh.of_file is None else int(mesh.of_file[number])
+    if mesh.of_file is None:
+        return number
+    if mesh.of_file[number] < 0:
+        raise MeshFileError(f"{path}: landmark '{name}': vertex {number} is not finite in the file of the mesh")
+    return int(mesh.of_file[number])
 
 
 def _check_number(path: Path, name: str, what: str, number: int, count: int) -> None:

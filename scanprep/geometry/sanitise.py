@@ -166,7 +166,8 @@ def _against_nearest(mesh: Mesh, patch: np.ndarray, known: np.ndarray, turn: np.
     middle, sure = mesh.corners.mean(axis=1), known[patch]
     asked = np.flatnonzero(~sure)
     near = np.flatnonzero(sure)[cKDTree(middle[sure]).query(middle[asked], workers=search_threads(len(asked)))[1]]
-    agree = np.einsum("fd,fd->f", mesh.face_normals[asked], mesh.face_normals[near]) * np.where(turn[patch[near]], -1, 1)
+    outward = mesh.face_normals[near] * np.where(turn[patch[near]], -1, 1)[:, None]
+    agree = np.einsum("fd,fd->f", mesh.face_normals[asked], outward)
     return np.bincount(patch[asked], mesh.face_areas[asked] * agree, len(known)) < 0
 
 

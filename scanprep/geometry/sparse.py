@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import splu
 
 
@@ -127,3 +127,25 @@ def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.nda
         rz, last = float(np.sum(r * z)), rz
         p = z + rz / last * p
     return d
+
+
+def spanning_tree(i: np.ndarray, j: np.ndarray, lengths: np.ndarray, n: int) -> csr_array:
+    """The edges of least total length that link n points as far as the given edges do.
+
+    Parameters
+    ----------
+    i, j : (E,) int
+        Ends of the edges, in one direction or in both.
+    lengths : (E,) float
+        Above 0.
+    n : int
+        Number of points.
+
+    Returns
+    -------
+    (n, n) csr_array
+        Lengths of the edges of the tree.
+    """
+    # before SciPy 1.16, the last for Python 3.10, it takes 32-bit indices only
+    edges = coo_array((lengths, (i.astype(np.int32), j.astype(np.int32))), shape=(n, n))
+    return csr_array(minimum_spanning_tree(edges.tocsr()))

@@ -9,6 +9,7 @@ import dataclasses
 import json
 import math
 import os
+import stat
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path, PureWindowsPath
@@ -95,16 +96,29 @@ def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
     return path
 
 
+def check_regular(path: str | Path, error: type[StorageError] = StorageError, what: str = "a file") -> None:
+    """An `error` for what is no plain file: missing, a folder, or a pipe or device, which may never end."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise error(f"{path}: no such file; expected {what}") from None
+    except (OSError, ValueError) as problem:
+        raise error(f"{path}: cannot be read ({getattr(problem, 'strerror', None) or problem})") from None
+    if not stat.S_ISREG(mode):
+        raise error(f"{path}: expected {what}, found a {'folder' if stat.S_ISDIR(mode) else 'pipe or a device'}")
+
+
 def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError] = StorageError) -> bytes:
     """All of a file, or an `error` that names it."""
+    check_regular(path, error, what)
     with taking_apart(path, what, error):
         return Path(path).read_bytes()
 
 
 def write(path: str | Path, data: bytes | str) -> None:
-    """Write a file, whole or not at all; text as UTF-8."""
+    """Write a file, whole or not at all; text as UTF-8, and as `\\udce9` what is none of it in the name of a file."""
     with writing(path) as beside:
-        beside.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+        beside.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
 @contextlib.contextmanager
@@ -189,8 +203,16 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
          header: dict[str, Any] | None = None, compress: bool = True) -> None:
     """Write arrays and a JSON header into one `.npz` file: what it holds and the number of its layout, for `load`."""
     text = json.dumps({"kind": kind, "version": version, **(header or {})})
+    save_arrays(path, {HEADER: np.array(text), **arrays}, compress)
+
+
+def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
+    """Write arrays into one `.npz` file; ValueError for one of objects, which only a pickle would hold."""
+    for name, array in arrays.items():                     # before NumPy 2.3 savez cannot refuse them itself
+        if np.asarray(array).dtype.hasobject:
+            raise ValueError(f"{path}: expected arrays of numbers or text, {name} holds objects")
     with writing(path) as beside, open(beside, "wb") as out:
-        (np.savez_compressed if compress else np.savez)(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
+        (np.savez_compressed if compress else np.savez)(out, **arrays)     # type: ignore[arg-type]
 
 
 def load_arrays(path: str | Path, what: str = "an .npz file", only: Collection[str] | None = None
@@ -202,12 +224,14 @@ def load_arrays(path: str | Path, what: str = "an .npz file", only: Collection[s
 
 def names_in(path: str | Path, what: str = "an .npz file") -> tuple[str, ...]:
     """The names of the arrays in an `.npz` file, without reading them; StorageError when it is missing or damaged."""
+    check_regular(path, what=what)
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         return tuple(name[:-4] for name in archive.namelist() if name.endswith(".npy"))
 
 
 def load_array(path: str | Path) -> np.ndarray:
     """The array of an `.npy` file, or StorageError when it is missing, damaged or holds objects."""
+    check_regular(path)
     with taking_apart(path, "an array of NumPy"), open(path, "rb") as stream:
         return _array(stream, os.fstat(stream.fileno()).st_size, "")
 
@@ -224,6 +248,7 @@ def load_header(path: str | Path, kind: str) -> dict[str, Any]:
 
 def _arrays(path: str | Path, what: str, only: Collection[str] | None) -> dict[str, np.ndarray]:
     """The arrays of an archive, or those of some names; numpy's own reader believes what a header promises."""
+    check_regular(path, what=what)
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         members = {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
         unpacked, packed = sum(info.file_size for info in members.values()), os.path.getsize(path)

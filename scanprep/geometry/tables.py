@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,31 @@ def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] |
     return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
 
 
+# What spreadsheets take for a formula, and run: with an apostrophe in front it is text to them.
+_FORMULA = re.compile(r"'*[=+\-@]")
+
+
+def _as_cell(value: Any) -> Any:
+    """A value as the cell of a table: text that begins as a formula does gets an apostrophe in front."""
+    if not isinstance(value, str) or not _FORMULA.match(value):
+        return value
+    with contextlib.suppress(ValueError):
+        float(value)                       # a number with a sign stays one
+        return value
+    return "'" + value
+
+
+def _of_cell(cell: str) -> str:
+    """What `_as_cell` was given."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV table, whole or not at all."""
+    """Write a CSV table, whole or not at all; `read_table` gives back the same text."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(header)
-    table.writerows(rows)
+    table.writerows(map(_as_cell, row) for row in rows)
     write(path, text.getvalue())
 
 
@@ -49,7 +69,7 @@ def number_lines(rows: np.ndarray, number: str = "%.6g", separator: str = ",") -
 def number_table(header: Sequence[str], rows: np.ndarray, number: str = "%.6g") -> str:
     """A CSV table of numbers (T, K), K at least 2: `number_lines` below a heading."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(header)
+    csv.writer(text, lineterminator="\n").writerow(map(_as_cell, header))
     return "\n".join([text.getvalue()[:-1], *number_lines(rows, number), ""])
 
 
@@ -66,7 +86,7 @@ def table_rows(path: str | Path, data: bytes, error: type[StorageError] = Storag
         text = _text(data)
         separator = max(",;\t", key=text.split("\n", 1)[0].count)
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-        rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        rows = [(reader.line_num, [_of_cell(cell.strip()) for cell in cells]) for cells in reader]
     width = 0
     for _, cells in rows:
         while len(cells) > width and not cells[-1]:

@@ -10,10 +10,13 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
+from ..console import JUDGEMENT, Metric, judgement_of, split_figures
 from ..geometry.storage import write
+from ..judgement import Judgement
 from .scene import Pane, framed_alike, pack_scene, picture_panes
 from .sheets import png_bytes, webp_bytes
 
@@ -28,6 +31,8 @@ script.textContent = text;
 document.head.append(script);
 scapekit.start();
 })().catch((error) => { document.body.classList.add("sk-pictures-only"); throw error; });"""
+CODE = re.compile(r"`([^`\n]+)`")
+NUMBER = re.compile(r"[-+]?[\d,]*\.?\d+(e[-+]?\d+)?")
 BETWEEN_FOLDERS = re.compile(r"(?<=\w)/(?=\w)")     # a long path may break here on a narrow page
 
 
@@ -37,6 +42,7 @@ class Page:
     def __init__(self, title: str, lead: str = "") -> None:
         self.title, self.lead = title, lead
         self._parts: list[str] = []
+        self._verdict = ""
         self._styles: list[str] = []
         self._sections: list[str] = []
         self._scenes: list[bytes] = []
@@ -48,8 +54,15 @@ class Page:
         return self.text(text) if text else self
 
     def text(self, text: str) -> Page:
-        """Paragraphs, separated by empty lines."""
-        self._parts += [f"<p>{escape(block.strip())}</p>" for block in text.split("\n\n") if block.strip()]
+        """Paragraphs, separated by empty lines; what stands between backticks is set as code."""
+        self._parts += [f"<p>{_with_code(block.strip())}</p>" for block in text.split("\n\n") if block.strip()]
+        return self
+
+    def verdict(self, judgement: Judgement, following: str = "") -> Page:
+        """On top of the page: what the result is worth in one word, why, and what to do next in one sentence."""
+        reasons = f": {_with_code(judgement.why)}" if judgement.reasons else ""
+        below = f"<br>{_with_code(following)}" if following else ""
+        self._verdict = f'<p class="verdict {judgement.verdict}"><b>{judgement.verdict}</b>{reasons}{below}</p>\n'
         return self
 
     def markup(self, html: str, style: str = "") -> Page:
@@ -84,6 +97,19 @@ class Page:
         still = _figure(picture if isinstance(picture, bytes) else webp_bytes(picture), caption, "")
         return still.replace("<figure>", f'<figure data-scene="scene{len(self._scenes)}" data-height="{height}">', 1)
 
+    def figures(self, metrics: Sequence[Metric], header: Sequence[str] = ("figure", "value", "unit")) -> Page:
+        """The table of figures that a command prints, what it leaves out folded below, and its verdict on top."""
+        judgement = judgement_of(metrics)
+        if judgement is not None:
+            self.verdict(judgement)
+        main, more = split_figures(m for m in metrics if m.name != JUDGEMENT)
+        self.table([(m.name, m.text(), m.unit) for m in main], header)
+        if more:
+            self._parts.append("<details><summary>more figures</summary>")
+            self.table([(m.name, m.text(), m.unit) for m in more])
+            self._parts.append("</details>")
+        return self
+
     def table(self, rows: Iterable[Sequence[Any]], header: Sequence[str] = ()) -> Page:
         """A table; numbers are set flush right, floats with three significant figures."""
         head = "".join(f"<th>{escape(name)}</th>" for name in header)
@@ -105,13 +131,13 @@ class Page:
         """The whole page."""
         style = Path(__file__).with_name("page.css").read_text(encoding="utf-8") + "".join(self._styles)
         style += (VIEWER / "viewer.css").read_text(encoding="utf-8") if self._scenes else ""
-        lead = f'<p class="lead">{escape(self.lead)}</p>' if self.lead else ""
+        lead = f'<p class="lead">{_with_code(self.lead)}</p>' if self.lead else ""
         links = "".join(f'<a href="#s{i + 1}">{escape(s)}</a>' for i, s in enumerate(self._sections))
         nav = f'<nav aria-label="Contents">{links}</nav>' if len(self._sections) > 2 else ""
         return (f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
                 f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
                 f"<title>{escape(self.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
-                f"<header><h1>{escape(self.title)}</h1>{lead}{nav}</header>\n"
+                f"<header><h1>{escape(self.title)}</h1>{lead}{self._verdict}{nav}</header>\n"
                 + "\n".join(self._parts) + "\n</main>\n" + self._viewer() + "</body>\n</html>\n")
 
     def _viewer(self) -> str:
@@ -126,6 +152,16 @@ class Page:
         write(path, self.html())
 
 
+def link_to(name: str) -> str:
+    """The address of a file or folder beside a page, whatever its name holds."""
+    return quote(name, errors="surrogateescape")
+
+
+def _with_code(text: str) -> str:
+    """A sentence as HTML, commands and names of files between backticks set as code."""
+    return CODE.sub(r"<code>\1</code>", escape(text))
+
+
 def _carried(name: str, data: bytes) -> str:
     return f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n'
 
@@ -137,7 +173,7 @@ def _viewer_code() -> bytes:
 
 def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:
     data = image if isinstance(image, bytes) else png_bytes(image)
-    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    below = f"<figcaption>{_with_code(caption)}</figcaption>" if caption else ""
     source = data_uri(data)
     size = "" if isinstance(image, bytes) else f' width="{image.shape[1]}" height="{image.shape[0]}"'
     return f'<figure><img src="{source}" alt="{escape(alt or caption or "picture")}"{size}>{below}</figure>'
@@ -167,4 +203,5 @@ def _cell(value: Any) -> str:
     if isinstance(value, float | np.floating):
         shown = "–" if np.isnan(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
         return f'<td class="number">{shown}</td>'
-    return f"<td>{BETWEEN_FOLDERS.sub('/<wbr>', escape(str(value)))}</td>"
+    number = ' class="number"' if NUMBER.fullmatch(str(value)) else ""
+    return f"<td{number}>{BETWEEN_FOLDERS.sub('/<wbr>', _with_code(str(value)))}</td>"

@@ -177,7 +177,8 @@ def _shade(name: str, shade: Any, mesh: Mesh | None, columns: _Columns) -> dict[
         ramp = heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1, shade.colormap)
         return {"name": name or shade.title, "index": columns.add(index.astype(np.uint8)),
                 "palette": _hex(np.round(255 * ramp)),
-                "legend": {"title": shade.title, "low": shade.low, "high": shade.high, "unit": shade.unit}}
+                "legend": {"title": shade.title, "low": shade.low, "high": shade.high, "unit": shade.unit,
+                           "more": bool((shade.values > shade.high).any())}}
     colors = np.round(255 * np.asarray(shade, dtype=float)).clip(0, 255).astype(np.uint8)
     if colors.ndim == 1:
         return {"name": name, "palette": _hex(colors)}

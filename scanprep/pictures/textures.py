@@ -1,6 +1,7 @@
 """Textures: read with a scan, baked onto a body, written as GLB."""
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.format_common import UNITS
-from ..geometry.format_glb import VERTICES, Glb, chunks_of, some_normal, tallest, turn_up, up_of
+from ..geometry.format_common import load_bytes, metres_per_unit
+from ..geometry.format_glb import VERTICES, Glb, chunks_of, file_beside, some_normal, tallest, turn_up, up_of
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
 from ..geometry.surface import Rays, barycentric
 from .gltf import skin_material
 from .sheets import png_bytes
 
+LARGEST_PICTURE = 8192**2            # pixels; the largest that scanners write, 1.6 GB when it is worked with
 # colours and weights of places with normals
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -63,29 +65,73 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
         return None
     import trimesh
 
+    beside = _beside(path)
     try:
-        loaded = trimesh.load_mesh(path, process=False)
+        with open(path, "rb") as file:
+            loaded = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), resolver=beside, process=False)
     except Exception as error:           # trimesh raises whatever its readers raise
         raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
+    lost = "; ".join(beside.problems.values())
     visual = loaded.visual
     image = _picture(getattr(visual, "material", None))
     uv = getattr(visual, "uv", None)
     if image is None or uv is None or len(uv) != len(loaded.vertices):
         warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
-                      "its colours are left out", stacklevel=2)
+                      f"its colours are left out{f' ({lost})' if lost else ''}", stacklevel=2)
         return None
-    vertices = UNITS[unit or "m"] * np.asarray(loaded.vertices)
+    if lost:
+        warnings.warn(f"{path}: some of its pictures cannot be read, what they show is grey ({lost})", stacklevel=2)
+    vertices = np.asarray(loaded.vertices, dtype=np.float64)
+    with warnings.catch_warnings():          # whoever reads the mesh tells its unit
+        warnings.simplefilter("ignore", UserWarning)
+        vertices = metres_per_unit(path, vertices, unit) * vertices
     if path.suffix.lower() == ".glb":
-        vertices = vertices @ turn_up(up_of(chunks_of(path, path.read_bytes())[0]))
+        vertices = vertices @ turn_up(up_of(chunks_of(path, load_bytes(path))[0]))
     mesh = Mesh(vertices, np.asarray(loaded.faces))
     return Texture(mesh, np.asarray(uv, dtype=np.float64), image)
+
+
+def _beside(path: Path) -> Any:
+    """What gives trimesh the files that a mesh names, and keeps why one cannot be had.
+
+    They lie beside the mesh or below; a small file may unpack to a picture that fills the memory.
+    """
+    from PIL import Image
+    from trimesh.resolvers import Resolver
+
+    class Beside(Resolver):
+        def __init__(self) -> None:
+            self.problems: dict[str, str] = {}
+
+        def get(self, name: str) -> bytes:
+            try:
+                data = load_bytes(file_beside(path, name.strip()))
+                if not name.lower().endswith((".mtl", ".bin")):
+                    width, height = Image.open(io.BytesIO(data)).size
+                    if width * height > LARGEST_PICTURE:
+                        raise ValueError(f"{name.strip()}: {width} x {height} pixels, expected at most 8192 x 8192")
+                return data
+            except (OSError, ValueError, Image.DecompressionBombError) as problem:
+                self.problems[name.strip()] = " ".join(str(problem).split())
+                raise FileNotFoundError(name) from problem
+
+        def write(self, name: str, data: bytes) -> None:
+            raise NotImplementedError
+
+        def keys(self) -> list[str]:
+            return []
+
+        def namespaced(self, namespace: str) -> Any:
+            return self
+
+    return Beside()
 
 
 def _names_a_picture(path: Path) -> bool:
     ending = path.suffix.lower()
     if ending not in (".obj", ".glb"):
         return False
-    data = path.read_bytes()
+    data = load_bytes(path)
     return b"mtllib" in data if ending == ".obj" else b'"images"' in data
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
+from ..arguments import Place
 from ..batch.opening import workspace
 from ..batch.workspace import Workspace
 from ..cleaning.clean_scan import CleanScanConfig
-from ..cli import MM, Output, SetArg
+from ..cli import MM, Output, Person, SetArg
 from ..console import Metric, Outcome, bar, say
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement, judge_many
@@ -23,11 +23,11 @@ from .page import PAGE, judge_set, write_set_page
 from .prepare import PrepareConfig, Prepared, Progress, prepare
 from .scans import ScanTask
 
-ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
+ScansArg = Annotated[Path, Place("SCANS")]
 
 
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
-            template_landmarks: Path | None = None, clean: bool = False, subject: str = "",
+            template_landmarks: Path | None = None, clean: bool = False, subject: Annotated[str, Person] = "",
             config: PrepareConfig = PrepareConfig(), *, space: Workspace) -> Outcome:                # noqa: B008
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 
@@ -66,7 +66,9 @@ def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], 
     verdicts = judge_set(space.folder)
     return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(verdicts),
                                   Metric("unit assumed", call.config.scan.unit or "m")],
-                   {"prepare": call.config}, list(done.failures), judgement=_of_set(verdicts))
+                   {"prepare": call.config}, list(done.failures), judgement=_of_set(verdicts),
+                   following=f"open {space.folder / 'report.html'}, then "
+                             f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
 
 def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B008

@@ -4,11 +4,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..console import visible
 from ..geometry import storage, tables
-from ..geometry.files import MeshFileError, name_of
+from ..geometry.files import SCAN_ENDINGS, MeshFileError, ending_of, name_of
 from ..geometry.landmarks import landmarks_beside
 
-SCAN_ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".xyz", ".pcd", ".pts")
 TABLE = "scans.csv"
 ABOUT = {"digest": False}         # what is only told in tables: no registration depends on it
 
@@ -58,6 +58,9 @@ def _list_scans(folder: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in sorted(filter(_is_scan, folder.iterdir())):
         name = name_of(path)
+        if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
+            raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
+                             "rename it")
         if name in found:
             raise ValueError(f"{folder}: expected one file a scan, found {found[name].name} and {path.name}, both "
                              f"of the name '{name}'; rename one, or merge them where they are views of one scan")
@@ -70,8 +73,7 @@ def _list_scans(folder: Path) -> dict[str, Path]:
 
 
 def _is_scan(path: Path) -> bool:
-    name = path.name.lower()
-    return name.endswith(SCAN_ENDINGS) and not name.startswith(".") and path.is_file()
+    return ending_of(path) in SCAN_ENDINGS and not path.name.startswith(".") and path.is_file()
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:

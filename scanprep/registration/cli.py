@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
+from ..arguments import Place
 from ..cli import MM, MeshArg, Output, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import find_correspondences
@@ -35,7 +35,7 @@ from .person import PersonParts, person_parts, stature
 from .repair import repaired
 from .schedule import RegistrationConfig
 
-TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
+TargetArg = Annotated[Path, Place("TARGET")]
 
 
 def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,
@@ -44,6 +44,15 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
     """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
 
     Example: scape prep align front.ply back.ply -o front_aligned.ply
+
+    Args:
+        source: Mesh to move.
+        target: Mesh that stays.
+        output: Mesh to write, the moved one.
+        landmarks: Landmarks of the mesh that is moved.
+        target_landmarks: Those of the other, with the same names.
+        unit: Unit of both meshes and of their landmarks.
+        config: Settings.
     """
     moving, fixed = read_mesh(source, unit), read_mesh(target, unit)
     T = np.eye(4)

@@ -91,7 +91,13 @@ def placed(given: Inputs) -> np.ndarray:
     elif given.landmarks is not None:
         vertices, points = given.landmarks
     else:
-        return align_rigid(template, target.points).T_target_source
+        # From where it lies, or where both are far apart from the same middle: ICP finds what is near.
+        T = np.eye(4)
+        apart = (target.points.max(axis=0) + target.points.min(axis=0)
+                 - template.vertices.max(axis=0) - template.vertices.min(axis=0)) / 2
+        if np.linalg.norm(apart) > given.size / 2:
+            T[:3, 3] = apart
+        return align_rigid(template, target.points, start=T).T_target_source
     return landmark_motion(template.vertices[vertices], points)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..geometry.mesh import Mesh, template_problem
 from ..geometry.surface import Rays, SeenSpace, Surface
-from ..ranges import FLAG, Count, Positive, Range, Settings
+from ..ranges import Count, Positive, Range, Settings
 from .hole_patch import Patch
 from .intersections import intersecting_faces
 from .loops import group_loops, joined_polygon
@@ -41,7 +41,7 @@ class FillConfig(Settings):
         Octree depth of the Poisson methods.
     """
 
-    method: Annotated[Method, FLAG] = "auto"
+    method: Method = "auto"
     max_edges: Count | None = None
     density: Positive = 2 ** 0.5
     join: bool = True

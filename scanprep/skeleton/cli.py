@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 
-from ..cli import Output, Unit, read_poses
+from ..arguments import Place
+from ..cli import Output, Person, Unit, read_poses
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..geometry.files import read_mesh
@@ -19,12 +19,13 @@ from .find import SkeletonSearch, search_skeleton, skeleton_problem
 from .parts import SkeletonConfig
 from .tree import Skeleton
 
-PosesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
-SkeletonArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SKELETON")]
+PosesArg = Annotated[Path, Place("POSES")]
+SkeletonArg = Annotated[Path, Place("SKELETON")]
 
 
-def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subject: str | None = None,
-             unit: Unit | None = None, config: SkeletonConfig = SkeletonConfig()) -> Outcome:  # noqa: B008
+def skeleton(poses: PosesArg, output: Output, template: Path | None = None,
+             subject: Annotated[str | None, Person] = None, unit: Unit | None = None,
+             config: SkeletonConfig = SkeletonConfig()) -> Outcome:  # noqa: B008
     """Rigid parts, joints and a tree from meshes of one person that share their triangles.
 
     Example: scape prep skeleton set -o skeleton.json

@@ -1,50 +1,143 @@
-"""From range views to a clean mesh: `scape prep views`, `merge`, `fill`, `decimate`, `template`."""
+"""From scans and range views to a clean mesh: `scape prep template`, `repair`, `views`, `merge`, `fill`, ..."""
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from ..alignment.views import AlignViewsConfig, align_views, views_problem
+from ..arguments import Called, Place, UsageError
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan, cleaning_doubts
 from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
-from ..console import Metric, Outcome, bar
+from ..console import Metric, Outcome, bar, say
 from ..dataset import RegisteredSet
 from ..decimation.decimate import DecimateConfig, decimate
 from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
-from ..geometry.files import UNITS, PointCloud, list_meshes, name_of, read_mesh, read_scan, write_mesh, write_points
-from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
+from ..geometry.files import (
+    UNITS,
+    PointCloud,
+    common_unit,
+    is_scan,
+    list_meshes,
+    name_of,
+    read_mesh,
+    read_points,
+    read_scan,
+    read_scan_mesh,
+    write_mesh,
+    write_points,
+)
+from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh, template_problem
-from ..geometry.sanitise import sanitise
 from ..judgement import Judgement
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
-from .template import make_template
+from ..repair.manifold import repair
+from .cloud import read_surface
+from .template import carry_landmarks, make_template, template_of_scan, views_without_cameras
 
-ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
+ScansArg = Annotated[tuple[Path, ...], Place("SCAN ...")]
+ViewsArg = Annotated[Path, Place("VIEWS")]
 
 
-def template_of_views(views: ViewsArg, output: Output, faces: Faces = 14000, unit: Unit | None = None) -> Outcome:
-    """Merge range views, close the holes, and decimate to a template.
+def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: Path | None = None,
+             unit: Unit | None = None) -> Outcome:
+    """Make a template of your best scan: the body alone, repaired, its holes filled, decimated.
 
-    Example: scape prep template views --faces 12000 -o template.ply
+    Landmarks are carried to it. Several files are views of one moment, which are aligned and merged; point clouds are
+    meshed.
+
+    Example: scape prep template "2024.05.01 anna.ply" -o template.ply
 
     Args:
-        views: Folder of range meshes in one frame, and cameras.json: {file name without ending: [x, y, z]}.
-        output: Mesh to write.
+        scans: One scan of the whole body, mesh or point cloud; or several views of it; or a folder of views, with
+            cameras.json: {file name without ending: [x, y, z]} where the cameras are known.
+        output: Mesh to write; its landmarks go beside it.
         faces: Triangles of the template.
-        unit: Unit of the views and cameras.
+        landmarks: Landmarks of the scan; else the file of its name beside it.
+        unit: Unit of the scans, their cameras and landmarks.
     """
-    seen = _read_views(views, unit)
-    with bar("making the template") as progress:
-        made = make_template(seen, faces, progress=progress)
+    if not scans:
+        raise ValueError("SCAN: expected a scan of the whole body, or views of it, got none")
+    notes: tuple[str, ...] = ()
+    rows, doubts, marks = list[Metric](), list[str](), dict[str, int]()
+    if len(scans) == 1 and (scans[0] / "cameras.json").exists():
+        seen = _read_views(scans[0], unit)
+        with bar("making the template") as progress:
+            made = make_template(seen, faces, progress=progress)
+        rows = [Metric("views", len(seen))]
+    else:
+        paths = [path for given in scans for path in (_files_of(given) if given.is_dir() else [given])]
+        views = [_read_body(path, unit) for path in paths]
+        scan = views[0] if len(views) == 1 else views_without_cameras(views)
+        path = landmarks or (landmarks_beside(paths[0]) if len(paths) == 1 else None)
+        surface = scan if isinstance(scan, Mesh) else scan.points
+        places = {} if path is None else read_landmarks(path, surface, unit)
+        with bar("making the template") as progress:
+            done = template_of_scan(scan, faces, landmarks=np.array(list(places.values())) if places else None,
+                                    progress=progress)
+        made, notes, doubts = done.mesh, done.notes, list(done.doubts)
+        rows = [Metric("files", len(paths)),
+                Metric("filled, where nothing was scanned", 100 * done.filled, "% of the surface")]
+        if done.balance is not None:
+            rows.append(Metric("triangles on the left side", 100 * done.balance, "%"))
+        marks, far = carry_landmarks(places, made)
+        doubts += [f"landmark {name} is {MM * away:.0f} mm from the template" for name, away in far.items()]
     write_mesh(output, made)
-    return Outcome(output, [Metric("views", len(seen)), *about_mesh(made)],
-                   judgement=_as_template(made))
+    if marks:
+        write_landmarks(output.with_name(f"{name_of(output)}.landmarks.json"), marks)
+    for note in notes:
+        say(f"note: {note}")
+    return Outcome(output, [*rows, Metric("landmarks carried", len(marks)), *about_mesh(made)],
+                   judgement=_as_template(made).joined(Judgement.of(check=doubts)))
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """The meshes and point clouds of a folder of views, by name."""
+    found = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and is_scan(path)
+                   and ".landmarks." not in path.name)
+    if not found:
+        raise ValueError(f"{folder}: expected views, meshes or point clouds, found none")
+    return found
+
+
+def _read_body(path: Path, unit: Unit | None) -> Mesh | PointCloud:
+    """A scan with the normals of its points, which meshing them wants."""
+    found = read_scan(path, unit)
+    return found if isinstance(found, Mesh) else read_points(path, unit)
+
+
+def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None) -> Outcome:
+    """Make a mesh manifold: degenerate, repeated and inverted triangles, sheets that touch, and loose pieces go.
+
+    Holes stay open, and where a fault is cut out there is one more: scape prep fill closes them.
+
+    Example: scape prep repair scan.ply -o repaired.ply
+
+    Args:
+        mesh: Mesh.
+        output: Mesh to write.
+        unit: Unit of the mesh.
+    """
+    before = read_mesh(mesh, unit)
+    after = repair(before)
+    write_mesh(output, after)
+    return Outcome(output, [Metric("fault found first", template_problem(before) or "none"),
+                            Metric("triangles before", len(before.faces)), *about_mesh(after)],
+                   judgement=_as_template(after))
+
+
+def _manifold(mesh: Mesh, path: Path) -> Mesh:
+    """The mesh, repaired first where it is not manifold, which is said."""
+    if mesh.is_edge_manifold and mesh.is_vertex_manifold:
+        return mesh
+    mended = repair(mesh, 0.0)
+    say(f"note: {path} is not manifold; it is repaired first, as scape prep repair does: "
+        f"{len(mesh.faces) - len(mended.faces)} of {len(mesh.faces)} triangles go")
+    return mended
 
 
 def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Unit | None = None,
@@ -68,14 +161,17 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
         write_mesh(output, found.scan)
     else:
         write_points(output, PointCloud(found.scan, None, None))
+    pieces: dict[str, list[int]] = {}                       # one row for a reason: a noisy cloud has hundreds of pieces
+    for piece in found.components:
+        pieces.setdefault(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", []).append(piece.points)
     return Outcome(output, [
         Metric("points before", len(found.kept)), Metric("points", int(found.kept.sum())),
-        *(Metric(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", piece.points, "points")
-          for piece in found.components)], {"clean": config}, judgement=Judgement.of(check=cleaning_doubts(found)))
+        *(Metric(f"{why}, {len(points)} pieces" if len(points) > 1 else why, sum(points), "points")
+          for why, points in pieces.items())], {"clean": config}, judgement=Judgement.of(check=cleaning_doubts(found)))
 
 
-def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None, features: bool = False,
-                  unit: Unit | None = None,
+def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None,
+                  features: Annotated[bool, Called("--by-shape")] = False, unit: Unit | None = None,
                   config: AlignViewsConfig = AlignViewsConfig()  # noqa: B008
                   ) -> Outcome:
     """Bring range views into one frame, all of them together.
@@ -145,14 +241,15 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
     Example: scape prep fill body.ply -o closed.ply
 
     Args:
-        mesh: Mesh with holes.
+        mesh: Mesh with holes, or point cloud.
         output: Mesh to write.
         views: Folder of the range meshes it was merged from, and their cameras.json: space that they look through is
             left empty.
         unit: Unit of the mesh, the views and the cameras.
         config: Settings.
     """
-    before = sanitise(read_mesh(mesh, unit), str(mesh))
+    found = read_surface(mesh, unit)
+    before = found if found.is_edge_manifold else _manifold(found, mesh)
     seen = _read_views(views, unit) if views else ()
     holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
@@ -190,10 +287,13 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
         wrong = [name for name, given in (("landmarks", landmarks), ("unit", unit),
                                           ("method", config.method != DecimateConfig().method)) if given]
         if wrong:
-            raise ValueError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
+            raise UsageError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
         return _reduce_set(mesh, output, faces, of_set)
-    before = sanitise(read_mesh(mesh, unit), str(mesh))
-    keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
+    given = read_scan_mesh(mesh, unit)
+    before, keep = _manifold(given, mesh), None
+    if landmarks:
+        places = {name: given.vertices[v] for name, v in read_landmark_vertices(landmarks, given, unit).items()}
+        keep = np.array(list(carry_landmarks(places, before)[0].values()))
     with bar("decimating") as progress:
         after = decimate(before, faces, config, keep, progress=progress)
     write_mesh(output, after)
@@ -226,5 +326,6 @@ def _read_views(folder: Path, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]
         if missing:
             raise ValueError(f"none for {', '.join(missing)}")
         where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
-        places = [UNITS[unit or "m"] * storage.numbers(where, name_of(path), 3) for path in paths]
-    return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]
+        common = common_unit(paths, unit)
+        places = [UNITS[common or "m"] * storage.numbers(where, name_of(path), 3) for path in paths]
+    return [(read_mesh(path, common), place) for path, place in zip(paths, places, strict=True)]

@@ -1,20 +1,31 @@
-"""From raw views of one subject to the template of all registrations."""
+"""From one scan of a subject, or range views, to the template of all registrations."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from ..alignment.views import AlignViewsConfig, align_views
+from ..cleaning.clean_scan import clean_scan
 from ..decimation.decimate import DecimateConfig, decimate
 from ..fusion.tsdf import MergeConfig, merge_views
-from ..geometry.mesh import Mesh, check_template
+from ..geometry.files import PointCloud
+from ..geometry.mesh import Mesh, check_template, template_problem
 from ..geometry.remeshing import improve_triangles, smooth
 from ..geometry.surface import Surface
 from ..ranges import Settings
 from ..repair.hole_filling import FillConfig, close
 from ..repair.manifold import drop_thin, repair
+from ..skeleton.symmetry import find_symmetry
+from .cloud import AWAY, mesh_of_cloud, mesh_of_view
+
+ONE_PIECE = 0.9                        # of the surface of a body that is one mesh hangs together
+MOST_FILLED = 0.05                     # of a surface, beyond which its shape is half a guess
+OFF = 0.01                             # metres from the template at which a landmark was clicked on something else
+UNEVEN = 0.03                          # of all triangles that one side may have more of than its area lets expect
 
 
 @dataclass(frozen=True)
@@ -47,18 +58,150 @@ def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConf
     serve as a template.
     """
     config = config or TemplateConfig()
-    tell = progress or (lambda done, total: None)
-    mesh = merge_views(views, config.merge)
+    return _finish(merge_views(views, config.merge), faces, config, progress, "the merged views").mesh
+
+
+@dataclass(frozen=True, eq=False)
+class MadeTemplate:
+    """A template, and what was done to the scan that it was made of."""
+
+    mesh: Mesh
+    notes: tuple[str, ...]              # one sentence each
+    filled: float                       # share of the surface that lies where nothing was scanned
+    handles: int                        # where the surface is joined to itself, as between thighs that touch
+    balance: float | None               # share of the triangles on the left of the body; None where it has no sides
+
+    @property
+    def doubts(self) -> list[str]:
+        """What somebody should look at before scans are registered with it."""
+        return [*([f"{100 * self.filled:.0f}% of the surface is filled, nothing was scanned there"]
+                  if self.filled > MOST_FILLED else []),
+                *([f"the surface is joined to itself in {self.handles} places: thighs, armpits or fingers that touch"]
+                  if self.handles else [])]
+
+
+def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: TemplateConfig | None = None,
+                     landmarks: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None
+                     ) -> MadeTemplate:
+    """One scan of a whole body to a closed manifold mesh: the body alone, repaired, filled, decimated.
+
+    Parameters
+    ----------
+    scan : Mesh or PointCloud, metres
+        Points, and meshes in which several views lie over each other, are meshed anew.
+    faces : int
+        Triangles of the template.
+    config : TemplateConfig, optional
+    landmarks : (L, 3) float, metres, optional
+        Points on the body, where it is not the largest thing in the scan.
+    progress : callable, optional
+        Called with (done, total).
+
+    Raises
+    ------
+    ValueError
+        Nothing that can serve as a template is left.
+
+    [Liepa] hole filling; [QEM] pair contraction
+    """
+    config = config or TemplateConfig()
+    points = scan.vertices if isinstance(scan, Mesh) else scan.points
+    kept = clean_scan(scan if isinstance(scan, Mesh) else points, landmarks=landmarks).kept
+    notes = [] if kept.all() else [f"{(~kept).sum()} of {len(kept)} points were no part of the body"]
+    if isinstance(scan, Mesh):
+        body = scan.submesh(kept[scan.faces].all(axis=1))[0]
+        mesh = repair(body)
+        if mesh.face_areas.sum() < ONE_PIECE * body.face_areas.sum():
+            notes.append("its pieces lie side by side or over each other: their points were meshed anew")
+            mesh = mesh_of_cloud(PointCloud(body.vertices, body.vertex_normals))
+        elif template_problem(body):
+            notes.append(f"repaired: {template_problem(body)}")
+    else:
+        normals = None if scan.normals is None else scan.normals[kept]
+        mesh = mesh_of_cloud(PointCloud(points[kept], normals))
+        notes.append("points without triangles were meshed")
+    made = _finish(mesh, faces, config, progress, "the scan")
+    return replace(made, notes=(*notes, *made.notes))
+
+
+def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
+    """Range views of which nobody knows the cameras, aligned: their points and normals, as one cloud.
+
+    They are a few centimetres and degrees from where they belong, or anywhere, then they are placed by their shapes
+    first. ValueError for a view that shares too little with the others.
+    """
+    placed = []
+    for view in views:
+        if isinstance(view, Mesh):
+            ahead = view.vertex_normals.mean(axis=0)
+            placed.append((view, view.vertices.mean(axis=0) + AWAY * ahead / max(np.linalg.norm(ahead), 1e-12)))
+        else:
+            placed.append(mesh_of_view(view))
+    found = align_views(placed)
+    apart = found.overlap < AlignViewsConfig().min_overlap
+    if len(views) > 1 and apart.any():
+        found = align_views(placed, features=True)
+        apart = found.overlap < AlignViewsConfig().min_overlap
+    if len(views) > 1 and apart.any():
+        raise ValueError(f"view {int(apart.argmax()) + 1} shares {100 * found.overlap.min():.0f}% of its surface with "
+                         "the others; views need about a fifth in common: leave it out, or align the views first "
+                         "(scape prep views, with landmarks)")
+    meshes = [mesh for mesh, _ in found.views]
+    return PointCloud(np.concatenate([mesh.vertices for mesh in meshes]),
+                      np.concatenate([mesh.vertex_normals for mesh in meshes]))
+
+
+def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[int, int], None] | None, what: str
+            ) -> MadeTemplate:
+    """Smooth, fill and decimate an open surface."""
+    tell, notes = progress or (lambda done, total: None), list[str]()
     tell(1, 4)
-    mesh = smooth(repair(mesh), config.smoothing)      # smooth rims make fair patches
+    mesh = repair(mesh)
+    # as wide as on merged views: on coarse scans as many rounds would round off fingers
+    rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
+    scanned = mesh = smooth(mesh, rounds)                        # smooth rims make fair patches
+    holes = len(mesh.boundary_loops)
+    if holes:
+        notes.append(f"{holes} holes were filled")
     tell(2, 4)
     mesh = close(mesh, config.fill)
-    mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), config.smoothing)
+    mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), rounds)
     tell(3, 4)
     surface = Surface(mesh)
-    mesh = improve_triangles(decimate(mesh, faces, config.decimate), surface)
     if mesh.volume < 0:
         mesh = Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colors)
-    check_template(mesh, "the merged views")
+    small = improve_triangles(decimate(mesh, faces, config.decimate), surface)
+    balance = left_share(small)
+    if balance is not None and abs(balance - 0.5) > UNEVEN:
+        # collapses of least error spend triangles on the noise of one side; those of shortest edges do not
+        small = improve_triangles(decimate(mesh, faces, replace(config.decimate, method="even")), surface)
+        notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, "
+                     f"{100 * (left_share(small) or 0.5):.0f}% are")
+        balance = left_share(small)
+    if template_problem(small):                                  # a triangle that decimation left without area
+        small = close(small, config.fill)
+    check_template(small, what)
+    far = Surface(scanned).closest(small.corners.mean(axis=1)).distances > scanned.mean_edge
     tell(4, 4)
-    return mesh
+    handles = 1 - (len(small.vertices) - len(small.edges) + len(small.faces)) // 2
+    return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), handles,
+                        balance)
+
+
+def carry_landmarks(places: Mapping[str, np.ndarray], mesh: Mesh) -> tuple[dict[str, int], dict[str, float]]:
+    """The vertices of a mesh nearest to landmarks (3,), and the distances, metres, of those that lie off it."""
+    if not places:
+        return {}, {}
+    away, vertices = cKDTree(mesh.vertices).query(np.array(list(places.values())))
+    reach = OFF + mesh.mean_edge
+    return (dict(zip(places, vertices.tolist(), strict=True)),
+            {name: float(d) for name, d in zip(places, away, strict=True) if d > reach})
+
+
+def left_share(mesh: Mesh) -> float | None:
+    """The share of the triangles on one side of the body's plane of symmetry; None where it has none."""
+    found = find_symmetry(mesh)
+    if not found.holds or not found.two_sided:
+        return None
+    by_area = float(mesh.face_areas[found.left].sum() / mesh.face_areas.sum())
+    return float(found.left.mean()) - by_area + 0.5              # a leg ahead, or a body turned, is no imbalance

@@ -86,7 +86,7 @@ class BodyShape(Settings):
         scale = {"weight": 0.9, "muscle": 0.8, "belly": 0.7, "chest": 0.8, "limbs": 0.7}
         for field in fields(BodyShape)[2:]:
             values[field.name] = scale.get(field.name, 0.9) * rng.normal()
-        allowed = {name: (found.low, found.high) for name, (found, _) in ranges(BodyShape).items()}
+        allowed = {name: (found.low, found.high) for name, found in ranges(BodyShape).items()}
         return BodyShape(**{name: float(np.clip(v, *allowed[name])) for name, v in values.items()})
 
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
+from ..arguments import Place
 from ..cli import MeshArg, Unit
 from ..console import Metric, Outcome, bar
 from ..pipeline.scans import find_scans
@@ -15,7 +14,7 @@ from .clicked import Clicked
 from .landmark_names import read_names
 from .pick import PickApp
 
-ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[SCAN ...]")]
+ScansArg = Annotated[tuple[Path, ...], Place("[SCAN ...]")]
 Port = Annotated[int, Range(0, 65535)]
 Ending = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd", "txt"]
 

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from ..alignment.icp import landmark_motion
 from ..depth_camera.picture import is_picture, read_depth
 from ..geometry.files import UNITS, name_of, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
@@ -21,6 +23,7 @@ from ..pictures.thinning import thinned
 from .surface_clicks import Clickable
 
 MOST_DOTS = 150_000                  # of a cloud
+TRIED = 1500                         # points of a body by which it is turned as another
 KEPT = ".before"                     # ending of the copy of a landmark file as it was found
 
 Places = dict[str, np.ndarray]
@@ -123,6 +126,36 @@ def camera_of(shape: Mesh | np.ndarray) -> Camera:
     body = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
     up, front = upright(body)
     return Camera.around(body.vertices, front, up=up)
+
+
+def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
+                landmarks: tuple[np.ndarray, np.ndarray] | None) -> Camera:
+    """A view of a body from the side from which a camera sees a template, points (n, 3).
+
+    By landmarks (L, 3) of both, at least three; else by the turn about the vertical in which both lie nearest.
+    """
+    own = camera_of(body)
+    points = body.vertices if isinstance(body, Mesh) else body
+    if landmarks is not None:
+        R_body_template = landmark_motion(*landmarks)[:3, :3]
+        side = R_body_template @ first.axes[2]
+        return Camera.from_side(points, side, own.vertical) if abs(side @ own.vertical) < 0.9 else own
+
+    def seen(camera: Camera, all_points: np.ndarray, turn: float = 0.0) -> np.ndarray:
+        """Some points, right, up and towards the camera that is turned, as shares of their height."""
+        flat = camera.axes[2] - (camera.axes[2] @ camera.vertical) * camera.vertical
+        flat = flat / np.linalg.norm(flat)
+        right = np.cross(camera.vertical, flat)
+        back, across = np.cos(turn) * flat + np.sin(turn) * right, np.cos(turn) * right - np.sin(turn) * flat
+        few = all_points[np.random.default_rng(0).permutation(len(all_points))[:TRIED]]
+        found = few @ np.stack([across, camera.vertical, back]).T
+        return np.asarray((found - np.median(found, axis=0)) / max(float(np.ptp(found[:, 1])), 1e-12))
+
+    target = cKDTree(seen(first, template))
+    turns = np.radians(np.arange(0, 360, 15))
+    best = min(turns, key=lambda turn: float(target.query(seen(own, points, turn))[0].mean()))
+    right = np.cross(own.vertical, own.axes[2])
+    return Camera.from_side(points, np.cos(best) * own.axes[2] + np.sin(best) * right, own.vertical)
 
 
 def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], body: Clickable,

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arguments import UsageError
 from ..geometry.landmark_names import TEN
 from ..geometry.sides import other_side
 
@@ -25,7 +26,7 @@ def read_names(given: str) -> tuple[str, ...]:
         return LISTS[given]
     path = Path(given)
     if not path.is_file():
-        raise ValueError(f"--names: expected {', '.join(LISTS)}, or a text file with one name in each line; there is "
+        raise UsageError(f"--names: expected {', '.join(LISTS)}, or a text file with one name in each line; there is "
                          f"no file {given}")
     names = [" ".join(line.split()) for line in path.read_text(encoding="utf-8").splitlines()]
     names = [name for name in names if name and not name.startswith("#")]

@@ -8,24 +8,28 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..console import say
+from ..depth_camera.picture import is_picture
+from ..geometry.landmark_names import landmark_name, paired_names
 from ..geometry.mesh import Mesh
 from ..geometry.sides import other_side
-from ..pictures.scene import pack_scene
+from ..judgement import extent
+from ..pictures.scene import Pane, pack_scene
 from .app import Send
-from .clicked import Clicked, Places, predict_landmarks
+from .clicked import Clicked, Places, camera_like, camera_of, predict_landmarks
 from .landmark_names import next_name
 from .messages import Message
 from .worker import Stopped
 
 TEMPLATE, SCAN = 0, 1                # panes
 ENOUGH = 4                           # landmarks from which the others can be predicted
+FAR = 0.06                           # of a scan's size, 12 cm on a person: predictions are nearer, but for hidden limbs
 SLIDES = -1                          # movements by key are one as long as they follow each other
 
 
@@ -51,8 +55,12 @@ class PickApp:
         if fixed is not None:                                    # a model's own: nothing to click or to save
             template.places = dict(fixed)
         self.fixed = fixed is not None
-        known = [*template.places, *(name for one in self.scans for name in one.places)]
-        self.names = tuple(dict.fromkeys([*known, *names]))
+        known = list(dict.fromkeys([*template.places, *(name for one in self.scans for name in one.places)]))
+        meant = {landmark_name(name) for name in known}
+        self.names = (*known, *(name for name in names if landmark_name(name) not in meant))
+        self.building = not template.places                      # names are still added to the template
+        self.alternating: int | None = None                      # pane that the chosen name was just clicked on
+        self.question: dict[str, Any] | None = None              # about a click far from where it was expected
         self.done: list[Change] = []
         self.undone: list[Change] = []
         self.chosen: str | None = None
@@ -77,8 +85,22 @@ class PickApp:
         """All panes."""
         panes = [self.template.pane(self.template.path.name)]
         if self.scan is not None:
-            panes.append(self.scan.pane(self.scan.path.name))
+            panes.append(self.scan_pane())
         return Message("scene", {}, pack_scene(panes))
+
+    def scan_pane(self) -> Pane:
+        """The scan that is shown, from the side from which the template is shown."""
+        assert self.scan is not None
+        pane = self.scan.pane(self.scan.path.name)
+        if is_picture(self.scan.path):
+            return pane
+        pairs = paired_names(self.template.places, self.scan.places)
+        template, body = self.template.body.points, self.scan.body.shape
+        landmarks = None
+        if len(pairs) >= ENOUGH:
+            landmarks = (np.array([self.template.places[ours] for ours, _ in pairs]),
+                         np.array([self.scan.places[theirs] for _, theirs in pairs]))
+        return replace(pane, camera=camera_like(camera_of(self.template.body.shape), template, body, landmarks))
 
     def state(self) -> Message:
         """Everything but the bodies."""
@@ -92,7 +114,8 @@ class PickApp:
             "panes": [{"places": _lists(one.places), "predicted": _lists(one.predicted), "file": one.file.name}
                       for one in shown],
             "scan": self.current, "scans": [{"name": one.path.name, "count": len(one.places)} for one in self.scans],
-            "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": ENOUGH}
+            "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": ENOUGH,
+            "question": self.question}
 
     def more(self) -> dict[str, Any]:
         """What an app that is built on this one adds to the state."""
@@ -106,7 +129,7 @@ class PickApp:
         if action is None:
             raise ValueError(f"a message of kind '{message.kind}', which nothing here answers")
         with self._lock:
-            self.note = ""
+            self.note, self.question = "", None
             action(send, **message.fields)
         send(self.state())
 
@@ -121,9 +144,13 @@ class PickApp:
                  inside: bool = False, seen: list[float] | None = None, drag: int = 0) -> None:
         """A landmark where a ray meets the surface; one inside is half way to where the ray leaves the body.
 
-        The places of one drag, which has a number, are undone as one.
+        The places of one drag, which has a number, are undone as one. After a click on one pane the same name is
+        wanted on the other; a second click on the same pane is the next name's.
         """
         one = self._editable(pane)
+        if not drag and name == self.chosen and self.alternating == pane:
+            offered = self.names if pane == TEMPLATE or self.building else self._of_template()
+            name = next_name(offered, set(one.places), name) or name
         body, ray = one.body, (_point(origin), _point(direction))
         place = body.middle(*ray) if inside else body.hit(*ray)
         if place is None and seen is not None:                   # the ray met the thinned surface, and just not ours
@@ -131,10 +158,26 @@ class PickApp:
         if place is None:
             self.note = "the click met nothing: turn the body so that the place faces you"
             return
+        self.building |= pane == TEMPLATE
         self._change(self._number(pane), {self._named(name): place}, drag)
         if not drag:
             self.choose_next(name, pane)
+            self._ask_if_far(pane, name, place)
         self._predict_if_time(send, pane)
+
+    def _ask_if_far(self, pane: int, name: str, place: np.ndarray) -> None:
+        """Question a click on the scan that is far from where the landmark was predicted."""
+        one = self._of(self._number(pane))
+        expected = one.predicted.get(name)
+        away = 0.0 if expected is None else float(np.linalg.norm(place - expected))
+        if pane == SCAN and away > FAR * extent(one.body.points):
+            self.chosen, self.alternating = name, None
+            self.question = {"name": name, "away": away,
+                             "text": f"This is {100 * away:.0f} cm from where “{name}” was expected: keep it?"}
+
+    def on_keep(self, send: Send, name: str) -> None:
+        """The landmark is where it should be, however far from where it was expected."""
+        self.choose_next(name, SCAN)
 
     def on_slide(self, send: Send, pane: int, name: str, direction: list[float], by: float) -> None:
         """Move a landmark along a ray, metres: into the body, to where a joint is."""
@@ -163,7 +206,7 @@ class PickApp:
 
     def on_choose(self, send: Send, name: str) -> None:
         """The landmark that the next click sets; a new name joins the list."""
-        self.chosen = self._named(name)
+        self.chosen, self.alternating = self._named(name), None
 
     def on_open(self, send: Send, scan: int) -> None:
         """Another scan."""
@@ -200,14 +243,24 @@ class PickApp:
     # the state itself
 
     def choose_next(self, last: str | None, pane: int = SCAN) -> None:
-        """Offer the next name: one that the template lacks while it is clicked on, then those that the scan lacks."""
-        template, scan = self.template.places, self.scan.places if self.scan else {}
-        missing = [name for name in self.names if name not in template]
-        if self.scan is None or not template or (pane == TEMPLATE and missing):
+        """Offer the same name where the other pane lacks it, else the next that one of the two lacks.
+
+        Names that a template lacks which came with landmarks are offered only when somebody clicks on it.
+        """
+        template, scan, self.alternating = self.template.places, self.scan.places if self.scan else {}, None
+        other = scan if pane == TEMPLATE else template
+        if self.scan is not None and not self.fixed and last in (template if pane == TEMPLATE else scan) and \
+                last not in other and (pane == TEMPLATE or self.building):
+            self.chosen, self.alternating = last, pane
+            return
+        if self.scan is None:
             offered, done = self.names, set(template)
         else:
-            offered, done = tuple(name for name in self.names if name in template), set(scan)
+            offered, done = self.names if self.building else self._of_template(), set(template) & set(scan)
         self.chosen = next_name(offered, done, last) or last or (self.names[0] if self.names else None)
+
+    def _of_template(self) -> tuple[str, ...]:
+        return tuple(name for name in self.names if name in self.template.places)
 
     def _number(self, pane: int) -> int:
         return -1 if pane == TEMPLATE else self.current

@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
 from model.linear import Subject
 from model.posing.cli import read_subject
+from scanprep.arguments import Place
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, judgement_of_many
 from scanprep.geometry.storage import read_json
-from scanprep.pictures.page import Page
+from scanprep.pictures.page import Page, link_to
 from scanprep.ranges import BETAS
 
 from ...cli import ModelOrNone, read_model
@@ -27,7 +27,7 @@ from ..subject.person import PersonConfig
 from .motions import ENDINGS, MEAN_DISTANCE, is_motion, motion_among
 from .work import MEAN_ERROR, BetasTo, Work
 
-MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
+MarkersArg = Annotated[Path, Place("MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
@@ -81,7 +81,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     if markers.is_file():
         with bar("following the markers") as following:
             done = space.run(work, [Task("motion", markers)], inside=following).only
-        return Outcome(output, done, settings, judgement=judgement_of(done))
+        return Outcome(output, done, settings, judgement=judgement_of(done),
+                       following=f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
     with bar("files") as progress:
         results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
     with space.staging("page") as staged:
@@ -114,7 +115,7 @@ def _folder_page(results: Results) -> Page:
         page.section("Failed").table([(line,) for line in results.failures.values()])
     page.section("Distance of markers or joint centres to where the body puts them, mean")
     for name in sorted(results.values, key=lambda name: -_error(results.values[name])):
-        page.markup(f'<p><a href="{escape(name)}/report.html">{escape(name)}</a>: '
+        page.markup(f'<p><a href="{link_to(name)}/report.html">{escape(name)}</a>: '
                     f'{_error(results.values[name]):.1f} mm</p>')
     return page
 

@@ -19,7 +19,6 @@ from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots
 
-from ...cli import rows
 from ...motion import Motion
 from ...motion_pictures import MARKER, chart_residuals, frame_panes, moving_pane, played, worst_frames
 from ..files.motion_files import write_glb, write_motion, write_residuals
@@ -58,7 +57,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     else:
         _joints(page, replace(motion, residuals=found.fit.distances, labels=found.fit.names,
                               trusted=np.ones_like(found.fit.distances, dtype=bool)), body, found.fit, room.folder)
-    return metrics, motion, body, page.section("Figures").table(rows(metrics), ("metric", "value", "unit"))
+    return metrics, motion, body, page.section("Figures").figures(metrics)
 
 
 def judged(fit: Followed | None) -> Judgement:

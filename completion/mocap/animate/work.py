@@ -3,22 +3,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
 from model.people import person_judgement
+from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM
-from scanprep.console import Metric, judgement_row
+from scanprep.console import Metric, details, judgement_row
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots
 
-from ...cli import rows
 from ...motion import Motion
 from ...motion_pictures import (
     MARKER,
@@ -104,7 +103,7 @@ class Work:
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body, believed(motion, sequence))
         metrics += write_glb(output / "animation.glb", motion, body)
-        return metrics, motion, body, motion_page(motion, body, sequence, path.name, rows(metrics))
+        return metrics, motion, body, motion_page(motion, body, sequence, path.name, metrics)
 
     def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: Room
                 ) -> tuple[MarkerSequence, PersonFit, Worn]:
@@ -128,14 +127,13 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
     off = MM * motion.residuals[seen] if seen.any() else np.array([np.nan])
     frame = MM * np.where(seen, motion.residuals, 0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
     return [
-        Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s"),
-        Metric("markers used", f"{int(seen.any(axis=0).sum())} of {len(markers.labels)}"),
         Metric(MEAN_ERROR, MM * float(np.nanmean(motion.told())) if seen.any() else np.nan, "mm"),
-        markers_told([motion]),
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
+        Metric("markers used", f"{int(seen.any(axis=0).sum())} of {len(markers.labels)}"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),
-        Metric("frames that converged", 100 * float(motion.converged.mean()), "%")]
+        Metric("frames that settled", 100 * float(motion.converged.mean()), "%"),
+        *details([markers_told([motion]), Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s")])]
 
 
 def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page
@@ -165,12 +163,12 @@ def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
     if isinstance(given, dict):
         return given
     if motion.betas is None:
-        raise ValueError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")
+        raise UsageError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")
     return {0.0: motion.betas, float(motion.times[-1]): given}
 
 
 def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str,
-                rows: list[tuple[str, Any, str]]) -> Page:
+                metrics: list[Metric]) -> Page:
     """The page of `scape animate`."""
     page = Page(f"{name}, animated", "The body in motion, with the markers that were measured as dots.")
     at = markers.positions[played(motion)[0]]
@@ -192,4 +190,4 @@ def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name:
     unused = [label for label in motion.labels if label not in labels]
     if unused:
         page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
-    return page.section("Figures").table(rows, ("metric", "value", "unit"))
+    return page.section("Figures").figures(metrics)

@@ -13,7 +13,7 @@ from model.export.correctives import body_correctives, motion_correctives, off_e
 from model.export.glb import write_skinned_glb
 from model.export.rig import subject_rig
 from model.linear import Subject
-from scanprep.console import Metric
+from scanprep.console import Metric, details
 from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import upright
 
@@ -94,8 +94,8 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
     exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
     off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
     write_skinned_glb(path, aimed(rig, up), motion.poses, motion.trans, motion.rate, up)
-    return [Metric(f"{path.name}, distance from the exact body, mean", float(off.mean()), "mm"),
-            Metric("the same, largest", float(off.max()), "mm")]
+    return details([Metric(f"{path.name}, distance from the exact body, mean", float(off.mean()), "mm"),
+                    Metric("the same, largest", float(off.max()), "mm")])
 
 
 def write_table(path: Path, columns: list[str], rows: np.ndarray) -> None:

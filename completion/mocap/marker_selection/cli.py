@@ -1,12 +1,14 @@
 """The command `scape layout design`, and its page."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.arguments import Called
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
@@ -20,7 +22,7 @@ from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
 
 from ...bodies import at_rest
-from ...cli import ModelOrNone, read_model, rows
+from ...cli import ModelOrNone, read_model
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..marker_sets.symmetry import label_pairs, marker_pairs
@@ -31,7 +33,7 @@ from .linear import check_bodies, example_poses, in_poses
 
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
-           keep: str | None = None, poses: int = 0, unit: Unit | None = None,
+           keep: str | None = None, poses: Annotated[int, Called("--poses-each")] = 0, unit: Unit | None = None,
            config: DesignConfig = DesignConfig()) -> Outcome:      # noqa: B008
     """Choose the markers from which bodies are estimated best.
 
@@ -72,7 +74,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
     result.layout.save(output / "layout.json")
     with storage.writing(output / "curve.csv") as part:
         part.write_text(chart_rows(result), encoding="utf-8")
-    design_page(result, loaded, among, labels, rows(metrics)).write(output / "report.html")
+    design_page(result, loaded, among, labels, metrics).write(output / "report.html")
     settings = {"design": config, "model": name, "candidates": candidates, "keep": keep, "poses": poses}
     return Outcome(output, metrics, settings, judgement=Judgement())
 
@@ -162,7 +164,7 @@ def chart_rows(design: MarkerDesign) -> str:
 
 
 def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout, keep: tuple[str, ...],
-                rows: list[tuple[str, Any, str]]) -> Page:
+                metrics: Sequence[Metric]) -> Page:
     """The page of `scape layout design`."""
     page = Page(f"{len(design.layout.labels)} markers", "Chosen so that bodies estimated from them are near the true "
                 "ones over their whole surface. Red: chosen; blue: kept; grey: left out.")
@@ -171,7 +173,7 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "
                                                       "of all bodies; linearised, crosses by full refits")
-    page.section("Figures").table(rows, ("metric", "value", "unit"))
+    page.section("Figures").figures(metrics)
     page.section("Order", "In which markers, or pairs, came or went, and the error after each.")
     for curve in design.curves:
         steps = zip(curve.steps, curve.counts[1:].tolist(), (1000 * curve.rmse[1:]).tolist(), strict=True)

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from model.files import load_model
+from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome, bar
@@ -30,7 +30,7 @@ from .named import layout_names, layout_summaries, read_layout
 from .opensim import opensim_markers
 from .symmetry import label_pairs
 
-LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
+LayoutArg = Annotated[str, Place("LAYOUT")]
 
 COMMANDS = {
     "list": ("The marker sets that come along.", "completion.mocap.marker_sets.cli:list_layouts"),
@@ -79,7 +79,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     from .pictures import layout_page, picture_layout
 
     if model is not None and body is not None:
-        raise ValueError("--model and --body: expected one of them")
+        raise UsageError("--model and --body: expected one of them")
     shown, skeleton, kept, name = _body(model, body, unit)
     found = read_layout(layout, shown, kept)
     figures = _figures(found, shown)

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from model.body import BodyModel
 from model.files import load_model
+from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
 from scanprep.cli import Unit
 
@@ -56,9 +57,9 @@ class MoshCall(KeptCall):
 def _sexes(models: tuple[Path, ...], character: Path | None) -> dict[str, BodyModel]:
     """The models of women and men, where they are given."""
     if len(models) not in (0, 1, 3):
-        raise ValueError(f"--model: expected one, or three of both sexes, of women and of men, got {len(models)}")
+        raise UsageError(f"--model: expected one, or three of both sexes, of women and of men, got {len(models)}")
     if character is not None and len(models) == 3:
-        raise ValueError("--retarget-to: a character is made of one model; expected one --model, got 3")
+        raise UsageError("--retarget-to: a character is made of one model; expected one --model, got 3")
     return dict(zip(("female", "male"), map(load_model, models[1:]), strict=True)) if len(models) == 3 else {}
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
+from scanprep.arguments import Alias, Place
 from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import HOME, Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import JUDGEMENT, Metric, Outcome, bar, judgement_of, say
+from scanprep.console import JUDGEMENT, Metric, Outcome, bar, details, judgement_of, say
 from scanprep.judgement import Judgement, judge_many
 from scanprep.pictures.page import Page
 
@@ -22,10 +22,10 @@ from .call import MoshCall
 from .mosh import MoshConfig
 from .recordings import TABLE, Actor, Grouping, write_table
 from .report import add_entry
-from .work import ERRORS, Work
+from .work import ERRORS, FIXED, Work
 
-MarkersArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MARKERS [MARKERS ...]")]
-Models = Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(aliases=["-m"])]
+MarkersArg = Annotated[tuple[Path, ...], Place("MARKERS [MARKERS ...]")]
+Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
@@ -35,8 +35,11 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
-    Nothing is needed but a file: scape mosh walk.c3d -o out
-    With a model of your own: scape mosh 85_02.c3d 85_03.c3d -m model.npz --layout cmu41 -o out
+    Example: scape mosh walk.c3d -o out
+
+    Nothing is needed but a file. With a model of your own:
+
+    Example: scape mosh 85_02.c3d 85_03.c3d -m model.npz --layout cmu41 -o out
 
     Begin with report.html in the output. Each person has a folder with subject.json (betas), layout.json (where the
     markers sat), report.html, and in it a folder for each sequence: motion.npz and soft_tissue.npz, animation.glb,
@@ -95,7 +98,8 @@ def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str
     settings = {"mosh": call.config, "model": loaded.name, "layout": call.layout, "held out": call.hold_out}
     return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures,
                    judgement=judge_many(judged, len(done.failures)) if len(actors) > 1 or not judged else
-                   next(iter(judged.values())))
+                   next(iter(judged.values())),
+                   following=f"open {space.folder / 'report.html'}")
 
 
 def _keep_table(space: Workspace, actors: Sequence[Actor], subjects: str) -> None:
@@ -124,11 +128,9 @@ def _summary(metrics: Mapping[str, Sequence[Metric]], count: int, before: int) -
     """The rows of the closing table: those of one person, or means over several."""
     if count == 1 and metrics:
         only = next(iter(metrics.values()))
-        return [Metric("person", next(iter(metrics))), *only, Metric("done before", before)]
+        return [*only, *details([Metric("person", next(iter(metrics))), Metric("done before", before)])]
     values = [{m.name: m for m in rows} for rows in metrics.values()]
-    rows = [Metric("people", count), Metric("done before", before), Metric("failed", count - len(metrics))]
-    for name in ("sequences", "frames", "swaps", "bad spans"):
-        rows.append(Metric(name, sum(int(v[name].value) for v in values)))
+    rows = list[Metric]()
     for name in ERRORS:
         found = {person: v[name] for person, v in zip(metrics, values, strict=True) if name in v}
         if found:
@@ -136,7 +138,10 @@ def _summary(metrics: Mapping[str, Sequence[Metric]], count: int, before: int) -
             rows += [Metric(f"{name}, mean of the people", float(np.mean([float(m.value) for m in found.values()])),
                             "mm"),
                      Metric(f"the same, worst ({worst})", float(found[worst].value), "mm")]
-    return rows
+    counts = [Metric(name, sum(int(v[name].value) for v in values))
+              for name in ("sequences", "frames", "swaps", "bad spans")]
+    return [*rows, Metric("people", count), Metric("failed", count - len(metrics)),
+            *details([Metric("done before", before), *counts])]
 
 
 def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]) -> Page:
@@ -147,7 +152,7 @@ def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], fail
               "not be used: open this folder with `scape view` and press `mend` to put them right and run again.")
     if failures:
         page.section("Failed").table([(line,) for line in failures])
-    error = {name: float(next(m.value for m in rows if m.name == ERRORS[0])) for name, rows in metrics.items()}
+    error = {name: float(next(m.value for m in rows if m.name == FIXED)) for name, rows in metrics.items()}
     rules = {actor.name: actor.rule for actor in actors}
     for name in sorted(metrics, key=lambda name: (-error[name], name)):
         told = [f"{m.name}: {m.text()} {m.unit}" for m in metrics[name]

@@ -28,7 +28,7 @@ from .call import MoshCall
 from .cli import carried_out
 from .mended_layout import Spot, changes, mended, next_file
 from .people import Found, found_people
-from .work import ERRORS
+from .work import ERRORS, FIXED
 
 MENDED = "scape mosh, mended in the browser"
 TOLD = "markers in the mean distance"
@@ -252,7 +252,7 @@ def _usual(call: MoshCall, model: BodyModel, people: list[Found]) -> MarkerLayou
 
 def _gravity(rows: list[Metric]) -> tuple[int, float]:
     """Failed people first, then those with the largest error."""
-    error = next((float(m.value) for m in rows if m.name == ERRORS[0]), 0.0)
+    error = next((float(m.value) for m in rows if m.name == FIXED), 0.0)
     return GRAVEST.index(_told(rows)["verdict"]), -error
 
 

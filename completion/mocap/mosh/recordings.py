@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast, get_args
 
+from scanprep.arguments import UsageError
 from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage, tables
 
@@ -53,7 +54,7 @@ class Grouping:
         if subjects in get_args(By):
             return Grouping(cast(By, subjects), None, who)
         if Path(subjects).suffix.lower() not in (".csv", ".json"):
-            raise ValueError(f"--subjects: expected a file .csv or .json, or one of {', '.join(get_args(By))}, "
+            raise UsageError(f"--subjects: expected a file .csv or .json, or one of {', '.join(get_args(By))}, "
                              f"got '{subjects}'")
         return Grouping("auto", Path(subjects), who)
 

@@ -13,12 +13,11 @@ from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import storage
-from scanprep.pictures.page import Page
+from scanprep.pictures.page import Page, link_to
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
 from scanprep.pictures.sheets import webp_bytes
 
-from ...cli import rows
 from ...motion import spread_frames
 from ...motion_pictures import MARKER, facing, marker_rows, mean_over, upwards, worst_frames
 from ..marker_sets.layout import MarkerLayout
@@ -80,7 +79,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
     """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
     frames = spread_frames(len(take.shown.poses), SOME)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
-    page.table(rows(_main(metrics)))
+    page.table([(m.name, m.text(), m.unit) for m in _main(metrics)])
     page.section("The whole sequence").bodies(
         [pictures.take_pane(take)], "Press the triangle to play, drag the body to turn it; it is kept in the middle.",
         520, webp_bytes(picture))
@@ -100,7 +99,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
 
 def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
     """The end of a page: all figures and the settings."""
-    page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
+    page.section("Figures").figures(metrics)
     text = escape(json.dumps(storage.as_json(settings), indent=1))
     return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
 
@@ -140,9 +139,10 @@ def _drawn(figure: Any) -> bytes:
 
 def add_entry(page: Page, name: str, lines: Iterable[str]) -> None:
     """A person, or a sequence, leading to its own page."""
-    link, told = escape(name), "".join(f"<p>{escape(line)}</p>" for line in lines)
-    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{link}</b></a>{told}</div>'
-                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>')
+    link, label = link_to(name), escape(name)
+    told = "".join(f"<p>{escape(line)}</p>" for line in lines)
+    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{label}</b></a>{told}</div>'
+                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{label}"></a></div>')
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:

@@ -13,9 +13,10 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sexes import SexGuess
 from model.people import person_judgement
+from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM
-from scanprep.console import Metric, Outcome, judgement_row, write_report
+from scanprep.console import Metric, Outcome, details, judgement_row, write_report
 from scanprep.geometry import storage, tables
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import upright
@@ -38,8 +39,10 @@ from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
 from .takes import LightMesh, Take, held_out
 
-ERRORS = ("marker error, fixed shape", "marker error, soft tissue", "held-out error, fixed shape",
-          "held-out error, soft tissue")
+# held out first; what soft tissue was fitted to is no error: its heads stay rigid, and little is left over
+ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
+          "left over after soft tissue was fitted")
+FIXED = ERRORS[2]                    # that everybody has
 HALF = 100                           # of progress: finding shape and motion, then files and pictures
 
 
@@ -126,7 +129,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     try:
         layout = usual.without(work.hold_out) if work.hold_out else usual
     except ValueError as error:
-        raise ValueError(f"--hold-out: {error}") from None
+        raise UsageError(f"--hold-out: {error}") from None
     model, guess = work.model, None
 
     def progress(done: int, total: int) -> None:
@@ -263,45 +266,47 @@ def _character(character: BodyModel, take: Take, folder: Path, factor: float
 def _person_metrics(found: _Found) -> list[Metric]:
     moved, result = MM * found.result.person.moved, found.result
     body = standing(found.model, result.betas)
-    told = [Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
-            Metric("height", float(np.ptp(body.vertices[:, upright(body)[0]])), "m"),
-            Metric("volume", 1000 * abs(body.volume), "l"),
-            Metric("betas, length", float(np.linalg.norm(result.betas)), "sd"),
-            Metric("markers moved, mean", float(moved.mean()), "mm"),
-            Metric(f"markers moved, most ({result.layout.labels[int(moved.argmax())]})", float(moved.max()), "mm")]
-    told += result.worn.metrics()
+    told = [Metric("height", float(np.ptp(body.vertices[:, upright(body)[0]])), "m"),
+            Metric("volume", 1000 * abs(body.volume), "l")]
     if found.guess is not None:
-        told[1:1] = [Metric("sex", found.guess.sex), Metric("sex, probability", 100 * found.guess.probability, "%")]
-    return told
+        told.append(Metric("sex", f"{found.guess.sex} ({100 * found.guess.probability:.0f}%)"))
+    return [*told, *result.worn.metrics(),
+            Metric("markers beside the layout's places, mean", float(moved.mean()), "mm"),
+            *details([Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
+                      Metric("body shape from the mean person, length of the betas",
+                             float(np.linalg.norm(result.betas)), "sd"),
+                      Metric(f"most beside the layout's place ({result.layout.labels[int(moved.argmax())]})",
+                             float(moved.max()), "mm")])]
 
 
 def _times(found: _Found, written: Mapping[str, np.ndarray], whole: np.ndarray) -> list[Metric]:
     """How long the stages took, those done in an earlier run too, and the `whole` (2,) of this one."""
     frames = sum(len(take.motion.poses) for take in found.takes)
     stages = {**found.result.seconds, **written, "all": whole}
-    return [*(Metric(f"{stage}, processor time", float(seconds[1]), "s") for stage, seconds in stages.items()),
-            *(Metric(f"{stage}, time by the clock", float(seconds[0]), "s") for stage, seconds in stages.items()),
-            Metric("speed", frames / max(float(whole[1]), 1e-9), "frames/s")]
+    return details([
+        *(Metric(f"{stage}, processor time", float(seconds[1]), "s") for stage, seconds in stages.items()),
+        *(Metric(f"{stage}, time by the clock", float(seconds[0]), "s") for stage, seconds in stages.items()),
+        Metric("speed", frames / max(float(whole[1]), 1e-9), "frames/s")])
 
 
 def _figures(takes: Sequence[Take]) -> list[Metric]:
     """What motions are judged by, of all frames together."""
-    out = [Metric("frames", sum(len(take.motion.poses) for take in takes))]
-    if len(takes) == 1:
-        out.append(Metric("rate", takes[0].motion.rate, "1/s"))
-    out.append(markers_told([take.motion for take in takes]))
+    out = list[Metric]()
     fixed = [t.motion.told() for t in takes]
     soft = [np.where(np.isnan(t.motion.told()), np.nan, t.soft.motion.residuals) for t in takes if t.soft is not None]
     held = [t.held for t in takes if t.held is not None]
     held_soft = [h.soft for h in held if h.soft is not None]
-    for name, values in zip(ERRORS, (fixed, soft, [h.fixed for h in held], held_soft), strict=True):
+    for name, values in zip(ERRORS, ([h.fixed for h in held], held_soft, fixed, soft), strict=True):
         if values:
             out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
     missing = sum(int((~t.markers.select(t.artefacts.labels).seen).sum()) for t in takes)
     filled = sum(sum(artefact_table(t.artefacts)["filled"].values()) for t in takes)
     share = 100 / max(sum(t.artefacts.simulated[..., 0].size for t in takes), 1)
+    rate = [Metric("rate", takes[0].motion.rate, "1/s")] if len(takes) == 1 else []
     return [*out, Metric("swaps", sum(len(t.artefacts.swaps) for t in takes)),
-            Metric("bad spans", sum(len(t.artefacts.bad) for t in takes)),
             Metric("markers missing", share * missing, "%"),
-            Metric("taken out as bad", share * max(filled - missing, 0), "%"),
-            Metric("gaps filled in", filled, "positions")]
+            Metric("markers taken out as bad", share * max(filled - missing, 0), "%"),
+            Metric("frames", sum(len(take.motion.poses) for take in takes)),
+            *details([*rate, markers_told([take.motion for take in takes]),
+                      Metric("bad spans", sum(len(t.artefacts.bad) for t in takes)),
+                      Metric("gaps filled in", filled, "positions")])]

@@ -93,12 +93,13 @@ def _read_skinned(path: Path) -> ControlModel:
     with storage.taking_apart(path, WHAT, MeshFileError):
         mesh_node, skin = _skinned(tree)
         places = {number: matrix for number, _, matrix in glb.nodes_of(tree)}
-        missing = [number for number in skin["joints"] if number not in places]
-        if missing:
-            raise ValueError(f"joint {_name(tree, missing[0])} does not stand in the scene")
+        motion = glb.joint_matrices(tree, binary, skin, places)
         matrices = np.stack([places[number] for number in skin["joints"]])
         corners = _corners(tree, binary, glb.item(tree["meshes"], mesh_node["mesh"]), len(matrices))
-        return _control(replace(corners, points=_as_it_stands(tree, binary, skin, matrices, corners)),
+        points = glb.skinned(corners.points, corners.weights, motion)
+        if not np.isfinite(points).all():
+            raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
+        return _control(replace(corners, points=points),
                         matrices[:, :3, 3], _parents(tree, skin["joints"]),
                         [_name(tree, number) for number in skin["joints"]])
 
@@ -130,47 +131,14 @@ def _primitive(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], j
     if primitive.get("mode", 4) != 4:    # the mode of triangles
         raise ValueError(f"expected triangles, found a primitive of mode {primitive['mode']}")
     attributes = primitive["attributes"]
-
-    def values(name: str, *types: str) -> np.ndarray:
-        got = glb.accessor(tree, binary, attributes[name], *types)
-        return got if got.dtype.kind == "f" or name.startswith("JOINTS") else got / np.iinfo(got.dtype).max
-
-    points = values("POSITION", "VEC3").astype(np.float64)
-    weights = np.zeros((len(points), joints))
-    sets = sorted(name for name in attributes if name.startswith("WEIGHTS_"))
-    if not sets:
-        raise ValueError("it has no weights (WEIGHTS_0): nothing says how the joints move its vertices")
-    for name in sets:
-        carriers, shares = values(name.replace("WEIGHTS", "JOINTS"), "VEC4"), values(name, "VEC4").astype(np.float64)
-        if len(carriers) != len(points) or len(shares) != len(points) or carriers.max(initial=0) >= joints:
-            raise ValueError(f"{name}: expected four of {joints} joints for each of {len(points)} vertices")
-        if not (np.isfinite(shares).all() and (shares >= 0).all()):
-            raise ValueError(f"{name}: expected numbers of at least 0")
-        np.add.at(weights, (np.arange(len(points))[:, None], carriers.astype(np.int64)), shares)
-    bare = np.flatnonzero(weights.sum(axis=1) < 1e-3)
-    if len(bare):
-        raise ValueError(f"{len(bare)} vertices have no weights, the first is vertex {bare[0]}")
+    points = glb.accessor(tree, binary, attributes["POSITION"], "VEC3").astype(np.float64)
     uv = None
-    if "TEXCOORD_0" in attributes:
-        uv = values("TEXCOORD_0", "VEC2").astype(np.float64) * [1, -1] + [0, 1]      # glTF counts from the upper left
+    if "TEXCOORD_0" in attributes:       # glTF counts from the upper left
+        uv = glb.accessor(tree, binary, attributes["TEXCOORD_0"], "VEC2").astype(np.float64) * [1, -1] + [0, 1]
     faces = glb.triangles_of(tree, binary, primitive, len(points))
     if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
         raise ValueError(f"a triangle refers to vertex {faces.max()}, expected 0..{len(points) - 1}")
-    return _Corners(points, weights / weights.sum(axis=1, keepdims=True), uv, faces)
-
-
-def _as_it_stands(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], matrices: np.ndarray, corners: _Corners
-                  ) -> np.ndarray:
-    """Where the joints of the scene carry the vertices (n, 3), which is what every program shows."""
-    motion = matrices
-    if "inverseBindMatrices" in skin:
-        inverse = glb.accessor(tree, binary, skin["inverseBindMatrices"], "MAT4").astype(np.float64)
-        motion = matrices @ inverse.reshape(len(matrices), 4, 4).swapaxes(1, 2)
-    one = np.column_stack([corners.points, np.ones(len(corners.points))])
-    points = np.einsum("nj,jab,nb->na", corners.weights, motion, one, optimize=True)[:, :3]
-    if not np.isfinite(points).all():
-        raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
-    return np.asarray(points)
+    return _Corners(points, glb.weights_of(tree, binary, primitive, joints), uv, faces)
 
 
 def _parents(tree: dict[str, Any], joints: list[int]) -> np.ndarray:

@@ -13,7 +13,7 @@ from scanprep.correspondence.correlated import find_correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError, taking_apart, writing
+from scanprep.geometry.storage import StorageError, save_arrays, taking_apart
 from scanprep.geometry.surface import OrientedPoints, Surface
 from scanprep.registration.nonrigid import Registration, register, registration_problem
 from scanprep.skeleton.tree import Skeleton
@@ -77,8 +77,7 @@ def write_motion(path: str | Path, control: ControlModel, motion: Retargeted) ->
     arrays = {"poses": motion.poses.reshape(len(motion.poses), -1),
               "trans": motion.trans + middle_drift(control, motion.poses), "betas": np.zeros(0),
               "mocap_frame_rate": np.array(float(motion.rate)), "surface_model_type": np.array("skinning")}
-    with writing(path) as beside, open(beside, "wb") as out:
-        np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    save_arrays(path, arrays)
 
 
 def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:

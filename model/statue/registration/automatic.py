@@ -54,7 +54,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     stands = find_person(search, target, UNITS[unit])
     best = stands[0]
     margin = stands[1].off / best.off if len(stands) > 1 else np.inf
-    problem = nobody_problem(best.off, margin, unit)
+    problem = nobody_problem(best.off, margin, f"{unit}, {UNITS[unit] * _length(scan.vertices):.2f} m long")
     if problem:
         return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
     placed = (data.vertices if isinstance(data, Mesh) else data) @ best.T[:3, :3].T + best.T[:3, 3]
@@ -66,13 +66,13 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     return Features(joints, points, missing, registered, fit, why_uncertain(best.off, margin, found.uncovered))
 
 
-def nobody_problem(off: float, margin: float, unit: str) -> str | None:
+def nobody_problem(off: float, margin: float, size: str) -> str | None:
     """Why there is no person in a scan, or none that stands upright; None where there is one."""
     if off <= 0.042 and margin >= 1.05:
         return None
-    return (f"no person who stands upright was found (the unit taken for {unit}): a body bent onto the scan stays "
-            f"{1000 * off:.0f} mm off, and {margin:.2f} times as far when it faces another way; something else, or a "
-            "pose that needs clicks?")
+    return (f"no person who stands upright was found (the unit taken for {size}): a body bent onto the scan stays "
+            f"{1000 * off:.0f} mm off, and {margin:.2f} times as far when it faces another way; something else, a "
+            "pose that needs clicks, or, if photographs without a scale made it, to be brought to metres first?")
 
 
 def why_uncertain(off: float, margin: float, missed: float) -> str | None:
@@ -86,9 +86,14 @@ def why_uncertain(off: float, margin: float, missed: float) -> str | None:
 
 def likely_unit(points: np.ndarray) -> str:
     """The unit in which points (n, 3) span most nearly as much as a person."""
+    longest = max(_length(points), 1e-12)
+    return min(UNITS, key=lambda unit: abs(np.log(longest * UNITS[unit] / 1.7)))                # metres
+
+
+def _length(points: np.ndarray) -> float:
+    """How far points (n, 3) span along the way in which they spread most."""
     spread = points - points.mean(axis=0)
-    longest = float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
-    return min(UNITS, key=lambda unit: abs(np.log(max(longest, 1e-12) * UNITS[unit] / 1.7)))    # metres
+    return float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
 
 
 def _facing_outward(target: Target, scan: Mesh, spacing: float) -> Target:

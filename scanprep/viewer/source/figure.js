@@ -160,7 +160,7 @@ export class Figure {
       this.below.prepend(make("div", { class: "sk-legend" }, make("span", {}, title),
         make("span", { class: "sk-low" }, told(low, shade.legend)),
         make("span", { class: "sk-ramp", style: `background: linear-gradient(to right, ${stops.join(", ")})` }),
-        make("span", {}, told(high, shade.legend))));
+        make("span", {}, `${told(high, shade.legend)}${shade.legend.more ? " or more" : ""}`)));
     }
   }
 

@@ -71,7 +71,9 @@ export class Layer {
     const { legend, index } = this.shade;
     if (!legend) return "";
     const place = this.columns[index][vertex];
-    return place === 255 ? "no data" : told(legend.low + (legend.high - legend.low) * place / 254, legend);
+    if (place === 255) return "no data";
+    const value = told(legend.low + (legend.high - legend.low) * place / 254, legend);
+    return place === 254 && legend.more ? `${value} or more` : value;
   }
 
   setSurface(kind) {

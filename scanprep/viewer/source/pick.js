@@ -44,6 +44,8 @@ export class Pick extends Program {
     };
     this.insideBox = make("input", { type: "checkbox", onchange: () => { this.inside = this.insideBox.checked; } });
     this.measure = make("p", { class: "sk-measure" });
+    this.question = make("div", { class: "sk-question", role: "alert", hidden: true });
+    this.status.after(this.question);
     this.file = make("p", { class: "sk-file" });
     this.panel.append(this.scans, this.list, this.added, make("div", { class: "sk-buttons" }, ...Object.values(this.buttons)),
       make("label", {}, this.insideBox, "inside the body (joints)"), this.measure, this.file,
@@ -86,6 +88,7 @@ export class Pick extends Program {
     this.buttons.swap.hidden = this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
     this.names();
     this.tellFile();
+    this.ask(state.question);
     if (state.working) this.work(state.working); else { this.work(null); this.say(state.note || this.hint()); }
     this.paint();
   }
@@ -93,7 +96,22 @@ export class Pick extends Program {
   hint() {
     const { chosen, fixed, panes } = this.state;
     if (!chosen) return "";
-    return panes.length > 1 && (fixed || chosen in panes[0].places) ? `Click “${chosen}” on the scan.` : `Click “${chosen}” on the template.`;
+    if (panes.length < 2) return `Click “${chosen}” on the template.`;
+    const [template, scan] = panes.map((pane) => chosen in pane.places);
+    if (!fixed && !template && !scan) return `Click “${chosen}” on the template, then on the scan.`;
+    return fixed || template ? `Click “${chosen}” on the scan.` : `Now the same, “${chosen}”, on the template.`;
+  }
+
+  // A click that is far from where the landmark was expected: was it meant?
+  ask(question) {
+    this.question.hidden = !question;
+    this.status.hidden = Boolean(question);
+    if (!question) { this.question.replaceChildren(); return; }
+    const { name, text } = question;
+    this.question.replaceChildren(make("span", {}, text),
+      button("keep", "it is right where I clicked", () => this.send("keep", { name })),
+      button("move it there", "to where it was expected", () => this.send("confirm", { names: [name] })),
+      button("undo", "click again", () => this.send("undo")));
   }
 
   tellFile() {
@@ -110,7 +128,11 @@ export class Pick extends Program {
         make("span", { class: "sk-dots" }, ...marks), make("span", {}, name), this.beside(name));
       return item;
     }));
-    this.list.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+    const current = this.list.querySelector("[aria-current]");
+    if (!current) return;                               // only the list is scrolled: on a telephone the page would leave the bodies
+    const top = current.offsetTop - this.list.offsetTop, below = top + current.offsetHeight - this.list.clientHeight;
+    if (top < this.list.scrollTop) this.list.scrollTop = top;
+    else if (below > this.list.scrollTop) this.list.scrollTop = below;
   }
 
   // What is told beside a name: how far it is from where it was predicted.

@@ -1,0 +1,387 @@
+"""Files as scanners and other programs write them: each a small one of its kind, with the right value."""
+import base64
+import json
+import struct
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+from mesh_files import TETRAHEDRON, body, quiet, refused
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from scanprep.geometry.files import list_meshes, read_mesh, read_points, read_scan, write_mesh
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.textures import read_texture
+from scanprep.pipeline.scans import find_scans
+
+PLY = "ply\nformat {} 1.0\nelement vertex 4\n{}element {} {}\nproperty list {} int vertex_indices\nend_header\n"
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+RGB = "property {0} red\nproperty {0} green\nproperty {0} blue\n"
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])
+STL = ("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+       "endsolid a\n")
+
+
+def same(mesh, other, atol=1e-6):
+    np.testing.assert_array_equal(mesh.faces, other.faces)
+    np.testing.assert_allclose(mesh.vertices, other.vertices, atol=atol)
+
+
+# ---- PLY
+
+@pytest.mark.parametrize("header", [b"\n", b"\r\n", b"\r"])
+@pytest.mark.parametrize("last", [b"\n", b"\r\n", b"\r"])
+def test_line_ends_of_a_binary_ply_may_be_mixed(tmp_path, header, last):
+    if (header, last) == (b"\r", b"\r\n"):
+        pytest.skip("LF is the first byte of the body")
+    write_mesh(tmp_path / "a.ply", TETRAHEDRON)
+    head, _, rest = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(head.replace(b"\n", header) + b"end_header" + last + rest)
+    same(read_mesh(tmp_path / "a.ply"), TETRAHEDRON, 0)
+
+
+def test_a_binary_body_that_begins_with_the_byte_of_a_line_end(tmp_path):
+    tall = TETRAHEDRON.with_vertices(np.where(TETRAHEDRON.vertices == 0, np.float32(8.6e-33), TETRAHEDRON.vertices))
+    first = struct.pack("<f", 8.6e-33)[1:]
+    vertices = tall.vertices.copy()
+    vertices[0, 0] = struct.unpack("<f", b"\n" + first)[0]
+    write_mesh(tmp_path / "a.ply", tall.with_vertices(vertices), "single")
+    data = (tmp_path / "a.ply").read_bytes()
+    assert b"end_header\n\n" in data
+    same(read_mesh(tmp_path / "a.ply"), tall.with_vertices(vertices), 1e-7)
+    head, _, rest = data.partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(head.replace(b"\n", b"\r") + b"end_header\r" + rest)
+    same(read_mesh(tmp_path / "a.ply"), tall.with_vertices(vertices), 1e-7)
+
+
+def test_strips_of_a_ply(tmp_path):
+    text = PLY.format("ascii", XYZ, "tristrips", 1, "int") + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n8 0 1 2 3 -1 0 2 1\n"
+    (tmp_path / "a.ply").write_text(text)
+    assert read_mesh(tmp_path / "a.ply").faces.tolist() == [[0, 1, 2], [2, 1, 3], [0, 2, 1]]
+
+
+def test_a_range_grid_is_joined_where_neighbours_are_near(tmp_path):
+    rows, columns = 6, 8
+    y, x = np.mgrid[:rows, :columns] * 0.01
+    z = np.where(x > 0.035, 0.5, 0.0)                            # a step half a metre deep between columns 3 and 4
+    seen = np.ones((rows, columns), bool)
+    seen[0, 0] = False
+    points = np.stack([x, y, z], axis=2)[seen]
+    number = iter(range(len(points)))
+    cells = "\n".join(f"1 {next(number)}" if there else "0" for there in seen.ravel())
+    header = PLY.format("ascii\nobj_info num_cols 8\nobj_info num_rows 6\ncomment", XYZ, "range_grid", 48, "uchar")
+    header = header.replace("comment 1.0", "").replace("ascii", "ascii 1.0").replace("vertex 4", "vertex 47")
+    rows_of_points = "\n".join(" ".join(f"{v:.9g}" for v in p) for p in points)
+    (tmp_path / "a.ply").write_text(header.replace("\n\n", "\n") + rows_of_points + "\n" + cells + "\n")
+    with pytest.warns(UserWarning, match="range grid of 6 x 8.* 59 triangles, 10 that span jumps"):
+        mesh = read_mesh(tmp_path / "a.ply")
+    assert mesh.vertices.shape == (47, 3)
+    np.testing.assert_allclose(mesh.face_normals, np.tile([0.0, 0, 1], (59, 1)), atol=1e-9)       # towards the scanner
+
+
+@pytest.mark.parametrize("properties", [True, False])
+def test_a_ply_with_an_empty_element_of_faces_is_a_cloud(tmp_path, properties):
+    text = PLY.format("ascii", XYZ, "face", 0, "uchar") + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
+    text = text if properties else text.replace("property list uchar int vertex_indices\n", "")
+    (tmp_path / "a.ply").write_text(text)
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.ply"), SQUARE)
+
+
+@pytest.mark.parametrize(("kind", "white"), [("uchar", 255), ("int", 255), ("ushort", 65535), ("float", 1),
+                                             ("float", 255), ("double", 255)])
+def test_colours_of_a_ply_are_of_the_scale_that_fits(tmp_path, kind, white):
+    colors = white * np.array([[1, 0.6, 0.2]] * 4)
+    text = PLY.format("ascii", XYZ + RGB.format(kind), "face", 1, "uchar")
+    rows = "\n".join("{:g} {:g} {:g} {:g} {:g} {:g}".format(*p, *c) for p, c in zip(SQUARE, colors, strict=True))
+    (tmp_path / "a.ply").write_text(f"{text}{rows}\n3 0 1 2\n")
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.ply").colors, [[1, 0.6, 0.2]] * 4, atol=1e-5)
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path):
+    text = PLY.format("ascii", XYZ, "face", 1, "uchar") + "0 0 0\nnan nan nan\n1 0 0\n0 1 0\n3 0 2 3\n"
+    (tmp_path / "a.ply").write_text(text)
+    with pytest.warns(UserWarning, match="1 of 4 points are not finite and were left out$"):
+        mesh = read_mesh(tmp_path / "a.ply")
+    assert mesh.faces.tolist() == [[0, 1, 2]] and mesh.of_file.tolist() == [0, -1, 1, 2]
+
+
+# ---- text
+
+@pytest.mark.parametrize("change", [str.upper, lambda text: text.replace("solid", "Solid", 1)])
+def test_ascii_stl_in_capitals(tmp_path, change):
+    (tmp_path / "a.stl").write_text(change(STL))
+    np.testing.assert_array_equal(read_mesh(tmp_path / "a.stl").corners, [SQUARE[:3]])
+
+
+def test_binary_stl_that_begins_with_solid_and_has_bytes_behind(tmp_path):
+    write_mesh(tmp_path / "a.stl", TETRAHEDRON)
+    data = (tmp_path / "a.stl").read_bytes()
+    (tmp_path / "a.stl").write_bytes(b"solid of Some Program".ljust(80) + data[80:] + b"made by Some Program")
+    with pytest.warns(UserWarning, match="20 bytes behind the 4 triangles"):
+        mesh = read_mesh(tmp_path / "a.stl")
+    np.testing.assert_array_equal(mesh.corners, TETRAHEDRON.corners)
+
+
+def test_an_off_header_glued_to_its_counts(tmp_path):
+    (tmp_path / "a.off").write_text("OFF3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    np.testing.assert_array_equal(read_mesh(tmp_path / "a.off").corners, [SQUARE[:3]])
+
+
+@pytest.mark.parametrize(("color", "right"), [("255 153 51", [1, 0.6, 0.2]), ("1 0.6 0.2", [1, 0.6, 0.2])])
+def test_colours_of_an_obj(tmp_path, color, right):
+    (tmp_path / "a.obj").write_text("".join(f"v {p} {color}\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f 1 2 3\n")
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.obj").colors, [right] * 3)
+
+
+def test_one_colour_that_is_no_number_leaves_out_all(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0 1 nan 1\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n")
+    with pytest.warns(UserWarning, match="all colours were left out"):
+        assert read_mesh(tmp_path / "a.obj").colors is None
+
+
+POINTS = [[1.5, 2.5, 3.5], [-1, 0.25, 2e-3]]
+
+
+@pytest.mark.parametrize(("name", "text", "colors"), [
+    ("a.pts", "2\n1.5 2.5 3.5 120 200 150 100\n-1 .25 2e-3 3 200 150 100\n", True),
+    ("a.pts", "2\n1.5 2.5 3.5 -1000\n-1 .25 2e-3 3\n", False),
+    ("a.asc", "//X Y Z R G B\n2\n1.5 2.5 3.5 200 150 100\n-1 .25 2e-3 200 150 100\n", True),
+    ("a.txt", "//X,Y,Z,Scalar,R,G,B\n1.5,2.5,3.5,7,200,150,100\n-1,.25,2e-3,8,200,150,100\n", True),
+    ("a.csv", "z;red;green;blue;y;x\n3.5;200;150;100;2.5;1.5\n2e-3;200;150;100;.25;-1\n", True),
+    ("a.csv", '"Points:0","Points:1","Points:2"\n1.5,2.5,3.5\n-1,.25,2e-3\n', False),
+    ("a.csv", "1.5, 2.5, 3.5\n-1, .25, 2e-3\n", False),
+    ("a.xyz", "1,5 2,5 3,5\n-1 0,25 2e-3\n", False),
+    ("a.xyz", "1,5;2,5;3,5\n-1;0,25;2e-3\n", False),
+    ("a.txt", "1,5\t2,5\t3,5\t200\t150\t100\n-1\t0,25\t0,002\t200\t150\t100\n", True)])
+def test_clouds_of_text_as_programs_write_them(tmp_path, name, text, colors):
+    (tmp_path / name).write_text(text)
+    cloud = quiet(read_points, tmp_path / name)
+    np.testing.assert_allclose(cloud.points, POINTS, atol=1e-12)
+    if colors:
+        np.testing.assert_allclose(255 * cloud.colors, [[200, 150, 100]] * 2)
+    else:
+        assert cloud.colors is None
+
+
+# ---- PCD
+
+def lzf(data):
+    """Packed by a slow and simple method: the longest copy that begins in what came before, or bytes as they are."""
+    out, at = bytearray(), 0
+    while at < len(data):
+        length = next((n for n in range(60, 2, -1) if data.find(data[at:at + n], max(at - 8000, 0), at + n - 1) >= 0
+                       and at + n <= len(data)), 0)
+        if length:
+            back = at - data.rfind(data[at:at + length], max(at - 8000, 0), at + length - 1) - 1
+            long = length - 2 >= 7
+            out += bytes([(7 if long else length - 2) << 5 | back >> 8, *[length - 9] * long, back & 255])
+        else:
+            out += bytes([0, data[at]])
+        at += length or 1
+    return bytes(out)
+
+
+def test_compressed_pcd(tmp_path):
+    rng = np.random.default_rng(2)
+    points = rng.integers(0, 9, (300, 3)).astype("<f4")
+    points[7] = np.nan
+    rgb = np.tile(np.array([200 << 16 | 150 << 8 | 100], "<u4"), 300)
+    body = points.T.tobytes() + rgb.tobytes()
+    packed = lzf(body)
+    assert len(packed) < len(body) / 2
+    head = b"VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nPOINTS 300\nDATA binary_compressed\n"
+    (tmp_path / "a.pcd").write_bytes(head + struct.pack("<II", len(packed), len(body)) + packed)
+    with pytest.warns(UserWarning, match="1 of 300 points are not finite"):
+        cloud = read_points(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(cloud.points, np.delete(points, 7, axis=0))
+    np.testing.assert_allclose(255 * cloud.colors, [[200, 150, 100]] * 299)
+    for cut in (packed[:-3], packed[:40] + b"\xff\xff\xff" + packed[43:]):
+        (tmp_path / "a.pcd").write_bytes(head + struct.pack("<II", len(cut), len(body)) + cut)
+        refused(tmp_path / "a.pcd", read=read_points)
+
+
+# ---- glTF
+
+def gltf(tree, arrays):
+    """A tree of glTF with its numbers as accessors 0, 1, ... in one buffer, whose URI is a data URI."""
+    kinds = {"f4": 5126, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125}
+    views, accessors, data = [], [], b""
+    for values in map(np.asarray, arrays):
+        shape = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (16,): "MAT4"}[values.shape[1:]]
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes})
+        accessors.append({"bufferView": len(views) - 1, "componentType": kinds[values.dtype.str[1:]],
+                          "count": len(values), "type": shape, "normalized": values.dtype.str[1:] in ("i2", "u1")})
+        data += values.tobytes() + b"\0" * (-values.nbytes % 4)
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    return {"asset": {"version": "2.0"}, "buffers": [{"uri": uri, "byteLength": len(data)}], "bufferViews": views,
+            "accessors": accessors, **tree}, data
+
+
+CORNERS, LINE = TETRAHEDRON.vertices.astype("<f4"), TETRAHEDRON.faces.ravel().astype("<u4")
+PRIMITIVE = {"attributes": {"POSITION": 0}, "indices": 1}
+ONE = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [PRIMITIVE]}]}
+
+
+def test_gltf_with_its_numbers_inside_or_beside(tmp_path):
+    tree, data = gltf(ONE, [CORNERS, LINE])
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON)
+    (tmp_path / "two parts.bin").write_bytes(data)
+    (tmp_path / "in").mkdir()
+    for uri, folder in (("two%20parts.bin", ""), ("../two parts.bin", "in")):
+        tree["buffers"][0]["uri"] = uri
+        (tmp_path / folder / "a.gltf").write_text(json.dumps(tree))
+    same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON)
+    refused(tmp_path / "in" / "a.gltf", "beside it", "../two parts.bin")
+    (tmp_path / "in" / "link.bin").symlink_to(tmp_path / "two parts.bin")
+    tree["buffers"][0]["uri"] = "link.bin"
+    (tmp_path / "in" / "a.gltf").write_text(json.dumps(tree))
+    refused(tmp_path / "in" / "a.gltf", "beside it", "link.bin")
+
+
+def test_normalised_integers_of_gltf_are_fractions(tmp_path):
+    whole = np.rint(TETRAHEDRON.vertices / 2 * 32767).astype("<i2")
+    tree, _ = gltf({**ONE, "nodes": [{"mesh": 0, "scale": [2, 2, 2]}],
+                    "extensionsRequired": ["KHR_mesh_quantization"]}, [whole, LINE])
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON, 1e-4)
+
+
+def test_sparse_numbers_of_gltf(tmp_path):
+    tree, _ = gltf(ONE, [0 * CORNERS, LINE, np.array([1, 2, 3], "<u2"), CORNERS[1:]])
+    tree["accessors"][0]["sparse"] = {"count": 3, "indices": {"bufferView": 2, "componentType": 5123},
+                                      "values": {"bufferView": 3}}
+    for base in (True, False):                                   # without a view all others are zero
+        (tmp_path / "a.gltf").write_text(json.dumps(tree))
+        same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON)
+        tree["accessors"][0].pop("bufferView", base)
+
+
+def test_extensions_that_a_gltf_requires_are_known_or_refused(tmp_path):
+    for name, known in (("KHR_materials_unlit", True), ("EXT_meshopt_compression", False), ("ACME_shape", False)):
+        (tmp_path / "a.gltf").write_text(json.dumps(gltf({**ONE, "extensionsRequired": [name]}, [CORNERS, LINE])[0]))
+        if known:
+            same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON)
+        else:
+            refused(tmp_path / "a.gltf", f"needs {name}")
+
+
+def test_instances_of_gltf_are_all_there(tmp_path):
+    moves, turn = np.array([[0, 0, 0], [5, 0, 0]], "<f4"), Rotation.from_euler("y", [[0], [90]], degrees=True)
+    node = {"mesh": 0, "translation": [0, 1, 0], "extensions": {"EXT_mesh_gpu_instancing": {
+        "attributes": {"TRANSLATION": 2, "ROTATION": 3}}}}
+    arrays = [CORNERS, LINE, moves, turn.as_quat().astype("<f4")]
+    tree, _ = gltf({**ONE, "nodes": [node], "extensionsRequired": ["EXT_mesh_gpu_instancing"]}, arrays)
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    mesh = quiet(read_mesh, tmp_path / "a.gltf")
+    right = np.concatenate([TETRAHEDRON.vertices @ turn[k].as_matrix().T + moves[k] + [0, 1, 0] for k in (0, 1)])
+    np.testing.assert_allclose(mesh.vertices, right, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, np.concatenate([TETRAHEDRON.faces, TETRAHEDRON.faces + 4]))
+
+
+def test_skinned_meshes_stand_where_their_joints_carry_them(tmp_path):
+    """Stored in centimetres on two joints, one of them turned; a rigid mesh beside it in metres."""
+    joints, shares = np.zeros((4, 4), "<u2"), np.tile(np.array([[1, 0, 0, 0]], "<f4"), (4, 1))
+    joints[3, 0] = 1
+    turned = Rotation.from_euler("x", 90, degrees=True).as_quat().tolist()
+    inverse = np.tile(np.diag([0.01, 0.01, 0.01, 1]).T.ravel().astype("<f4"), (2, 1))
+    skinned = {"attributes": {"POSITION": 2, "JOINTS_0": 3, "WEIGHTS_0": 4}, "indices": 1}
+    tree, _ = gltf({"scenes": [{"nodes": [0, 1, 2]}], "skins": [{"joints": [2, 3], "inverseBindMatrices": 5}],
+                    "meshes": [{"primitives": [skinned]}, {"primitives": [PRIMITIVE]}],
+                    "nodes": [{"mesh": 0, "skin": 0, "translation": [9, 9, 9]}, {"mesh": 1, "translation": [3, 0, 0]},
+                              {"children": [3]}, {"rotation": turned}]},
+                   [CORNERS, LINE, 100 * CORNERS, joints, shares, inverse])
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    mesh = quiet(read_mesh, tmp_path / "a.gltf")
+    np.testing.assert_allclose(mesh.vertices[:4], [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1.5, 0]], atol=1e-6)
+    np.testing.assert_allclose(mesh.vertices[4:], TETRAHEDRON.vertices + [3, 0, 0], atol=1e-6)
+
+
+# ---- Draco, MeshLab
+
+def test_draco_in_files_of_its_own_and_in_gltf(tmp_path):
+    DracoPy = pytest.importorskip("DracoPy", reason="draco is an extra")
+    mesh = body(np.random.default_rng(3))
+    packed = DracoPy.encode(mesh.vertices.astype("f4"), mesh.faces.astype("u4"), quantization_bits=20)
+    (tmp_path / "a.drc").write_bytes(packed)
+    back = read_mesh(tmp_path / "a.drc")
+    assert len(back.faces) == len(mesh.faces) and back.is_closed
+    volume = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume
+    assert trimesh.Trimesh(back.vertices, back.faces, process=False).volume == pytest.approx(volume, rel=1e-4)
+    tree, _ = gltf(ONE, [CORNERS, LINE, np.frombuffer(packed, "u1")])
+    tree["meshes"][0]["primitives"][0] = {**PRIMITIVE, "extensions": {"KHR_draco_mesh_compression": {
+        "bufferView": 2, "attributes": {"POSITION": DracoPy.decode(packed).attributes[0]["unique_id"]}}}}
+    tree["accessors"][0] = {"componentType": 5126, "count": len(mesh.vertices), "type": "VEC3"}
+    tree["accessors"][1] = {"componentType": 5125, "count": 3 * len(mesh.faces), "type": "SCALAR"}
+    (tmp_path / "a.gltf").write_text(json.dumps({**tree, "extensionsRequired": ["KHR_draco_mesh_compression"]}))
+    same(read_mesh(tmp_path / "a.gltf"), back, 0)
+
+
+def test_without_dracos_library_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "DracoPy", None)
+    (tmp_path / "a.drc").write_bytes(b"DRACO")
+    refused(tmp_path / "a.drc", "pip install 'scapekit[draco]'")
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("ending", [".dae"])
+def test_other_formats_are_read_through_meshlab(tmp_path, ending):
+    pymeshlab = pytest.importorskip("pymeshlab")
+    mesh, meshes = body(np.random.default_rng(4)), pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
+    meshes.save_current_mesh(str(tmp_path / f"a{ending}"))
+    with pytest.warns(UserWarning, match="read through MeshLab; the order"):
+        back = read_mesh(tmp_path / f"a{ending}")
+    np.testing.assert_allclose(np.sort(back.face_areas), np.sort(mesh.face_areas), atol=1e-5)
+    assert [path.name for path in list_meshes(tmp_path)] == [f"a{ending}"]
+    assert [task.name for task in find_scans(tmp_path)] == ["a"]
+    (tmp_path / f"b{ending}").write_bytes(b"nothing of the kind")
+    refused(tmp_path / f"b{ending}", "MeshLab cannot read it")
+
+
+# ---- textures
+
+def pictured(folder, picture="lost.png"):
+    (folder / "a.mtl").write_text(f"newmtl A\nmap_Kd {picture}\nnewmtl B\nmap_Kd green.png\n")
+    (folder / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\n"
+                                  "usemtl A\nf 1/1 2/2 3/3\nusemtl B\nf 1/1 2/2 4/3\n")
+    Image.new("RGB", (8, 8), (0, 200, 0)).save(folder / "green.png")
+    return folder / "a.obj"
+
+
+def test_a_picture_that_is_missing_is_named(tmp_path):
+    with pytest.warns(UserWarning, match=r"some of its pictures cannot be read.*lost\.png: no such file"):
+        assert read_texture(pictured(tmp_path)) is not None
+
+
+@pytest.mark.parametrize("what", ["folder", "outside", "huge"])
+def test_pictures_that_are_none_or_too_large_are_named(tmp_path, what):
+    (tmp_path / "in").mkdir()
+    obj = pictured(tmp_path / "in", {"outside": "../lost.png"}.get(what, "lost.png"))
+    if what == "folder":
+        (tmp_path / "in" / "lost.png").mkdir()
+    else:
+        size, place = (8200, 8200) if what == "huge" else (8, 8), tmp_path / ("" if what == "outside" else "in")
+        Image.new("1", size).save(place / "lost.png")
+    says = {"folder": "found a folder", "outside": "expected files beside it", "huge": "8200 x 8200 pixels"}[what]
+    with pytest.warns(UserWarning, match=says):
+        read_texture(obj)
+
+
+def test_all_good_pictures_are_read_without_a_word(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_texture(pictured(tmp_path, "green.png")).image.max() == pytest.approx(200 / 255, abs=0.01)
+
+
+def test_seams_and_lost_points_together_keep_the_numbers_of_the_file(tmp_path):
+    twice = Mesh(np.r_[TETRAHEDRON.vertices, [[9, 9, 9]], TETRAHEDRON.vertices], np.r_[TETRAHEDRON.faces[:2],
+                                                                                        TETRAHEDRON.faces[2:] + 5])
+    write_mesh(tmp_path / "a.obj", twice)
+    text = (tmp_path / "a.obj").read_text()
+    (tmp_path / "a.obj").write_text(text.replace("v 9 9 9", "v nan 0 0"))
+    mesh = quiet(read_mesh, tmp_path / "a.obj")
+    assert mesh.of_file.tolist() == [0, 1, 2, 3, -1, 0, 1, 2, 3]
+    same(mesh, TETRAHEDRON, 0)
