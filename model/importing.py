@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError, taking_apart
+from scanprep.geometry.storage import StorageError, check_regular, taking_apart
 from scanprep.skeleton.names import name_parts
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
@@ -144,6 +144,7 @@ def _poses(mesh: Mesh, skeleton: Skeleton, hands: dict[str, np.ndarray]) -> tupl
 
 def read_published(path: str | Path) -> Published:
     """The arrays of a file of the SMPL family's layout, checked; as for `import_model`."""
+    check_regular(path, what="a body model as .npz")
     with taking_apart(path, "a body model as .npz"):
         with open(path, "rb") as file:
             start = file.read(4)

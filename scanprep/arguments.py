@@ -162,7 +162,7 @@ class Argument:
         for path in value if isinstance(value, tuple) else (value,):
             if isinstance(path, Path) and str(path) not in WORDS and not path.exists():
                 beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-                raise FileNotFoundError(f"{path}: no such file or folder{near(path.name, beside)}")
+                raise FileNotFoundError(f"{path}: no such file or folder{near(path.name, beside, 0.8)}")
 
     def add_to(self, group: Any) -> argparse.Action:
         """As an argument of argparse."""
@@ -216,9 +216,9 @@ def _value(kind: Any, text: str) -> Any:
         raise _Unknown(f"expected a {'whole ' if kind is int else ''}number, got {text}") from None
 
 
-def near(word: str, known: Iterable[str]) -> str:
+def near(word: str, known: Iterable[str], alike: float = 0.6) -> str:
     """The end of a message about a word that is unknown: the nearest one that is known."""
-    found = difflib.get_close_matches(word, list(known), 1, 0.6)
+    found = difflib.get_close_matches(word, list(known), 1, alike)
     return f"; did you mean {found[0]}?" if found else ""
 
 

@@ -150,11 +150,10 @@ class Arguments:
         return make_parser(self.prog, self.text, self.listed, tell)
 
     def read(self, argv: list[str]) -> dict[str, Any]:
-        """The values of a command line, every number in its range and every file there; nothing is done yet."""
+        """The values of a command line, every number in its range; nothing is done yet."""
         given = read_line(self.prog, self.text, self.listed, argv)
-        for check in (Argument.check_numbers, Argument.check_files):
-            for argument in self.listed:
-                check(argument, given[argument.name])
+        for argument in self.listed:
+            argument.check_numbers(given[argument.name])
         return given
 
     def as_flags(self, text: str) -> str:
@@ -174,7 +173,8 @@ class _Call:
         self.arguments = Arguments(function, prog, argv)
         self.wants_space, self.beside = self.arguments.wants_space, self.arguments.beside
         self.output_name = self.arguments.output_name
-        self.given = self.arguments.settings.taken_from(self.arguments.read(argv))
+        self.read = self.arguments.read(argv)
+        self.given = self.arguments.settings.taken_from(dict(self.read))
         self.force = self.given.pop(FORCE, False)
         self.output: Path | None = self.given.get(self.output_name or "")
         # what stands at its place is the thing itself that a command works on; flags name what is taken along
@@ -198,6 +198,8 @@ class _Call:
         from .batch.opening import beside, workspace
         from .judgement import carry_judgements
 
+        for argument in self.arguments.listed:
+            argument.check_files(self.read[argument.name])
         # before anything is written: an output may be one of the inputs
         self.before = carry_judgements(self.inputs, self.used)
         if self.output is None:

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from .geometry import storage
 from .ranges import FLAG, OutOfRange, Settings, marks
 
 Path_ = tuple[str, ...]              # of a field: the parameter, then the names of nested settings down to it
@@ -125,7 +126,9 @@ def _inline(item: Any) -> str:
 
 def read(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
     """Settings with what a file changes in them; ValueError names file, line, what was expected, the nearest name."""
-    return parsed(path.read_text(encoding="utf-8"), path, settings)
+    with storage.taking_apart(path, "settings in TOML"):
+        text = storage.read_bytes(path, "settings in TOML").decode("utf-8")
+    return parsed(text, path, settings)
 
 
 def parsed(text: str, path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:

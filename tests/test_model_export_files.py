@@ -208,7 +208,7 @@ def test_the_command_writes_what_the_name_says(files, model, rig, motion):
         "distance from exact body, skinning alone, mean"]
     exported(files, "a.ply", "--own-body")
     assert np.abs(read_mesh(files / "a.ply", "m").vertices - model.vertices(np.zeros((4, 3)))).max() < 1e-12
-    figures = exported(files, "slow.glb", "--motion", str(files / "motion.npz"), "--up", "1", "--fps", "2")
+    figures = exported(files, "slow.glb", "--motion", str(files / "motion.npz"), "--up", "y", "--fps", "2")
     assert figures["frames"] == 3
     assert exported(files, "frames", "--motion", str(files / "motion.npz"))["meshes"] == 5
     assert len(list((files / "frames").glob("*.ply"))) == 5

@@ -67,7 +67,7 @@ def test_wrong_usage_is_one_line(words, told, capsys, tmp_path, monkeypatch):
 def test_a_file_that_is_not_there_is_said_before_anything_else(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "half_view.ply").touch()
-    assert main(["complete", "half_veiw.ply", "-o", "out"]) == 2
+    assert main(["complete", "half_veiw.ply", "-o", "out"]) == 1
     assert capsys.readouterr().err == \
         "scape complete: half_veiw.ply: no such file or folder; did you mean half_view.ply?\n"
 

@@ -2,11 +2,17 @@
 import csv
 import dataclasses
 import os
+import re
 
 import numpy as np
 import pytest
 
-from scanprep import Mesh, RegisteredSet
+from completion import MarkerLayout, read_markers
+from completion.partial.masks import read_mask
+from model import load_model
+from model.importing import read_published
+from model.motion.files import read_motion_file
+from scanprep import Mesh, RegisteredSet, Skeleton, config_files, read_landmarks
 from scanprep.batch.cluster import _outcome
 from scanprep.batch.digests import Digests
 from scanprep.batch.opening import beside, workspace
@@ -15,6 +21,7 @@ from scanprep.batch.room import Job
 from scanprep.batch.values import save_value
 from scanprep.batch.workspace import RECORD, Task
 from scanprep.console import Metric, bar, say, show
+from scanprep.depth_camera.picture import read_camera, read_distances
 from scanprep.geometry import storage
 from scanprep.geometry.storage import StorageError, path_inside
 from scanprep.geometry.tables import number_table, read_table, write_table
@@ -97,12 +104,40 @@ def test_a_report_names_the_file_of_somebody_else(home, name):
         (staged.folder / "body.ply").write_text("new")
 
 
+def test_a_new_result_follows_no_link_out_of_the_output(home):
+    """Before it is written: else every later run would find it on its way and stop."""
+    (home / "elsewhere").mkdir()
+    (home / "out" / "place").symlink_to(home / "elsewhere", target_is_directory=True)
+    (home / "in.txt").write_text("text")
+    with workspace(home / "out") as space:
+        with pytest.raises(StorageError, match="link"), space.staging("in") as staged:
+            (staged.folder / "place").mkdir()
+            (staged.folder / "place" / "copy.txt").write_text("text")
+        assert not list(space.home.glob("ready/*"))
+    assert not list((home / "elsewhere").iterdir())
+
+
+READERS = (load_model, read_published, read_camera, read_distances, read_landmarks, read_markers, Skeleton.load,
+           MarkerLayout.load, read_motion_file, lambda path: read_mask(path, np.zeros((2, 3))),
+           lambda path: config_files.read(path, {}))
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_what_is_no_plain_file_is_refused_before_it_is_read(tmp_path, reader):
+    """A pipe that nobody writes to would be waited for without end."""
+    os.mkfifo(tmp_path / "pipe.npz")
+    for path in (tmp_path, tmp_path / "pipe.npz"):
+        with pytest.raises(ValueError, match=re.escape(str(path))):
+            reader(path)
+
+
 def test_a_record_without_what_it_needs_counts_as_none(home):
     save_value(home / "out" / HOME / "done" / "in.npz", None, {"files": {"../profile": "x"}})
     assert run_again(home).fresh == ("in",)
 
 
-@pytest.mark.parametrize("place", [HOME, f"{HOME}/making", f"{HOME}/ready", f"{HOME}/ready/in", f"{HOME}/done"])
+@pytest.mark.parametrize("place", [HOME, f"{HOME}/making", f"{HOME}/ready", f"{HOME}/ready/in", f"{HOME}/done",
+                                   f"{HOME}/ready/in/place", f"{HOME}/steps/in"])
 def test_a_link_where_scapekit_keeps_what_it_knows(home, place):
     """Removing what a killed run left would remove it elsewhere."""
     (home / "elsewhere" / "making").mkdir(parents=True)

@@ -234,11 +234,11 @@ def test_gltf_with_its_numbers_inside_or_beside(tmp_path):
         tree["buffers"][0]["uri"] = uri
         (tmp_path / folder / "a.gltf").write_text(json.dumps(tree))
     same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON)
-    refused(tmp_path / "in" / "a.gltf", "beside it", "../two parts.bin")
+    refused(tmp_path / "in" / "a.gltf", "inside", "../two parts.bin")
     (tmp_path / "in" / "link.bin").symlink_to(tmp_path / "two parts.bin")
     tree["buffers"][0]["uri"] = "link.bin"
     (tmp_path / "in" / "a.gltf").write_text(json.dumps(tree))
-    refused(tmp_path / "in" / "a.gltf", "beside it", "link.bin")
+    refused(tmp_path / "in" / "a.gltf", "leads out", "link.bin")
 
 
 def test_normalised_integers_of_gltf_are_fractions(tmp_path):
@@ -365,7 +365,8 @@ def test_pictures_that_are_none_or_too_large_are_named(tmp_path, what):
     else:
         size, place = (8200, 8200) if what == "huge" else (8, 8), tmp_path / ("" if what == "outside" else "in")
         Image.new("1", size).save(place / "lost.png")
-    says = {"folder": "found a folder", "outside": "expected files beside it", "huge": "8200 x 8200 pixels"}[what]
+    says = {"folder": "found a folder",
+            "outside": "expected the name of a file inside", "huge": "8200 x 8200 pixels"}[what]
     with pytest.warns(UserWarning, match=says):
         read_texture(obj)
 

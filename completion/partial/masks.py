@@ -81,7 +81,7 @@ def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
 
 def _words(path: Path) -> np.ndarray:
     with storage.taking_apart(path, "text"):
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = storage.read_bytes(path, "text").decode("utf-8-sig").splitlines()
     known: dict[str, bool] = {"true": True, "false": False}
     values: list[bool | int] = []
     for number, line in enumerate(lines, 1):

@@ -57,7 +57,8 @@ def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
 def _opened(space: Workspace) -> Iterator[Workspace]:
     """Locked, and put right where an earlier run was killed; of one that came to nothing, nothing is left."""
     key, made = space.home.absolute(), [p for p in (space.home, *space.home.parents) if not p.exists()]
-    for place in (space.home, *(space.home.glob("*")), *space.home.glob("ready/*")):
+    for place in (space.home, *(Path(parent) / name for parent, folders, files in os.walk(space.home)
+                                for name in (*folders, *files))):
         if place.is_symlink():                              # what is moved and removed there would be elsewhere
             raise ForeignFileError(f"{place}: expected a file or folder that scapekit made, found a link; remove it")
     space.home.mkdir(parents=True, exist_ok=True)

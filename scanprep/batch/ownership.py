@@ -34,7 +34,7 @@ class Ownership:
         """ForeignFileError where something else stands in the places of files with these digests."""
         taken = []
         for file, digest in files.items():
-            place = self.folder / file
+            place = storage.path_inside(self.folder, file, self.folder)      # no link leads the file elsewhere
             if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
                     or (place.exists() and self.digests.of_file(place) != digest and not self.has(file)):
                 taken.append(place)

@@ -1,13 +1,14 @@
 """What a depth camera saw: a picture of distances, cleaned of pixels between two surfaces, as points with normals."""
 from __future__ import annotations
 
-import json
+import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
+from ..geometry import storage
 from ..geometry.mesh import Mesh
 
 NOISE = 0.002                        # metres at one metre, growing with the square of the distance: what cameras have
@@ -182,7 +183,7 @@ def read_distances(path: Path) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as image:
+        with Image.open(io.BytesIO(storage.read_bytes(path, "a PNG file"))) as image:
             values = np.array(image)
     except UnidentifiedImageError:
         raise ValueError(f"{path}: it is not a PNG file") from None
@@ -197,7 +198,7 @@ def read_camera(path: Path) -> np.ndarray:
         raise ValueError(f"expected its camera in {path}, as {{\"fx\": 589, \"fy\": 589, \"cx\": 319.5, "
                          "\"cy\": 239.5}, pixels; there is none")
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        told = storage.read_json(path, "the camera of a depth picture")
         if "intrinsic_matrix" in told:
             return np.array(told["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
         fx, fy, cx, cy = (float(told[name]) for name in ("fx", "fy", "cx", "cy"))

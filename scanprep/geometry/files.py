@@ -274,7 +274,7 @@ def write_points(path: str | Path, cloud: PointCloud) -> None:
 
 def is_scan(path: Path) -> bool:
     """Whether a name is that of a mesh or a point cloud."""
-    return ending_of(path) in ENDINGS
+    return ending_of(path) in SCAN_ENDINGS
 
 
 def list_meshes(folder: str | Path) -> list[Path]:

@@ -79,10 +79,10 @@ def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
 
 def file_beside(path: Path, name: str) -> Path:
     """A file that another one names; MeshFileError where it does not lie in the folder of that one, or below."""
-    beside, folder = path.parent / unquote(name), path.parent.resolve()
-    if "\0" in name or not beside.resolve().is_relative_to(folder):
-        raise MeshFileError(f"{path}: expected files beside it, found {quote(name)}")
-    return beside
+    try:
+        return storage.path_inside(path.parent, unquote(name), path)
+    except storage.StorageError as problem:
+        raise MeshFileError(str(problem)) from None
 
 
 def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:

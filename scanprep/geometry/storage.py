@@ -51,6 +51,18 @@ def _reason(problem: Exception) -> str:
     return f"cannot read it ({text or type(problem).__name__})"
 
 
+def check_regular(path: str | Path, error: type[StorageError] = StorageError, what: str = "a file") -> None:
+    """An `error` for what is no plain file: missing, a folder, or a pipe or device, which may never end."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise error(f"{path}: no such file; expected {what}") from None
+    except (OSError, ValueError) as problem:
+        raise error(f"{path}: cannot be read ({getattr(problem, 'strerror', None) or problem})") from None
+    if not stat.S_ISREG(mode):
+        raise error(f"{path}: expected {what}, found a {'folder' if stat.S_ISDIR(mode) else 'pipe or a device'}")
+
+
 def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
     """The file of a folder that another file names, which must lie in that folder.
 
@@ -94,18 +106,6 @@ def path_inside(folder: str | Path, name: object, source: str | Path) -> Path:
     if not inside:
         raise StorageError(f"{source}: {path} is a link that leads out of {folder}; expected a file inside")
     return path
-
-
-def check_regular(path: str | Path, error: type[StorageError] = StorageError, what: str = "a file") -> None:
-    """An `error` for what is no plain file: missing, a folder, or a pipe or device, which may never end."""
-    try:
-        mode = os.stat(path).st_mode
-    except FileNotFoundError:
-        raise error(f"{path}: no such file; expected {what}") from None
-    except (OSError, ValueError) as problem:
-        raise error(f"{path}: cannot be read ({getattr(problem, 'strerror', None) or problem})") from None
-    if not stat.S_ISREG(mode):
-        raise error(f"{path}: expected {what}, found a {'folder' if stat.S_ISDIR(mode) else 'pipe or a device'}")
 
 
 def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError] = StorageError) -> bytes:

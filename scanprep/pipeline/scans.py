@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..console import visible
 from ..geometry import storage, tables
-from ..geometry.files import SCAN_ENDINGS, MeshFileError, ending_of, name_of
+from ..geometry.files import SCAN_ENDINGS, MeshFileError, is_scan, name_of
 from ..geometry.landmarks import landmarks_beside
 
 TABLE = "scans.csv"
@@ -73,7 +73,7 @@ def _list_scans(folder: Path) -> dict[str, Path]:
 
 
 def _is_scan(path: Path) -> bool:
-    return ending_of(path) in SCAN_ENDINGS and not path.name.startswith(".") and path.is_file()
+    return is_scan(path) and not path.name.startswith(".") and path.is_file()
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:
