@@ -76,7 +76,7 @@ def test_csv_is_plain_enough_for_a_spreadsheet(tmp_path):
 
 @pytest.mark.parametrize(("data", "word"), [
     (None, "no such file"), (b"", "empty"), (b"\x89PNG\r\n" + bytes(range(256)) * 8, "expected"),
-    (b"hello\nworld\n" * 100, "expected"), ("folder", "directory")])
+    (b"hello\nworld\n" * 100, "expected"), ("folder", "found a folder")])
 @pytest.mark.parametrize("suffix", [".c3d", ".trc", ".csv"])
 def test_missing_empty_folder_and_foreign_files(tmp_path, suffix, data, word):
     path = tmp_path / f"a{suffix}"

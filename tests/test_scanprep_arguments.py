@@ -85,7 +85,7 @@ def test_values_may_begin_with_a_dash_and_names_in_python_are_understood(words):
     def work(up: Literal["y", "-y"] = "y", betas: tuple[Signed, ...] = (),
              old_name: Annotated[Path | None, Called("--renamed")] = None) -> Outcome:
         got.update(up=up, betas=betas, old_name=old_name)
-        return Outcome(None, [])
+        return Outcome(None, [], judgement=None)
 
     work.__annotations__ = {"up": Literal["y", "-y"], "betas": tuple[Signed, ...],
                             "old_name": Annotated[Path | None, Called("--renamed")]}

@@ -75,7 +75,7 @@ def run(argv, capsys):
     @functools.wraps(work)
     def spy(words="", config=None, *, times=1):
         seen.append(config)
-        return Outcome(None, [Metric("done", 1)])
+        return Outcome(None, [Metric("done", 1)], judgement=None)
 
     code = command_line.run(spy, "scape work", [str(word) for word in argv])
     said = capsys.readouterr()

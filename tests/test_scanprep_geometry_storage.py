@@ -22,7 +22,7 @@ def test_arrays_and_header_come_back(tmp_path):
 
 
 def test_no_objects_go_in_and_no_pickle_is_loaded(tmp_path):
-    with pytest.raises(ValueError, match="Object arrays cannot be saved"):
+    with pytest.raises(ValueError, match=r"m\.npz: .*a holds objects"):
         storage.save(tmp_path / "m.npz", "model", 1, {"a": np.array([{}])})
     assert list(tmp_path.iterdir()) == []
     np.savez(tmp_path / "evil.npz", header=np.array([json.dumps({"kind": "model"})], dtype=object))

@@ -155,7 +155,7 @@ def test_defaults_are_in_their_ranges(prog, monkeypatch, tmp_path):
     @functools.wraps(function)
     def spy(*args, **named):
         called.append(named)
-        return Outcome(None, [Metric("done", 1)])
+        return Outcome(None, [Metric("done", 1)], judgement=None)
 
     assert command_line.run(spy, prog, needed(function)) == 0 and len(called) == 1
 

@@ -92,7 +92,7 @@ def test_a_command_has_one_thread_and_leaves_the_settings_as_they_were(monkeypat
     def command() -> Outcome:
         """Look."""
         seen.append(pools())
-        return Outcome(None, [Metric("nothing", 0)])
+        return Outcome(None, [Metric("nothing", 0)], judgement=None)
 
     assert run(command, "look", []) == 0 and seen == [{1}] and pools() == {2}
     monkeypatch.setenv("OMP_NUM_THREADS", "2")

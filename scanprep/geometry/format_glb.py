@@ -59,7 +59,7 @@ def read_gltf(path: Path, data: bytes) -> Contents:
 def _one_buffer(path: Path, tree: dict[str, Any], binary: bytes) -> bytes:
     """All buffers of a file one after the other, `binary` the one inside it; its views are moved to where they are."""
     buffers, starts = list[bytes](), list[int]()
-    for entry in tree.get("buffers", []):
+    for entry in tree.get("buffers") or [{}]:          # without a list of them there is the one inside
         uri = entry.get("uri")
         if uri is None:
             data = binary

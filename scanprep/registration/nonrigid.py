@@ -122,9 +122,10 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
     points = scan.vertices if isinstance(scan, Mesh) else scan
     far, seen, stretch = fit.uncovered, float(fit.seen.mean()), stretched_share(template, fit.mesh)
     off = fit.landmark_rms > HAND * size(template)
-    # with left and right exchanged 0.13 are not covered and 0.10 stretched; a second person is half of a scan, and a
-    # limb alone, with which the rest of the template is only invented, gives a twentieth of it data
-    if not (far > 0.35 or seen < 0.05 or min(far, stretch) > 0.05 or off):
+    # with left and right exchanged 0.13 are not covered and 0.10 stretched; a limb alone, with which the rest of the
+    # template is only invented, gives a twentieth of it data. Where half of a scan is something else, but half of the
+    # template has data, it is furniture or a second person: to be looked at.
+    if not (far > (0.5 if seen > 0.5 else 0.35) or seen < 0.05 or min(far, stretch) > 0.05 or off):
         return None
     cause = unit_problem(extent(points), extent(template.vertices), "the scan is", 0.05) or (
         "landmarks of left and right exchanged, or of other places?" if marked and seen >= 0.01 else

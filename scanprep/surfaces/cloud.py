@@ -61,7 +61,10 @@ def read_surface(path: Path, unit: str | None = None) -> Mesh:
     if isinstance(found, Mesh):
         return found
     warnings.warn(f"{path} has no triangles: its points are meshed, and left open where there are none", stacklevel=2)
-    return mesh_of_cloud(read_points(path, unit))
+    try:
+        return mesh_of_cloud(read_points(path, unit))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def mesh_of_view(view: PointCloud | np.ndarray) -> tuple[Mesh, np.ndarray]:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.storage import StorageError, read_bytes, read_json, taking_apart, write_json, writing
+from scanprep.geometry.storage import StorageError, check_regular, read_json, taking_apart, write_json, writing
 from scanprep.pictures import png16
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
@@ -124,7 +124,9 @@ def _decoded(path: Path) -> tuple[np.ndarray, int]:
     """An image file and its bits per channel."""
     from PIL import Image
 
-    data = read_bytes(path, "a picture")
+    if path.exists():
+        check_regular(path)
+    data = path.read_bytes()
     if data[:8] == png16.SIGNATURE and png16.depth(data) in ((16, 2), (16, 3), (16, 4)):
         return png16.decode(data), 16
     with Image.open(io.BytesIO(data)) as image:
