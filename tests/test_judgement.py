@@ -79,9 +79,9 @@ REGISTER = "prep register {}.ply --template template.ply -o out.ply --config qui
 NOTHING = {
     "a ball": (REGISTER.format("ball"), ["of the scan lies off the template", "a scan of something else"]),
     "ten points": (REGISTER.format("ten"), ["0% of the template has data", "a scan of something else"]),
-    "another unit": (REGISTER.format("large") + " --landmarks large.json", ["--unit", "times as large"]),
+    "another unit": (REGISTER.format("large") + " --landmarks large.json --unit m", ["--unit", "times as large"]),
     "a ball to align": ("prep align ball_mesh.ply good.ply -o out.ply", ["a start far from the target"]),
-    "another unit to align": ("prep align large.ply good.ply -o out.ply", ["--unit", "times as large"]),
+    "another unit to align": ("prep align large.ply good.ply -o out.ply --unit m", ["--unit", "times as large"]),
 }
 GOOD = {"a scan": REGISTER.format("good"), "with landmarks": REGISTER.format("good") + " --landmarks good.json",
         "to align": "prep align good.ply template.ply -o out.ply"}
@@ -295,6 +295,13 @@ def test_registrations_by_their_figures(far, seen, off, stretch, words):
                        {}, 0, np.ones(count), far)
     told = registration_problem(body, body, fit, True)
     assert (told is None) if words is None else all(word in told for word in words), told
+
+
+def test_an_alignment_that_did_not_converge_is_to_be_looked_at(place, capsys):
+    assert main("prep align large.ply good.ply -o out.ply".split()) == 0            # read in inches, in which it fits
+    told = json.loads(Path("out.ply.report.json").read_text())
+    assert {"metric": "converged", "value": "False", "unit": ""} in told["metrics"]
+    assert told["judgement"]["verdict"] == "check" and "did not converge" in told["judgement"]["reasons"][0]
 
 
 def test_an_outcome_always_says_what_it_is_worth():

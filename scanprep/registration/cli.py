@@ -69,7 +69,8 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
     return Outcome(output, [
         Metric("RMS distance", MM * found.rms, "mm"), Metric("converged", str(found.converged)),
         Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config},
-        judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, found)))
+        judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, found), [] if found.converged else [
+            f"it did not converge, at {MM * found.rms:.0f} mm RMS: a start far from the target?"]))
 
 
 UNSEEN = 0.15                        # share of vertices that four views of a person leave without data
