@@ -149,5 +149,5 @@ def test_landmarks_of_a_scan_are_matched_by_name(built, tmp_path):
     assert found == {model.info["landmarks"][n]: p for n, p in
                      (("navel", [0, 1, 2]), ("left heel", [3, 4, 5]), ("right heel", [6, 7, 8]))}
     marks.write_text('{"navel": [0, 1, 2]}')
-    with pytest.raises(ValueError, match=r"marks\.json"):
-        read_landmark_pairs(model, "m", marks, None, "m")
+    with pytest.warns(UserWarning, match=r"marks\.json.*template: .*left heel.*scan: navel; going on without"):
+        assert read_landmark_pairs(model, "m", marks, None, "m") is None

@@ -100,7 +100,6 @@ REFUSED = {
     "nothing.ply": (None, "nothing.ply: no such file"),
     "empty.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\n"
                   b"end_header\n", "empty.ply"),
-    "nan.obj": (b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "nan.obj"),
     "notes.docx": (b"hello", "notes.docx: expected a mesh"),
     "text.ply": (b"hello", "text.ply"),
     "cut.npz": (b"PK\x03\x04broken", "cut.npz: expected"),

@@ -117,7 +117,7 @@ def test_commands(tmp_path, model, motion, capsys, monkeypatch):
     words = [str(tmp_path / "m.npz"), "--motion", str(tmp_path / "w.npz"), "--up", "z", "-o"]
     for wrong, told in ((["w.points.usd", "--root", "a"], "--root: it says nothing about a point cache"),
                         (["w.usd", "--unit", "cm"], "--unit: it says nothing about a usd")):
-        assert run(export, "scape model export", [*words, str(tmp_path / wrong[0]), *wrong[1:]]) == 1
+        assert run(export, "scape model export", [*words, str(tmp_path / wrong[0]), *wrong[1:]]) == 2
         assert told in capsys.readouterr().err
     assert run(export, "scape model export", [words[0], "-o", str(tmp_path / "w.points.usd")]) == 1
     assert "name it with --motion" in capsys.readouterr().err

@@ -23,7 +23,7 @@ def work(out: Path, times: int = 2, settings: Choices = Choices()) -> Outcome:
         raise ValueError(f"times: expected a count,\n got {times}")
     out.write_text("done")
     return Outcome(out, [Metric("distance", 0.00123456, "m"), Metric("times", times)], {"settings": settings},
-                   ["scan7: empty"] if times == 7 else [])
+                   ["scan7: empty"] if times == 7 else [], judgement=None)
 
 
 def test_done(tmp_path, capsys):

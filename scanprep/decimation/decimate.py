@@ -96,7 +96,10 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
     if smaller.colors is None and mesh.colors is not None:
         nearest = cKDTree(mesh.vertices).query(smaller.vertices)[1]
         smaller = Mesh(smaller.vertices, smaller.faces, mesh.colors[nearest])
-    return improve_triangles(smaller, Surface(mesh)) if config.improve else smaller
+    if not config.improve:
+        return smaller
+    fixed = None if keep is None else np.unique(cKDTree(smaller.vertices).query(mesh.vertices[keep])[1])
+    return improve_triangles(smaller, Surface(mesh), fixed)
 
 
 def collapse(mesh: Mesh, faces: int, crease: float | None = None, keep: np.ndarray | None = None,

@@ -127,10 +127,15 @@ def smooth(mesh: Mesh, rounds: int) -> Mesh:
     return mesh.with_vertices(vertices)
 
 
-def improve_triangles(mesh: Mesh, surface: Surface) -> Mesh:
-    """Slivers turned into well-shaped triangles on a surface; their number stays."""
+def improve_triangles(mesh: Mesh, surface: Surface, keep: np.ndarray | None = None) -> Mesh:
+    """Slivers turned into well-shaped triangles on a surface; their number stays, and the places of vertices `keep`."""
+    fixed = np.zeros(0, dtype=np.int64) if keep is None else keep
+    places = mesh.vertices[fixed]
     for _ in range(6):
         mesh = relax(flip_edges(mesh, rounds=8), surface, rounds=2)
+        vertices = mesh.vertices.copy()
+        vertices[fixed] = places
+        mesh = mesh.with_vertices(vertices)
     return flip_edges(mesh)
 
 

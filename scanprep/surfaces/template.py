@@ -120,7 +120,7 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
         normals = None if scan.normals is None else scan.normals[kept]
         mesh = mesh_of_cloud(PointCloud(points[kept], normals))
         notes.append("points without triangles were meshed")
-    made = _finish(mesh, faces, config, progress, "the scan")
+    made = _finish(mesh, faces, config, progress, "the scan", landmarks)
     return replace(made, notes=(*notes, *made.notes))
 
 
@@ -151,9 +151,9 @@ def views_without_cameras(views: Sequence[Mesh | PointCloud]) -> PointCloud:
                       np.concatenate([mesh.vertex_normals for mesh in meshes]))
 
 
-def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[int, int], None] | None, what: str
-            ) -> MadeTemplate:
-    """Smooth, fill and decimate an open surface."""
+def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[int, int], None] | None, what: str,
+            landmarks: np.ndarray | None = None) -> MadeTemplate:
+    """Smooth, fill and decimate an open surface; the vertices at landmarks (L, 3), such as fingertips, stay."""
     tell, notes = progress or (lambda done, total: None), list[str]()
     tell(1, 4)
     mesh = repair(mesh)
@@ -170,11 +170,12 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     surface = Surface(mesh)
     if mesh.volume < 0:
         mesh = Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colors)
-    small = improve_triangles(decimate(mesh, faces, config.decimate), surface)
+    keep = None if landmarks is None else np.unique(cKDTree(mesh.vertices).query(landmarks)[1])
+    small = _improve(decimate(mesh, faces, config.decimate, keep), surface, keep)
     balance = left_share(small)
     if balance is not None and abs(balance - 0.5) > UNEVEN:
         # collapses of least error spend triangles on the noise of one side; those of shortest edges do not
-        small = improve_triangles(decimate(mesh, faces, replace(config.decimate, method="even")), surface)
+        small = _improve(decimate(mesh, faces, replace(config.decimate, method="even")), surface, keep)
         notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, "
                      f"{100 * (left_share(small) or 0.5):.0f}% are")
         balance = left_share(small)
@@ -186,6 +187,16 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     handles = 1 - (len(small.vertices) - len(small.edges) + len(small.faces)) // 2
     return MadeTemplate(small, tuple(notes), float(small.face_areas[far].sum() / small.face_areas.sum()), handles,
                         balance)
+
+
+def _improve(mesh: Mesh, surface: Surface, keep: np.ndarray | None) -> Mesh:
+    """Well-shaped triangles; the vertices nearest to those of the surface `keep` (L,) are where these are."""
+    if keep is None:
+        return improve_triangles(mesh, surface)
+    nearest, which = np.unique(cKDTree(mesh.vertices).query(surface.mesh.vertices[keep])[1], return_index=True)
+    vertices = mesh.vertices.copy()
+    vertices[nearest] = surface.mesh.vertices[keep[which]]
+    return improve_triangles(mesh.with_vertices(vertices), surface, nearest)
 
 
 def carry_landmarks(places: Mapping[str, np.ndarray], mesh: Mesh) -> tuple[dict[str, int], dict[str, float]]:
