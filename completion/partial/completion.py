@@ -48,6 +48,8 @@ BENT = np.radians(20)                # rotation that is more than an error, of a
 MONSTROUS = np.radians(75)           # from any known way to hold a joint; right bodies reach 50, wrong ones 94
 LEFT_OVER = 0.03                     # share of a scan without a body near that is clutter, or a limb elsewhere
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
+CROWDED = 0.7                        # the same where hardly half of the body has data; a cylinder ends at 0.60 and 0.37
+COVERED = 0.5                        # share of the body with data; of one of two people it is 0.94, at 0.58 explained
 UNJUDGED = Judgement.of(check=["no judgement was made"])
 ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
 
@@ -216,7 +218,8 @@ def left_over(fit: ScanFit, explained: float) -> list[str]:
     """What of a scan no body is near, where that is a limb's worth; of a picture `strayed` tells."""
     if fit.cloud.person is not None or 1 - explained <= LEFT_OVER:
         return []
-    return [f"{100 * (1 - explained):.1f}% of the scan has no body near: clutter, or a limb elsewhere"]
+    cause = "a second person, or clutter?" if explained < CROWDED else "clutter, or a limb elsewhere"
+    return [f"{100 * (1 - explained):.1f}% of the scan has no body near: {cause}"]
 
 
 def ambiguous(fit: ScanFit, x: np.ndarray, rival: np.ndarray | None) -> list[str]:
@@ -250,7 +253,8 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
     """
     off, most = done.landmark_rms / size(done.predicted), done.explained
     wrong = None if free_scale else unit_problem(extent(points), extent(done.predicted.vertices), "the scan is", 0.05)
-    if wrong is None and done.seen.any() and most >= LOST and not (off > HAND or (off > ASTRAY and most < ENOUGH)):
+    least = CROWDED if done.seen.mean() < COVERED else LOST
+    if wrong is None and done.seen.any() and most >= least and not (off > HAND or (off > ASTRAY and most < ENOUGH)):
         return None
     marks = "" if np.isnan(done.landmark_rms) else f", the landmarks are {1000 * done.landmark_rms:.0f} mm off"
     return (f"the body explains {100 * done.explained:.0f}% of the scan, {100 * done.seen.mean():.2g}% of it has "

@@ -13,6 +13,7 @@ from ..judgement import Judgement
 from ..ranges import Settings
 from ..registration.limbs import Doubt
 
+CROWDED = 0.3                  # share of a scan off the template that may be a second person, who is half of it
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
 FIGURES, TIMES, FAILURES, LIMBS = "registration.csv", "times.csv", "failures.csv", "limbs.csv"
@@ -184,7 +185,8 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
 
 def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt]) -> Verdict:
     over = {
-        f"{100 * f.missed:.1f}% of the scan lies off the template: an uncovered limb, or clutter":
+        f"{100 * f.missed:.1f}% of the scan lies off the template: "
+        + ("a second person, or clutter?" if f.missed > CROWDED else "an uncovered limb, or clutter"):
             f.missed / limits.missed,
         f"{1000 * f.distance:.1f} mm from the scan on average": f.distance / (limits.distance * size),
         f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here":

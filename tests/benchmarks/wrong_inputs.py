@@ -199,11 +199,11 @@ def statue_cases() -> Iterator[Case]:
     for what in ("0.5 of the size", "two people", "left half", "chair", "cylinder", "horse", "shins and feet"):
         def make(folder: Path, what: str = what) -> None:
             write(folder, changes(300, False)[what][0])
-        yield Case(f"statue: {what}", "statue fit scan.ply -o out --unit m --config.displacement.size 512", make)
+        yield Case(f"statue: {what}", "statue fit scan.ply -o out --unit m --size 512", make)
     for seed in (310, 311):
         def right(folder: Path, seed: int = seed) -> None:
             write(folder, subject(seed, False).scan)
-        yield Case(f"statue: person {seed}", "statue fit scan.ply -o out --config.displacement.size 512", right, False)
+        yield Case(f"statue: person {seed}", "statue fit scan.ply -o out --size 512", right, False)
 
 
 def measured_cases() -> Iterator[Case]:
