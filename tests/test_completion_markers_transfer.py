@@ -73,7 +73,7 @@ def test_a_transfer_rotates_with_the_bodies(body, layout):
 def test_what_does_not_fit_is_refused(body, layout):
     target, _ = renumbered(body, np.random.default_rng(1))
     far = target.with_vertices(4 * target.vertices)
-    with pytest.raises(ValueError, match=r"target: the source could not be brought onto it, (99|100)% .* give landmarks"):
+    with pytest.raises(ValueError, match=r"target: .* brought onto it, (99|100)% .* give landmarks"):
         transfer_layout(layout, body, far, config=replace(NEAR, final_fit=None), search=False)
     with pytest.raises(ValueError, match="marker 'A' sits on vertex 99999"):
         transfer_layout(MarkerLayout(("A",), np.array([99_999])), body, target)
