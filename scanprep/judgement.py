@@ -15,9 +15,9 @@ Verdict = Literal["good", "check", "failed"]
 HAND = 0.06                 # of a body's size, the root of its area: a hand's width, 8 cm on a man
 
 # ANSUR II, 6,068 soldiers: 1.41 to 1.99 m, 36 to 144 kg, 15 to 43 kg/m²; one litre of a person weighs about a kilogram.
-# Everybody is more varied than soldiers: an adult beyond 1.40 to 2.10 m or 35 to 200 litres is one in ten thousand.
+# Everybody is more varied than soldiers; beyond 1.40 to 2.10 m or 35 to 200 litres somebody should look.
 ADULTS, VOLUMES = (1.40, 2.10), (35.0, 200.0)          # metres, litres
-ANYBODY = (1.00, 2.30)                                 # metres: a child of four; five men alive are taller than that
+ANYBODY = (1.00, 2.30)                                 # metres: from a child of about four
 BUILD, ANY_BUILD = (13.0, 55.0), (9.0, 90.0)           # litres per square metre of stature, of people and of anybody
 # Betas of K components are sqrt(K) long on average. `mosh` of good recordings finds up to 2.8 times that, 12 of 18;
 # recordings scaled by 1.6 and 2.54 end at 4.7 and 11 times.
