@@ -109,7 +109,7 @@ def test_a_mix_wants_a_set_and_a_skeleton(folder, tmp_path):
 
 def test_parts_are_found_where_none_are_given(folder, tmp_path):
     outcome = learned(folder / "poses", tmp_path / "m.npz", parts=3, scape=QUICK)
-    assert {m.name: m.value for m in outcome.metrics}["parts"] == 3
+    assert {m.name: m.value for m in outcome.metrics}["parts of the skeleton"] == 3
     assert json.loads(json.dumps(load_model(tmp_path / "m.npz").info))["shapes"] == 0
 
 
