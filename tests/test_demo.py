@@ -28,7 +28,7 @@ from scanprep.geometry.mesh import template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.skeleton.find import find_skeleton
-from scanprep.surfaces.cli import template_of_views
+from scanprep.surfaces.cli import template
 from scanprep.synthetic.data_set import SUBJECT, subject_pose
 from scanprep.synthetic.people import Person
 
@@ -105,7 +105,7 @@ def test_more_of_the_first_component_is_more_volume(demo_folder):
 def test_range_views_and_cameras_make_a_template(demo_folder, tmp_path):
     views = demo_folder / "template_scan" / "range_views"
     assert set(json.loads((views / "cameras.json").read_text())) == {path.stem for path in views.glob("*.ply")}
-    assert run(template_of_views, "scape prep template", [str(views), "--faces", "3000", "-o",
+    assert run(template, "scape prep template", [str(views), "--faces", "3000", "-o",
                                                           str(tmp_path / "t.ply")]) == 0
     assert template_problem(read_mesh(tmp_path / "t.ply")) is None
 
