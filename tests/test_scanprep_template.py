@@ -71,7 +71,7 @@ def test_the_best_scan_becomes_a_template_in_one_command(place, body, tmp_path, 
     marks = read_landmark_vertices(tmp_path / "template.landmarks.json", made)
     assert list(marks) == list(TEN)
     for name, vertex in marks.items():
-        # a fingertip that lies in a hole of the scan is as far off as the patch over it
+        # 23.5 mm at one fingertip, of which the cause is not known; 20 are wanted
         assert np.linalg.norm(made.vertices[vertex] - body.vertices[landmarks()[name]]) < 0.025, name
     report = json.loads((tmp_path / "template.ply.report.json").read_text())
     assert report["judgement"]["verdict"] == "good" and "yes" in said.out + said.err
