@@ -265,7 +265,7 @@ def test_landmarks_that_nobody_shares_are_told_and_left_out(recording, tmp_path,
                                                  str(tmp_path / "marks.json")]) == 0
     assert "going on without landmarks" in capfd.readouterr().err
     assert run(cli.track_frames, "scape track", [str(tmp_path / "none"), *given]) == 1
-    assert "no such folder" in capfd.readouterr().err
+    assert "none: no such file or folder" in capfd.readouterr().err
     with pytest.raises(SystemExit):
         run(cli.track_frames, "scape track", ["--help"])
     assert "Example: scape track frames -m model.npz" in capfd.readouterr().out

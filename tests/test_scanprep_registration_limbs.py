@@ -3,8 +3,10 @@ import pytest
 
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
+from scanprep.geometry.target import target_of
+from scanprep.judgement import size
 from scanprep.registration import unmarked
-from scanprep.registration.limb_ends import bending
+from scanprep.registration.limb_ends import RigidFit, bending, find_ends, rotated_ends
 from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_bending, rolls
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts, average_person
@@ -114,3 +116,17 @@ def test_where_a_limb_was_lost_its_ends_lead(person, monkeypatch, first, second,
     monkeypatch.setattr(unmarked, "register", register)
     fit, _ = unmarked.register_unmarked(person.mesh, person.mesh)
     assert led == kept and fit.uncovered == (min(first, second) if len(kept) > 1 else first)
+
+
+def test_a_hand_bent_at_the_wrist_is_found(person):
+    """The template's hand points along the arm, the scan's is bent to some side."""
+    template, pose, hand = person.mesh, np.zeros((len(PARTS), 3)), PARTS.index("hand_left")
+    end = next(end for end in find_ends(template, 5, 0.14 * size(template))
+               if (person.part_of_vertex[end.vertices] == hand).any())
+    mine = np.flatnonzero(person.part_of_vertex[end.vertices] == hand)
+    for axis, degrees in ((1, 50), (1, 80), (2, -80), (2, 80)):
+        pose[hand] = np.radians(degrees) * frames()[hand, axis]
+        scan = template.with_vertices(person.posed(pose))
+        tried = rotated_ends(template, end, template.vertices, RigidFit(target_of(scan), size(template)))
+        off = min(np.linalg.norm(places[mine] - scan.vertices[end.vertices[mine]], axis=1).mean() for places in tried)
+        assert off < 0.025, (axis, degrees)

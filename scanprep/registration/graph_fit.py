@@ -20,7 +20,7 @@ from ..geometry.least_squares import Sparse, levenberg_marquardt
 from ..geometry.mesh import Mesh
 from ..geometry.target import orient
 from .deformation_graph import DeformationGraph, build_graph
-from .limb_ends import End, RigidFit, bending, find_ends, rotated_end
+from .limb_ends import End, RigidFit, bending, find_ends, rotated_ends
 from .matches import NORMALS, Inputs, Pull, landmark_pull, pull, wanted_by
 from .schedule import GraphStage
 
@@ -67,14 +67,16 @@ def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) 
     target = given.target.thinned(0.5 * stage.detail * size)
     target = orient(target, template.with_vertices(fit.x), NORMALS * size)
     scan = RigidFit(target, size)
-    places = rotated_end(template, end, fit.x, scan)
-    if places is None:
+    tried = rotated_ends(template, end, fit.x, scan)
+    if not tried:
         return fit
     held = landmark_pull(len(fit.x), given.landmarks, stage.landmarks * size**2)
     stiffness = _stiffness(stage, size)
     areas = template.vertex_areas
-    drawn = held + pull(len(fit.x), end.vertices, places, areas[end.vertices])
-    trial = bent(given, fit.minimised(drawn, stiffness, 8), replace(stage, hints=0.0, paths=0.0))
+
+    def trial(places: np.ndarray) -> GraphFit:
+        drawn = held + pull(len(fit.x), end.vertices, places, areas[end.vertices])
+        return bent(given, fit.minimised(drawn, stiffness, 8), replace(stage, hints=0.0, paths=0.0))
 
     def misfit(of: GraphFit) -> float:
         """Error against the scan, strain, and what the end is bent in itself, as they are now."""
@@ -83,7 +85,7 @@ def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) 
         bent = SHAPE * areas[end.vertices].sum() * bending(template.vertices[end.vertices], of.x[end.vertices])[0] ** 2
         return float(scan.error(body.vertices, body.vertex_normals) @ areas) + strain + bent
 
-    return trial if misfit(trial) < misfit(fit) else fit
+    return min([fit, *map(trial, tried)], key=misfit)
 
 
 def _stiffness(stage: GraphStage, size: float) -> Stiffness:

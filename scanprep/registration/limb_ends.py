@@ -1,4 +1,8 @@
-"""Ends of a body rotated about themselves: a head that looks elsewhere is out of reach of nearest points."""
+"""Ends of a body rotated about themselves or bent at their base.
+
+A head that looks elsewhere, or a hand bent at the wrist whose fingers no landmark shows, is out of reach of nearest
+points.
+"""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,13 +17,29 @@ from ..geometry.mesh import Mesh
 from ..geometry.target import Target
 from .matches import NORMALS
 
+SWING = 0.8                            # radians by which an end is tried bent at its base, to four sides
+BASE = 0.5                             # what its base, moved from where it is, weighs against all its other points
+
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """An end of a body: its vertices, and the direction in which it points away from the rest."""
+    """An end of a body: its vertices, those at its base, and the direction in which it points away from the rest."""
 
     vertices: np.ndarray
+    base: np.ndarray
     axis: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Hung:
+    """What holds a rigid piece: a point (3,) of it that should stay at a place (3,), both in metres.
+
+    `weight` is what that weighs against all its other points together.
+    """
+
+    local: np.ndarray
+    place: np.ndarray
+    weight: float
 
 
 @lru_cache(maxsize=4)
@@ -33,28 +53,47 @@ def find_ends(template: Mesh, count: int, radius: float) -> tuple[End, ...]:
         rim = inside[distance[inside] > 0.8 * radius]
         axis = template.vertices[inside].mean(axis=0) - template.vertices[rim].mean(axis=0) if len(rim) else np.zeros(3)
         if np.linalg.norm(axis) > 1e-3 * radius:
-            ends.append(End(inside, axis / np.linalg.norm(axis)))
+            ends.append(End(inside, rim, axis / np.linalg.norm(axis)))
     return tuple(ends)
 
 
-def rotated_end(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01
-                ) -> np.ndarray | None:
-    """Places (n, 3) of the vertices of an end after the rotation that fits best as a rigid piece.
+def rotated_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01) -> list[np.ndarray]:
+    """Places (n, 3) of the vertices of an end after rotations that fit well as a rigid piece, two at most.
 
-    None where that is no farther than `moved`, a share of the template's size, from where they are.
+    One may slide along the rest of the body, the other hangs on its base: where much of a bent hand is hidden, it is
+    the arm that a hand fits best. Places no farther than `moved`, a share of the template's size, from where they are
+    or from each other are left out.
     """
     rest, middle = template.vertices[end.vertices], x[end.vertices].mean(axis=0)
     R, _ = rotations.procrustes(rest, x[end.vertices])
     sample = np.linspace(0, len(rest) - 1, min(120, len(rest))).astype(int)
     local, normals = rest - rest.mean(axis=0), template.vertex_normals[end.vertices]
-    found = []
-    for angle in (0.0, 0.5, 1.0, -0.5, -1.0):        # radians: nearest points find what is half a step away
-        start = rotations.exp(angle * (R @ end.axis)) @ R
-        rotation, place, error = scan.fitted(local[sample], normals[sample], start, middle)
-        found.append((error, local @ rotation.T + place))
-    best = int(np.argmin([error for error, _ in found]))
-    apart = np.linalg.norm(found[best][1] - x[end.vertices], axis=1).mean()
-    return found[best][1] if apart > moved * scan.size else None
+    base, local_base = x[end.base].mean(axis=0), template.vertices[end.base].mean(axis=0) - rest.mean(axis=0)
+    kept = [x[end.vertices]]
+    for weight in (0.0, BASE):
+        found = []
+        for turn, pivot in _starts(R @ end.axis, middle, base):
+            start = rotations.exp(turn)
+            place = pivot + start @ (middle - pivot)
+            hung = Hung(local_base, base, weight)
+            rotation, place, error = scan.fitted(local[sample], normals[sample], start @ R, place, hung)
+            found.append((error, local @ rotation.T + place))
+        best = found[int(np.argmin([error for error, _ in found]))][1]
+        if all(np.linalg.norm(best - other, axis=1).mean() > moved * scan.size for other in kept):
+            kept.append(best)
+    return kept[1:]
+
+
+def _starts(axis: np.ndarray, middle: np.ndarray, base: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rotation vectors (3,) from which an end is tried, each with the point (3,) that stays: rolls, then swings.
+
+    Nearest points find what is half a step away.
+    """
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    around = [np.cos(angle) * across + np.sin(angle) * np.cross(axis, across) for angle in np.arange(4) * np.pi / 2]
+    rolls = [(angle * axis, middle) for angle in (0.0, 0.5, 1.0, -0.5, -1.0)]
+    return [*rolls, *((SWING * way, base) for way in around)]
 
 
 def bending(rest: np.ndarray, now: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
@@ -89,18 +128,21 @@ class RigidFit:
         off = np.einsum("nd,nd->n", m, x - y) ** 2 + self.scale**2 * ((n - m) ** 2).sum(axis=1)
         return np.where(good, np.minimum(off, self.cap**2), self.cap**2)
 
-    def fitted(self, local: np.ndarray, normals: np.ndarray, R: np.ndarray, place: np.ndarray
-               ) -> tuple[np.ndarray, np.ndarray, float]:
+    def fitted(self, local: np.ndarray, normals: np.ndarray, R: np.ndarray, place: np.ndarray,
+               hung: Hung) -> tuple[np.ndarray, np.ndarray, float]:
         """A rigid piece after some rounds of nearest points: its rotation, its place, its mean error."""
+        held = np.sqrt(hung.weight * len(local))
         for _ in range(8):
             x, n = local @ R.T + place, normals @ R.T
             y, m, good = self.nearest(x, n)
             if good.sum() < 6:
                 break
             arm = x - place
-            J = np.hstack([np.cross(arm, m), m])[good]
+            J = np.vstack([np.hstack([np.cross(arm, m), m])[good],
+                           held * np.hstack([np.cross(R @ hung.local, np.eye(3)), np.eye(3)])])
+            off = np.append(np.einsum("nd,nd->n", m, x - y)[good], held * (R @ hung.local + place - hung.place))
             H = J.T @ J
-            step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6),
-                                    J.T @ np.einsum("nd,nd->n", m, x - y)[good])
+            step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6), J.T @ off)
             R, place = rotations.exp(step[:3]) @ R, place + step[3:]
-        return R, place, float(self.error(local @ R.T + place, normals @ R.T).mean())
+        slid = hung.weight * ((R @ hung.local + place - hung.place) ** 2).sum()
+        return R, place, float(self.error(local @ R.T + place, normals @ R.T).mean() + slid)
