@@ -220,6 +220,7 @@ def test_the_command_writes_what_the_name_says(files, model, rig, motion):
     (["-o", "b.ply", "--motion", "motion.npz"], 2, "name a folder for the meshes of a motion"),
     (["-o", "b.glb", "--correctives", "3"], 2, "name it with --motion"),
     (["-o", "b.ply", "--fps", "24"], 2, "--fps: it says nothing about a mesh"),
+    (["-o", "b.ply", "--morphs", "2"], 2, "--morphs: it says nothing about a mesh"),
     (["-o", "nothing"], 1, "name it with --motion"),
     (["-o", "b.glb", "--own-body", "--betas", "1"], 2, "the template's own body has no betas"),
     (["-o", "b.glb", "--own-body", "--morphs", "2"], 1, "shapes: the template's own body has none"),

@@ -36,7 +36,7 @@ MEASURED = 40                        # poses in which the files are compared wit
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
 _BONES = _PLACED | {"motion", "fps", "root", "names"}
-_TAKES = {"glb": _BONES | {"shapes", "correctives"}, "usd": _BONES | {"shapes", "correctives"},
+_TAKES = {"glb": _BONES | {"morphs", "correctives"}, "usd": _BONES | {"morphs", "correctives"},
           "point cache": {"betas", "own_body", "motion", "fps", "up"}, "bvh": _BONES | {"unit"},
           "npz": {"motion", "fps"},
           "mesh": _PLACED, "folder": {"betas", "own_body", "motion", "fps"}}
@@ -79,7 +79,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
     """
     kind, axis = _kind(output), None if up is None else "xyz".index(up)
-    _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "shapes": shapes,
+    _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "morphs": shapes,
                             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
                             "names": names, "ground": ground, "front": front, "fps": fps})
     loaded = load_model(model)
