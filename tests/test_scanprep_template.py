@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.cli import group
@@ -15,7 +16,7 @@ from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.surfaces.cloud import mesh_of_cloud, mesh_of_view, spacing_of
-from scanprep.surfaces.template import left_share, template_of_scan, views_without_cameras
+from scanprep.surfaces.template import carry_landmarks, left_share, template_of_scan, views_without_cameras
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import Person
 
@@ -33,10 +34,15 @@ def off(mesh, truth):
 
 
 def as_scanned(body, rng):
-    """In millimetres, vertices in another order, with noise, holes, degenerate triangles, a fin, and a speck beside."""
+    """In millimetres, vertices in another order, with noise, holes, degenerate triangles, a fin, and a speck beside.
+
+    No hole takes a place that is clicked.
+    """
     v = body.vertices + 0.001 * rng.normal(size=(len(body.vertices), 1)) * body.vertex_normals
     middle, keep = v[body.faces].mean(axis=1), np.ones(len(body.faces), dtype=bool)
-    for centre in v[rng.integers(0, len(v), 4)]:
+    clicked = body.vertices[[landmarks()[name] for name in TEN]]
+    away = np.flatnonzero(cKDTree(clicked).query(v)[0] > 0.06)
+    for centre in v[rng.choice(away, 4)]:
         keep &= np.linalg.norm(middle - centre, axis=1) > 0.025
     order = rng.permutation(len(v))
     v, faces = v[order], np.argsort(order)[body.faces[keep]]
@@ -71,10 +77,17 @@ def test_the_best_scan_becomes_a_template_in_one_command(place, body, tmp_path, 
     marks = read_landmark_vertices(tmp_path / "template.landmarks.json", made)
     assert list(marks) == list(TEN)
     for name, vertex in marks.items():
-        # 23.5 mm at one fingertip, of which the cause is not known; 20 are wanted
-        assert np.linalg.norm(made.vertices[vertex] - body.vertices[landmarks()[name]]) < 0.025, name
+        assert np.linalg.norm(made.vertices[vertex] - body.vertices[landmarks()[name]]) < 0.02, name
     report = json.loads((tmp_path / "template.ply.report.json").read_text())
     assert report["judgement"]["verdict"] == "good" and "yes" in said.out + said.err
+
+
+def test_a_landmark_that_lies_off_the_template_is_told(body):
+    tip = landmarks()["right middle finger"]
+    lost = body.submesh(np.linalg.norm(body.corners.mean(axis=1) - body.vertices[tip], axis=1) > 0.025)[0]
+    places = {"top of head": body.vertices[landmarks()["top of head"]], "right middle finger": body.vertices[tip]}
+    _, far = carry_landmarks(places, lost)
+    assert list(far) == ["right middle finger"] and 0.015 < far["right middle finger"] < 0.026
 
 
 def test_a_scan_of_which_much_was_not_seen_is_doubted(body):

@@ -200,13 +200,13 @@ def _improve(mesh: Mesh, surface: Surface, keep: np.ndarray | None) -> Mesh:
 
 
 def carry_landmarks(places: Mapping[str, np.ndarray], mesh: Mesh) -> tuple[dict[str, int], dict[str, float]]:
-    """The vertices of a mesh nearest to landmarks (3,), and the distances, metres, of those that lie off it."""
+    """The vertices of a mesh nearest to landmarks (3,), and the distances, metres, of those off its surface."""
     if not places:
         return {}, {}
-    away, vertices = cKDTree(mesh.vertices).query(np.array(list(places.values())))
-    reach = OFF + mesh.mean_edge
+    points = np.array(list(places.values()))
+    away, vertices = Surface(mesh).closest(points).distances, cKDTree(mesh.vertices).query(points)[1]
     return (dict(zip(places, vertices.tolist(), strict=True)),
-            {name: float(d) for name, d in zip(places, away, strict=True) if d > reach})
+            {name: float(d) for name, d in zip(places, away, strict=True) if d > OFF})
 
 
 def left_share(mesh: Mesh) -> float | None:
