@@ -243,8 +243,8 @@ def test_the_model_of_the_sex_that_the_markers_tell(place, tmp_path):
 @pytest.mark.parametrize("words, message", [
     (("--hold-out", "M99"), "--hold-out: labels: M99 not among M0"),
     (("-m", "layout.json"), "--model: expected one, or three of both sexes, of women and of men, got 2"),
-    (("-m", "layout.json", "-m", "layout.json", "--retarget-to", "layout.json"),
-     "--retarget-to: a character is made of one model"),
+    (("-m", "layout.json", "-m", "layout.json", "--character", "layout.json"),
+     "--character: a character is made of one model"),
     (("--subjects", "no.csv"), "no.csv: no such file"), (("--subjects", "nobody"), "--subjects: expected a file"),
 ])
 def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):

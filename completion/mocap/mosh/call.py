@@ -59,7 +59,7 @@ def _sexes(models: tuple[Path, ...], character: Path | None) -> dict[str, BodyMo
     if len(models) not in (0, 1, 3):
         raise UsageError(f"--model: expected one, or three of both sexes, of women and of men, got {len(models)}")
     if character is not None and len(models) == 3:
-        raise UsageError("--retarget-to: a character is made of one model; expected one --model, got 3")
+        raise UsageError("--character: a character is made of one model; expected one --model, got 3")
     return dict(zip(("female", "male"), map(load_model, models[1:]), strict=True)) if len(models) == 3 else {}
 
 

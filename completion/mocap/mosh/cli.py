@@ -9,7 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
-from scanprep.arguments import Alias, Place
+from scanprep.arguments import Alias, Called, Place
 from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import HOME, Task, Workspace
 from scanprep.cli import Output, Unit
@@ -30,7 +30,7 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
                  subjects: str = "auto", subject_prefix: str | None = None, hold_out: tuple[str, ...] = (),
-                 retarget_to: Path | None = None, unit: Unit | None = None,
+                 retarget_to: Annotated[Path | None, Called("--character")] = None, unit: Unit | None = None,
                  config: MoshConfig = MoshConfig(),               # noqa: B008
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
