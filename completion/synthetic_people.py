@@ -27,7 +27,7 @@ Progress = Callable[[int, int], None]
 
 CACHE = "SCAPEKIT_CACHE"             # environment variable that names another folder
 SEAL = "seal"                        # its place in the model's info
-VERSION = 3                          # raised when the same recipe makes another model
+VERSION = 4                          # raised when the same recipe makes another model
 
 
 @dataclass(frozen=True)

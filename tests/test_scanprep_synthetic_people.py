@@ -7,8 +7,10 @@ import pytest
 
 from scanprep.geometry import rotations, storage
 from scanprep.geometry.mesh import Mesh, template_problem
+from scanprep.registration.limbs import beyond_people, joint_angles
 from scanprep.synthetic import people, topology
 from scanprep.synthetic.body_parts import body_surface
+from scanprep.synthetic.data_set import subject_pose
 from scanprep.synthetic.muscles import COLUMNS, masks
 from scanprep.synthetic.people import NAMED_POSES, PARENTS, PARTS, BodyShape, Person
 
@@ -266,3 +268,10 @@ def test_landmarks_and_markers(bodies):
     nose = bodies[0].mesh.vertices[people.LANDMARKS["nose tip"]]
     head = bodies[0].mesh.vertices[bodies[0].part_of_vertex == 3]
     assert nose[1] == pytest.approx(head[:, 1].min(), abs=0.004), "people face -y"
+
+
+def test_the_poses_of_the_demonstration_are_ones_that_people_do(man):
+    """No limb lies so that its registration would be doubted, whatever the seed."""
+    poses = [subject_pose(k, np.random.default_rng([seed, 1, k]))[1] for seed in range(12) for k in range(1, 12)]
+    bodies = np.stack([man.posed(pose) for pose in poses])
+    assert not beyond_people(joint_angles(man.skeleton.fit_rotations(man.mesh, bodies))).any()
