@@ -117,7 +117,8 @@ def test_a_header_as_blender_2_4_wrote_it(tmp_path):
     write_mesh(tmp_path / "a.ply", ball(1))
     data = (tmp_path / "a.ply").read_bytes().replace(b"element vertex", b"Created by Blender3D 247\nelement vertex", 1)
     (tmp_path / "b.ply").write_bytes(data)
-    np.testing.assert_array_equal(read_mesh(tmp_path / "b.ply", "m").vertices, read_mesh(tmp_path / "a.ply", "m").vertices)
+    theirs, ours = (read_mesh(tmp_path / name, "m") for name in ("b.ply", "a.ply"))
+    np.testing.assert_array_equal(theirs.vertices, ours.vertices)
 
 
 def test_a_polygon_that_folds_over_is_told(tmp_path):
