@@ -212,7 +212,7 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
 
 def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
     """Write arrays into one `.npz` file; ValueError for one of objects, which only a pickle would hold."""
-    for name, array in arrays.items():                     # before NumPy 2.3 savez cannot refuse them itself
+    for name, array in arrays.items():                     # before NumPy 2.2 savez cannot refuse them itself
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"{path}: expected arrays of numbers or text, {name} holds objects")
     with writing(path) as beside, open(beside, "wb") as out:
