@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError, check_regular, taking_apart
+from scanprep.geometry.storage import ObjectsError, StorageError, check_regular, load_arrays, names_in, taking_apart
 from scanprep.skeleton.names import name_parts
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
@@ -152,10 +152,14 @@ def read_published(path: str | Path) -> Published:
             if start[:1] == b"\x80" or Path(path).suffix == ".pkl":
                 raise StorageError(f"{path}: a pickle can run any program, so it is not opened; {_convert(path)}")
             raise StorageError(f"{path}: expected a body model as .npz, found another kind of file")
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: _array(path, file, name) for name in file.files
-                      if name in WANTED or name.startswith(("J_regressor_", "hands_mean"))
-                      or name in ("part_names", "header")}
+        wanted = [name for name in names_in(path) if name in WANTED or name in ("part_names", "header")
+                  or name.startswith(("J_regressor_", "hands_mean"))]
+        try:
+            arrays = load_arrays(path, "a body model as .npz", wanted)
+        except StorageError as problem:
+            if isinstance(problem.__cause__, ObjectsError):
+                raise StorageError(f"{problem}; {_convert(path)}") from None
+            raise
         if "header" in arrays:
             raise ValueError("it is a model of ours already: nothing to import")
         return _checked(arrays)
@@ -164,16 +168,6 @@ def read_published(path: str | Path) -> Published:
 def _convert(path: str | Path) -> str:
     stem = Path(path).with_suffix("")
     return CONVERT.format(path, f"{stem.name}.npz", WANTED)
-
-
-def _array(path: str | Path, file: Any, name: str) -> np.ndarray:
-    try:
-        return np.asarray(file[name])
-    except ValueError as problem:
-        if "allow_pickle" not in str(problem):
-            raise
-        raise StorageError(f"{path}: {name} is a pickled object, which can run any program, so it is not opened; "
-                           f"{_convert(path)}") from None
 
 
 def _checked(a: dict[str, np.ndarray]) -> Published:

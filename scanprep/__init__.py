@@ -1,4 +1,8 @@
 """From raw range scans to registered meshes and a skeleton."""
-import lazy_loader
+from .interrupts import leave_if_command
+
+leave_if_command()
+
+import lazy_loader  # noqa: E402
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -54,6 +54,8 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
         except Exception as error:
             if os.environ.get(TRACEBACK):
                 raise
+            for failure in getattr(error, "failures", ()):
+                say(call.real(f"{prog}: failed: {failure}") if call else failure)
             told = _told(error)
             say(f"{prog}: {told if call is None else call.real(call.arguments.as_flags(told))}")
             return 2 if isinstance(error, UsageError) else wrong
@@ -196,6 +198,7 @@ class _Call:
     def carried_out(self, start: float) -> tuple[Outcome, Path | None]:
         """What the function did, and where its report is."""
         from .batch.opening import beside, workspace
+        from .batch.workspace import NothingMadeError
         from .judgement import carry_judgements
 
         for argument in self.arguments.listed:
@@ -207,6 +210,8 @@ class _Call:
         if self.wants_space and not self.beside:
             with workspace(self.output, self.force) as space:
                 outcome = self.judged(self.function(**self.given, space=space))
+                if outcome.failures and space.all_failed and space.is_new:
+                    raise NothingMadeError(outcome.failures)
                 with space.staging("report") as staged:
                     report = write_report(dataclasses.replace(outcome, output=staged.folder), self.command,
                                           time.perf_counter() - start)

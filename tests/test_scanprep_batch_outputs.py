@@ -1,6 +1,7 @@
 """What commands write: whole or not at all, and nothing of the user's is lost."""
 import json
 import os
+from dataclasses import dataclass
 
 import pytest
 from trees import tree
@@ -9,7 +10,7 @@ from scanprep import command_line
 from scanprep.batch import workspace as room
 from scanprep.batch.opening import FileWorkspace, beside
 from scanprep.batch.ownership import HOME
-from scanprep.batch.workspace import Workspace
+from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output
 from scanprep.console import Metric, Outcome
 
@@ -153,3 +154,31 @@ def test_a_report_without_the_ending_still_tells_what_is_ours(tmp_path):
     assert command(write_alone, tmp_path / "a.md") == 1 and (tmp_path / "a.md").read_text() == "mine"
     assert command(write_alone, tmp_path / "a.txt", "--text", "other") == 0
     assert sorted(os.listdir(tmp_path)) == ["a.md", "a.txt", "a.txt.report.json"]
+
+
+@dataclass(frozen=True)
+class Refuse:
+    works: bool
+
+    def __call__(self, number, room):
+        if not (self.works and number == 1):
+            raise ValueError(f"task {number} is not done")
+        return number
+
+
+def failing(output: Output, works: bool = False, *, space: Workspace) -> Outcome:
+    """Prepare, then fail at all tasks but one, if that."""
+    space.step("prepared", 0, lambda folder: (folder / "a.txt").write_text("a"))
+    done = space.run(Refuse(works), [Task("1", 1, "1"), Task("2", 2, "2")])
+    return Outcome(output, [], failures=list(done.failures.values()), judgement=None)
+
+
+def test_where_all_tasks_fail_no_output_of_the_command_stays(tmp_path, capsys):
+    out = tmp_path / "new" / "out"
+    assert command(failing, out) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        "scape x: failed: task 1 is not done", "scape x: failed: task 2 is not done",
+        "scape x: all failed; nothing was written"]
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == []
+    assert command(failing, out, "--works") == 1 and (out / "a.txt").exists()
+    assert command(failing, out) == 1 and (out / "a.txt").exists()                  # what was there before stays

@@ -1,6 +1,10 @@
 """Commands end with a table and a report, failures with one line and exit code 1, wrong usage with 2."""
 import dataclasses
 import json
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -63,3 +67,13 @@ def test_plain_survives_json():
     value = {"a": np.float64(1.5), "b": np.arange(3), "c": Choices(), "d": (Path("x"), None)}
     assert json.loads(json.dumps(storage.as_json(value))) == {
         "a": 1.5, "b": [0, 1, 2], "c": {"weight": 0.5}, "d": ["x", None]}
+
+
+def test_ctrl_c_before_anything_is_loaded_is_one_line(tmp_path):
+    """The first library that is imported interrupts; one that did not stop at once would be seen after a minute."""
+    (tmp_path / "lazy_loader.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\n"
+                                             "time.sleep(60)\n")
+    run = subprocess.run([sys.executable, "-m", "completion", "--help"], capture_output=True, text=True, timeout=120,
+                         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+                         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    assert (run.returncode, run.stdout, run.stderr) == (130, "", "scape: interrupted; nothing was written\n")

@@ -3,29 +3,34 @@ import csv
 import dataclasses
 import os
 import re
+import zipfile
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from completion import MarkerLayout, read_markers
 from completion.partial.masks import read_mask
 from model import load_model
 from model.importing import read_published
 from model.motion.files import read_motion_file
+from model.statue.detail.maps import read_edited
 from scanprep import Mesh, RegisteredSet, Skeleton, config_files, read_landmarks
 from scanprep.batch.cluster import _outcome
 from scanprep.batch.digests import Digests
 from scanprep.batch.opening import beside, workspace
 from scanprep.batch.ownership import HOME
 from scanprep.batch.room import Job
-from scanprep.batch.values import save_value
+from scanprep.batch.values import load_value, save_value
 from scanprep.batch.workspace import RECORD, Task
 from scanprep.console import Metric, bar, say, show
 from scanprep.depth_camera.picture import read_camera, read_distances
 from scanprep.geometry import storage
 from scanprep.geometry.storage import StorageError, path_inside
 from scanprep.geometry.tables import number_table, read_table, write_table
+from scanprep.pictures.sheets import small_picture
 from scanprep.pipeline.scans import find_scans
+from scanprep.viewer.landmark_names import read_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +124,8 @@ def test_a_new_result_follows_no_link_out_of_the_output(home):
 
 READERS = (load_model, read_published, read_camera, read_distances, read_landmarks, read_markers, Skeleton.load,
            MarkerLayout.load, read_motion_file, lambda path: read_mask(path, np.zeros((2, 3))),
-           lambda path: config_files.read(path, {}))
+           lambda path: config_files.read(path, {}), small_picture, lambda path: read_names(str(path)),
+           lambda path: read_edited(path, (4, 4)))
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -129,6 +135,29 @@ def test_what_is_no_plain_file_is_refused_before_it_is_read(tmp_path, reader):
     for path in (tmp_path, tmp_path / "pipe.npz"):
         with pytest.raises(ValueError, match=re.escape(str(path))):
             reader(path)
+
+
+def test_what_unpacks_to_more_than_the_memory_is_refused_by_its_name(tmp_path):
+    """Small files of nothing but zeros: a model, and the maps and texture of a statue."""
+    with zipfile.ZipFile(tmp_path / "model.npz", "w", zipfile.ZIP_DEFLATED) as archive, \
+            archive.open("v_template.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "<f8", "fortran_order": False, "shape": (2**25, 1)})
+        for _ in range(256):
+            member.write(bytes(2**20))
+    with pytest.raises(StorageError, match=r"model\.npz.*would unpack to"):
+        read_published(tmp_path / "model.npz")
+    Image.new("1", (10_000, 10_000)).save(tmp_path / "map.png")
+    with pytest.raises(StorageError, match=r"map\.png.*10000 x 10000 pixels"):
+        read_edited(tmp_path / "map.png", (4, 4))
+
+
+@pytest.mark.parametrize("name", ["scanprep.geometry.mesh:Mesh", "scanprep.geometry.mesh:csr_array",
+                                  "scanprep.pictures.scene:_Columns", "os:stat_result", "scanprep.cli:Path"])
+def test_a_record_names_another_class_than_is_kept(tmp_path, name):
+    """Only a frozen dataclass of ours with just its own values is made again."""
+    storage.save(tmp_path / "in.npz", "result", 1, {}, {"value": {"class": name, "fields": {"more": 1}}})
+    with pytest.raises(StorageError, match=r"in\.npz.*(not a dataclass that is kept|not of this project|the values)"):
+        load_value(tmp_path / "in.npz")
 
 
 def test_a_record_without_what_it_needs_counts_as_none(home):

@@ -1,9 +1,11 @@
 """What other programs write: seams, polygons with more than three corners, several objects in one file."""
 import json
+import time
 
 import numpy as np
 import pytest
 import trimesh
+from scanned_shapes import ball
 
 from scanprep.geometry.files import read_mesh, read_registered, write_mesh
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
@@ -99,6 +101,24 @@ def test_polygons_are_cut_where_no_edge_is_yet(tmp_path):
     assert read_mesh(tmp_path / "b.obj").is_edge_manifold
     (tmp_path / "c.obj").write_text(CUBE)
     assert read_mesh(tmp_path / "c.obj").faces[:2].tolist() == [[0, 1, 3], [0, 3, 2]] and mesh.is_closed
+
+
+def test_a_polygon_that_goes_round_and_round_takes_no_time(tmp_path):
+    """A line of a thousand corners, as assimp keeps one to test its readers."""
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 2 0 0\nf " + 250 * "1 2 3 4 "
+                                    + "\nf 2 5 3\nf 1 2 5 4\n")
+    begun = time.process_time()
+    assert len(read_mesh(tmp_path / "a.obj", "m").faces) == 998 + 1 + 2
+    assert time.process_time() - begun < 1
+
+
+def test_a_header_as_blender_2_4_wrote_it(tmp_path):
+    """Its comment has no word that says so."""
+    write_mesh(tmp_path / "a.ply", ball(1))
+    data = (tmp_path / "a.ply").read_bytes().replace(b"element vertex", b"Created by Blender3D 247\nelement vertex", 1)
+    (tmp_path / "b.ply").write_bytes(data)
+    theirs, ours = (read_mesh(tmp_path / name, "m") for name in ("b.ply", "a.ply"))
+    np.testing.assert_array_equal(theirs.vertices, ours.vertices)
 
 
 def test_a_polygon_that_folds_over_is_told(tmp_path):

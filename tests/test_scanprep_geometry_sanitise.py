@@ -6,7 +6,7 @@ from scanned_shapes import ball
 
 from scanprep.cleaning.clean_scan import clean_scan
 from scanprep.geometry.files import read_scan, write_mesh
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.places import distinct_places, distinct_rows, spacing
 from scanprep.geometry.sanitise import _agree_with_camera, inverted, sanitise
 from scanprep.geometry.surface import Rays
@@ -172,9 +172,24 @@ def test_a_scan_finer_than_any_work_needs_is_thinned_and_told():
     assert 3400 < len(thin.faces) < 4400
     np.testing.assert_allclose(np.linalg.norm(thin.vertices, axis=1), 0.1, atol=5e-4)
     assert np.linalg.norm(thin.vertices[thin.of_file] - fine.vertices, axis=1).max() < 0.01
-    assert thin_scan(thin, most=5000) is thin
+    assert thin_scan(thin, most=2500) is thin
+    assert thin.is_closed and thin.is_edge_manifold and thin.is_vertex_manifold and template_problem(thin) is None
     rng = np.random.default_rng(0)                     # noise as large as the triangles: pleats, but no holes
     rough = fine.with_vertices(fine.vertices + 0.001 * rng.normal(size=fine.vertices.shape))
     with pytest.warns(UserWarning, match="thinned"):
         thin = thin_scan(rough, most=4000)
     assert thin.volume == pytest.approx(rough.volume, rel=0.03) and (thin.edge_use % 2 == 0).all()
+
+
+def test_a_thinned_surface_stays_closed_and_manifold():
+    """A sphere that all but touches one around it, and a noisy one."""
+    fine = ball(6)
+    inner = fine.with_vertices(0.8 * fine.vertices + [0.0199, 0, 0])
+    both = Mesh(np.r_[fine.vertices, inner.vertices], np.r_[fine.faces, inner.faces[:, ::-1] + len(fine.vertices)])
+    rng = np.random.default_rng(0)
+    rough = fine.with_vertices(fine.vertices + 1e-4 * rng.normal(size=fine.vertices.shape))
+    for scan in (both, rough):
+        with pytest.warns(UserWarning, match="thinned"):
+            thin = thin_scan(scan, most=16_000)
+        assert thin.is_closed and thin.is_edge_manifold and thin.is_vertex_manifold
+        assert template_problem(thin) is None and len(thin.faces) < 20_000

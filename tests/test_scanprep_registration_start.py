@@ -241,3 +241,22 @@ def test_rotations_are_those_of_a_rigid_motion_and_a_fold_does_not_sway_them():
     np.testing.assert_allclose(vertex_rotations(mesh, x), np.broadcast_to(R, (len(x), 3, 3)), atol=1e-9)
     x[[405, 406]] = x[[406, 405]]
     assert np.linalg.norm(rotations.log(vertex_rotations(mesh, x) @ R.T), axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize("away", [(3.0, -3.0, 3.0), (5e5, 5e6, 100.0)], ids=["a room", "UTM"])
+def test_a_scan_far_from_the_origin_is_registered_as_one_near_it(away):
+    """And is given back there: what led it and where it began come along.
+
+    In UTM the scan itself is rounded, to a nanometre, which tips a few matches.
+    """
+    template = body()
+    points = template.vertices[::3] + 0.002 * np.sin(40 * template.vertices[::3])
+    marks = np.array([3, 400, 900, 1500])
+    near, hints = template.vertices[marks], Correspondences(marks, template.vertices[marks], np.ones(4))
+    here = register(template, points, (marks, near), small(), None, hints, np.eye(4))
+    start = np.eye(4)
+    start[:3, 3] = away
+    there = register(template, points + away, (marks, near + away), small(), None,
+                     replace(hints, scan_points=near + away), start)
+    np.testing.assert_allclose(there.mesh.vertices - away, here.mesh.vertices, atol=1e-4)
+    assert there.landmark_rms == pytest.approx(here.landmark_rms, abs=1e-4)

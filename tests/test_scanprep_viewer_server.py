@@ -1,4 +1,6 @@
 """The viewer's server: who may ask it, and how it starts and ends."""
+import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -9,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from click_app import refused_in_one_line
+from click_app import refused_in_one_line, until
 from socket_client import CLOSED, Tab, ask
 
 from scanprep.viewer.gate import one_line
@@ -85,6 +87,30 @@ def test_a_socket_needs_token_host_and_a_name(server, given, status):
 def test_a_page_of_an_earlier_server_is_refused(server):
     assert ask(server, f"/alive?server={server.gate.server}")[0] == 204
     assert refused_in_one_line(server, 403, ask(server, "/alive?server=earlier")[0])
+
+
+def test_a_flood_of_connections_closes_none_of_the_user(server, app):
+    """More than a process may have files open, each with half a request: the oldest go, and the page is served."""
+    with Tab(server) as tab, contextlib.ExitStack() as flood:
+        for _ in range(300):
+            one = flood.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=5))
+            one.sendall(b"GET /?token=")
+        assert ask(server)[0] == 200
+        held = len(os.listdir(f"/proc/{os.getpid()}/fd"))
+        assert held < 300 + 100                             # their own ends, and few of the server's
+        tab.send("click", number=1)
+        until(lambda: app.numbers == [1])
+
+
+def test_a_body_without_the_token_is_not_taken(server, app):
+    head = f"POST /drop?name=a.ply HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Length: 1000000000\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=5) as one:
+        one.sendall(head.encode())
+        with contextlib.suppress(OSError):
+            for _ in range(1000):
+                one.sendall(bytes(10**6))
+            pytest.fail("all of it was taken")
+    assert not list(server.dropped.iterdir()) and ask(server)[0] == 200
 
 
 def test_lines_about_requests_are_clean():

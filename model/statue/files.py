@@ -1,6 +1,7 @@
 """A statue on disk: control model, images over its chart, and files for other commands and programs (glTF, X3D)."""
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from xml.etree import ElementTree as xml
@@ -10,6 +11,7 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
+from scanprep.pictures.textures import check_pixels
 from scanprep.synthetic import people
 
 from ..blend_weights import strongest
@@ -72,7 +74,9 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
         pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",
                                len(control.skeleton.parents), 3)
     if about.get("texture"):
-        with storage.taking_apart(folder / TEXTURE, "the texture of the statue"), Image.open(folder / TEXTURE) as image:
+        data = storage.read_bytes(folder / TEXTURE, "the texture of the statue")
+        with storage.taking_apart(folder / TEXTURE, "the texture of the statue"), Image.open(io.BytesIO(data)) as image:
+            check_pixels(image.size)
             texture = np.asarray(image.convert("RGB"))
     return Statue(control, pose, read_map(folder, edited), texture)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Annotated
 
 from .ownership import HOME, ForeignFileError, refusal, refuse_any, written_of
-from .workspace import Workspace
+from .workspace import NothingMadeError, Workspace
 
 FileWorkspace = Annotated[Workspace, "steps of a command whose output is a file; they are kept beside it"]
 _open: dict[Path, Workspace] = {}
@@ -62,11 +62,15 @@ def _opened(space: Workspace) -> Iterator[Workspace]:
         if place.is_symlink():                              # what is moved and removed there would be elsewhere
             raise ForeignFileError(f"{place}: expected a file or folder that scapekit made, found a link; remove it")
     space.home.mkdir(parents=True, exist_ok=True)
+    space.is_new = space.folder in made
     with locked(space.home / "lock", space.output or space.folder):
         space._recover()
         _open[key] = space
         try:
             yield space
+        except NothingMadeError:
+            space.drop_others("")
+            raise
         finally:
             del _open[key]
             shutil.rmtree(space.home / "making", ignore_errors=True)

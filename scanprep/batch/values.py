@@ -81,15 +81,21 @@ def _unpacked(told: Any, arrays: list[np.ndarray]) -> Any:
 
 
 def _remade(name: str, values: dict[str, Any]) -> Any:
-    """An object of a dataclass of this project, by its constructor, which checks what it is given."""
+    """An object of a frozen dataclass of this project, by its constructor, which does nothing but check its values.
+
+    Folders of results travel, so the name may be anything.
+    """
     module, _, qualified = name.partition(":")
     if module.split(".")[0] not in PACKAGES:
         raise ValueError(f"{name} is not of this project")
     kind: Any = importlib.import_module(module)
     for part in qualified.split("."):
         kind = getattr(kind, part)
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        raise ValueError(f"{name} is not a dataclass")
+    params = getattr(kind, "__dataclass_params__", None)
+    if not isinstance(kind, type) or params is None or not params.frozen or kind.__module__ != module:
+        raise ValueError(f"{name} is not a dataclass that is kept")
+    if values.keys() != {f.name for f in dataclasses.fields(kind)}:
+        raise ValueError(f"{name}: expected the values {', '.join(f.name for f in dataclasses.fields(kind))}")
     made = kind(**{f.name: values[f.name] for f in dataclasses.fields(kind) if f.init})
     for f in dataclasses.fields(kind):
         if not f.init:

@@ -58,12 +58,22 @@ class Results:
         return next(iter(self.values.values()))
 
 
+class NothingMadeError(ValueError):
+    """All the tasks of a run failed: of an output that it made itself nothing stays."""
+
+    def __init__(self, failures: Sequence[str]) -> None:
+        super().__init__("all failed; nothing was written")
+        self.failures = tuple(failures)
+
+
 class Workspace:
     """An output that is open for one run; see `workspace`."""
 
     def __init__(self, folder: Path, home: Path, force: bool = False, output: Path | None = None) -> None:
         self.folder, self.home, self.force, self.output = folder, home, force, output
         self.digests = Digests(home / "files.json")
+        self.is_new = False                 # this run made the folder
+        self.all_failed = False             # there were tasks, and none of them was done
         self._made: set[str] = set()
 
     @cached_property
@@ -114,6 +124,7 @@ class Workspace:
         finally:
             for job in jobs:
                 shutil.rmtree(job.folder, ignore_errors=True)
+        self.all_failed |= bool(tasks) and len(failures) == len(tasks)
         return Results({name: value for name, value in values.items() if name not in failures},
                        {task.name: failures[task.name] for task in tasks if task.name in failures},
                        tuple(job.name for job in jobs if job.name not in failures))

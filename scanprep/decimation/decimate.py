@@ -203,12 +203,10 @@ def _broken(left: Mesh, areas: np.ndarray) -> np.ndarray:
     half = np.sort(left.faces * len(bad) + np.roll(left.faces, -1, axis=1), axis=None)
     twice = half[1:][half[1:] == half[:-1]]
     bad[twice // len(bad)] = bad[twice % len(bad)] = True
-    bad[left.edges[left.edge_use > 2]] = True
+    bad[left.non_manifold_vertices] = True
     corners = np.sort(left.faces, axis=1)
     order = np.lexsort(corners.T)
     bad[corners[order[1:]][(corners[order[1:]] == corners[order[:-1]]).all(axis=1)]] = True
-    fan = np.unique(np.stack([left.faces.ravel(), left.corner_fans.ravel()]), axis=1)[0]
-    bad[np.bincount(fan, minlength=len(bad)) > 1] = True
     meant = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-300)
     inverted = np.einsum("fd,fd->f", left.face_normals, meant[left.faces].sum(axis=1)) < 0
     bad[left.faces[inverted]] = True

@@ -235,6 +235,8 @@ def _cuts_that_meet_nothing(sizes: np.ndarray, corners: np.ndarray, count: int) 
     rings = [set(ring.tolist()) for ring in np.split(corners, start[1:])]
     for p in np.unique(of[crowded]):
         ring, n = corners[start[p]:start[p] + sizes[p]], int(sizes[p])
+        if len(rings[p]) < n:                # it meets itself, and a thousand corners that repeat take many seconds
+            continue
         ways = [_edge_key(ring[k], ring[(k + np.arange(2, n - 1)) % n], count).tolist() for k in range(n)]
         # polygons that repeat each other meet however they are cut
         met = [sum(not (rings[q] <= rings[p] or rings[p] <= rings[q]) for key in way for q in users.get(key, ()))

@@ -86,7 +86,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
     for number, line in enumerate(lines[1:], 2):
         words = line.split()
         try:
-            if not words or words[0] in (b"comment", b"obj_info"):
+            if not words or words[0] in (b"comment", b"obj_info") or words[:2] == [b"Created", b"by"]:   # Blender 2.4
                 continue
             if words[0] == b"format":
                 order = _ORDERS[words[1]]

@@ -179,6 +179,13 @@ class Mesh:
         return int(self.corner_fans.max(initial=-1)) + 1 == len(np.unique(self.faces))
 
     @cached_property
+    def non_manifold_vertices(self) -> np.ndarray:
+        """(n,) vertices on an edge that has more than two triangles, or at which separate fans touch, ascending."""
+        fan = np.unique(np.stack([self.faces.ravel(), self.corner_fans.ravel()]), axis=1)[0]
+        touching = np.flatnonzero(np.bincount(fan, minlength=len(self.vertices)) > 1)
+        return np.unique(np.r_[self.edges[self.edge_use > 2].ravel(), touching])
+
+    @cached_property
     def boundary_vertices(self) -> np.ndarray:
         """(B,) vertices on an edge that has one triangle, ascending."""
         return np.unique(self.edges[self.edge_use == 1])

@@ -146,6 +146,6 @@ def spanning_tree(i: np.ndarray, j: np.ndarray, lengths: np.ndarray, n: int) -> 
     (n, n) csr_array
         Lengths of the edges of the tree.
     """
-    # before SciPy 1.16, the last for Python 3.10, it takes 32-bit indices only
+    # SciPy 1.15, the last for Python 3.10, takes 32-bit indices only
     edges = coo_array((lengths, (i.astype(np.int32), j.astype(np.int32))), shape=(n, n))
     return csr_array(minimum_spanning_tree(edges.tocsr()))

@@ -26,6 +26,10 @@ class StorageError(ValueError):
     """A file that is missing, damaged, or of another kind or version: which one, what was expected, what came."""
 
 
+class ObjectsError(ValueError):
+    """An array of Python objects, which only a pickle could bring back."""
+
+
 @contextlib.contextmanager
 def taking_apart(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Iterator[None]:
     """Whatever goes wrong inside is an `error` that names the file: damaged ones fail in too many ways to list."""
@@ -208,7 +212,7 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
 
 def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
     """Write arrays into one `.npz` file; ValueError for one of objects, which only a pickle would hold."""
-    for name, array in arrays.items():                     # before NumPy 2.3 savez cannot refuse them itself
+    for name, array in arrays.items():                     # before NumPy 2.2 savez cannot refuse them itself
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"{path}: expected arrays of numbers or text, {name} holds objects")
     with writing(path) as beside, open(beside, "wb") as out:
@@ -272,9 +276,11 @@ def _array(stream: IO[bytes], size: int, name: str) -> np.ndarray:
         shape, fortran, kind = read(stream)
     except Exception:                    # numpy's words advise to allow pickles
         raise ValueError(f"array {name}: its header is damaged") from None
+    if kind.hasobject:
+        raise ObjectsError(f"array {name}: expected numbers or text, found Python objects, which are not read here, "
+                           "because they can run programs")
     if kind.kind not in "biufcSU":
-        pickled = "Python objects, which are not read here, because they can run programs" * kind.hasobject
-        raise ValueError(f"array {name}: expected numbers or text, found {pickled or kind}")
+        raise ValueError(f"array {name}: expected numbers or text, found {kind}")
     count = math.prod(shape)
     if min(shape, default=0) < 0 or count * max(kind.itemsize, 1) != size - stream.tell():
         raise ValueError(f"array {name}: expected {count} of {kind}, found {size - stream.tell()} bytes")

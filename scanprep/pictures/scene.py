@@ -89,7 +89,7 @@ def carried(paths: Iterable[Path], room: int) -> list[bytes | None]:
     """What files hold, as long as there is room for so many bytes; None where there is none, or no room."""
     out = list[bytes | None]()
     for path in paths:
-        held = path.read_bytes() if path.exists() and room > 0 else None
+        held = path.read_bytes() if path.is_file() and room > 0 else None
         room -= len(held or b"")
         out.append(held if room >= 0 else None)
     return out

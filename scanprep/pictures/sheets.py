@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.storage import write
+from ..geometry.storage import read_bytes, write
 
 INK = (58, 62, 68)
 
@@ -70,7 +70,7 @@ def small_picture(path: Path, width: int = 700) -> bytes:
     """The picture of a file as a WebP file, no wider than so many pixels."""
     from PIL import Image
 
-    with Image.open(path) as image:
+    with Image.open(io.BytesIO(read_bytes(path, "a picture"))) as image:
         image.thumbnail((width, width))
         return webp_bytes(np.asarray(image.convert("RGB")))
 

@@ -2,8 +2,9 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,12 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return values.reshape(len(uv), *image.shape[2:])
 
 
+def check_pixels(size: Sequence[int]) -> None:
+    """ValueError for a picture of more pixels than are read: a small file may unpack to one that fills the memory."""
+    if math.prod(size) > LARGEST_PICTURE:
+        raise ValueError(f"{' x '.join(map(str, size))} pixels, expected at most 8192 x 8192")
+
+
 def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
     """The texture of an OBJ with its MTL, or of a GLB; None where the file has none.
 
@@ -94,7 +101,7 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
 def _beside(path: Path) -> Any:
     """What gives trimesh the files that a mesh names, and keeps why one cannot be had.
 
-    They lie beside the mesh or below; a small file may unpack to a picture that fills the memory.
+    They lie beside the mesh or below.
     """
     from PIL import Image
     from trimesh.resolvers import Resolver
@@ -107,9 +114,7 @@ def _beside(path: Path) -> Any:
             try:
                 data = load_bytes(file_beside(path, name.strip()))
                 if not name.lower().endswith((".mtl", ".bin")):
-                    width, height = Image.open(io.BytesIO(data)).size
-                    if width * height > LARGEST_PICTURE:
-                        raise ValueError(f"{name.strip()}: {width} x {height} pixels, expected at most 8192 x 8192")
+                    check_pixels(Image.open(io.BytesIO(data)).size)
                 return data
             except (OSError, ValueError, Image.DecompressionBombError) as problem:
                 self.problems[name.strip()] = " ".join(str(problem).split())

@@ -67,7 +67,7 @@ class MendApp(PickApp):
         plain = super().scene()
         shown = self.folder / PICTURES / f"{self.scan_names[self.current]}.scene"
         return Message("scene", {"first": len(plain.data)},
-                       plain.data + (shown.read_bytes() if shown.exists() else b""))
+                       plain.data + (shown.read_bytes() if shown.is_file() else b""))
 
     def more(self) -> dict[str, Any]:
         """What is to be thought of each scan, and which have been changed."""

@@ -20,7 +20,7 @@ from .deformation_graph import DeformationGraph, build_graph
 from .graph_fit import GraphFit, NodeMotion, deform, followed
 from .limbs import Doubt, frames, limb_doubts, limb_measures
 from .matches import Inputs, Landmarks, prepare
-from .nonrigid import Registration, finished, measured, principal_stretches, uncovered_share
+from .nonrigid import Registration, finished, measured, moved, offset_of, principal_stretches, uncovered_share
 from .person import PersonParts
 from .rolls import other_rolls
 from .schedule import GraphStage, RegistrationConfig
@@ -52,6 +52,10 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     -------
     Registration
     """
+    away = offset_of(scan)
+    if away.any():
+        return repaired(template, moved(scan, -away), fit.moved(-away), parts, moved(landmarks, -away), config,
+                        progress, moved(correspondences, -away)).moved(away)
     config = config or RegistrationConfig()
     stages = tuple(stage for stage in config.graph if stage.positions == 1 and not stage.paths and stage.reach)
     x = fit.mesh.vertices

@@ -10,7 +10,7 @@ from ..correspondence.correlated import find_correspondences, find_seeds
 from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.mesh import Mesh
-from .nonrigid import Registration, register
+from .nonrigid import Registration, moved, offset_of, register
 from .schedule import RegistrationConfig
 
 LOST = 0.005                           # share of a scan off the template from which on a limb may be lost
@@ -25,6 +25,10 @@ def register_unmarked(template: Mesh, scan: Mesh | np.ndarray, config: Registrat
     A scan that is not all covered is registered again with the ends of its limbs as landmarks, and the registration
     that covers more is kept. ValueError as from `find_correspondences` and `register`.
     """
+    away = offset_of(scan)
+    if away.any():
+        fit, pairs = register_unmarked(template, moved(scan, -away), config, search, progress)
+        return fit.moved(away), moved(pairs, away)
     seeds = find_seeds(template, scan)
     ends = seeds.template_vertices, seeds.scan_points
     pairs = find_correspondences(template, scan, ends, search)

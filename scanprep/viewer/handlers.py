@@ -44,6 +44,10 @@ class Serving(Protocol):
         """A tab opened or came back."""
         ...
 
+    def passed(self, connection: Any) -> None:
+        """The connection of a request has shown the token."""
+        ...
+
     def take_in(self, name: str, message: Message) -> None:
         """A message of a tab."""
         ...
@@ -85,6 +89,7 @@ class Guarded(RequestHandler):
             raise Refusal(403, "wrong or missing token")
         if self.get_query_argument("server", gate.server) != gate.server:
             raise Refusal(403, "a page of an earlier server")
+        self.server.passed(self.request.connection)
 
     def passes(self) -> bool:
         """Whether the request has the token."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..arguments import UsageError
+from ..geometry import storage
 from ..geometry.landmark_names import TEN
 from ..geometry.sides import other_side
 
@@ -25,10 +26,12 @@ def read_names(given: str) -> tuple[str, ...]:
     if given in LISTS:
         return LISTS[given]
     path = Path(given)
-    if not path.is_file():
+    if not path.exists():
         raise UsageError(f"--names: expected {', '.join(LISTS)}, or a text file with one name in each line; there is "
                          f"no file {given}")
-    names = [" ".join(line.split()) for line in path.read_text(encoding="utf-8").splitlines()]
+    with storage.taking_apart(path, "one name in each line"):
+        text = storage.read_bytes(path, "one name in each line").decode("utf-8-sig")
+    names = [" ".join(line.split()) for line in text.splitlines()]
     names = [name for name in names if name and not name.startswith("#")]
     if not names:
         raise ValueError(f"{path}: expected one name in each line, found none")

@@ -15,8 +15,10 @@ import traceback
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from tornado.httpserver import HTTPServer
+from tornado.iostream import IOStream
 from tornado.netutil import bind_sockets
 from tornado.web import Application
 
@@ -33,7 +35,23 @@ __all__ = ["App", "Message", "Send", "Server", "Stopped", "serve"]
 ADDRESS = "127.0.0.1"
 GRACE = 0.5                          # seconds that work gets to end
 LARGEST_REQUEST = 2**20              # bytes of a request that is no file
+STRANGERS = 64                       # connections at a time that have not shown the token; a browser opens six
 HERE = Path(__file__).parent
+
+
+class _Door(HTTPServer):
+    """Connections: of those that have not shown the token the oldest is closed where there are too many."""
+
+    def initialize(self, *args: Any, **kwargs: Any) -> None:
+        super().initialize(*args, **kwargs)
+        self.strangers: list[IOStream] = []
+
+    def handle_stream(self, stream: IOStream, address: tuple[str, int]) -> None:
+        self.strangers = [one for one in self.strangers if not one.closed()]
+        if len(self.strangers) >= STRANGERS:         # each takes a file from this process, which may have few
+            self.strangers.pop(0).close()
+        self.strangers.append(stream)
+        super().handle_stream(stream, address)
 
 
 class Server:
@@ -105,6 +123,10 @@ class Server:
 
         self._greeter.put(greet)
 
+    def passed(self, connection: Any) -> None:
+        """The connection of a request has shown the token: whatever comes, it stays open."""
+        self._door.strangers = [one for one in self._door.strangers if one is not connection.stream]
+
     def take_in(self, name: str, message: Message) -> None:
         """A message of a tab, to be handled once however often it comes."""
         if self.tabs.is_new(name, message.number):
@@ -151,7 +173,7 @@ class Server:
             routes, default_handler_class=handlers.Unknown, default_handler_args=own,      # type: ignore[arg-type]
             log_function=lambda handler: None, websocket_max_message_size=handlers.LARGEST_MESSAGE,
             websocket_ping_interval=30)
-        server = HTTPServer(application, max_body_size=LARGEST_REQUEST)
+        self._door = server = _Door(application, max_body_size=LARGEST_REQUEST)
         server.add_sockets(self._sockets)
         self._loop, self._ending = asyncio.get_running_loop(), asyncio.Event()
         self._ready.set()

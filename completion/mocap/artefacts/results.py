@@ -169,7 +169,7 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
         write_markers(path, sequence)
         return
     source = None if original is None else Path(original)
-    data = None if source is None else source.read_bytes()
+    data = None if source is None else storage.read_bytes(source, "a C3D file", MarkerFileError)
     with storage.writing(path) as beside:
         if source is None or data is None:
             write_c3d(beside, sequence.positions, sequence.labels, sequence.rate, filled)

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.storage import StorageError, check_regular, read_json, taking_apart, write_json, writing
+from scanprep.geometry.storage import StorageError, read_bytes, read_json, taking_apart, write_json, writing
 from scanprep.pictures import png16
+from scanprep.pictures.textures import check_pixels
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 
@@ -105,7 +106,9 @@ def _read_tiff(path: Path) -> np.ndarray:
     import tifffile
 
     with taking_apart(path, "a TIFF image of single-precision numbers"):
-        return np.asarray(tifffile.imread(path))
+        with tifffile.TiffFile(io.BytesIO(read_bytes(path))) as file:
+            check_pixels(file.pages[0].shape[:2])
+            return np.asarray(file.pages[0].asarray())
 
 
 def _read_png(path: Path) -> np.ndarray:
@@ -124,12 +127,11 @@ def _decoded(path: Path) -> tuple[np.ndarray, int]:
     """An image file and its bits per channel."""
     from PIL import Image
 
-    if path.exists():
-        check_regular(path)
-    data = path.read_bytes()
+    data = read_bytes(path, "an image")
     if data[:8] == png16.SIGNATURE and png16.depth(data) in ((16, 2), (16, 3), (16, 4)):
         return png16.decode(data), 16
     with Image.open(io.BytesIO(data)) as image:
+        check_pixels(image.size)
         if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
             return np.asarray(image).astype(np.uint16), 16
         return np.asarray(image), 32 if image.mode in ("I", "F") else 8
