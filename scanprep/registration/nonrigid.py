@@ -52,7 +52,6 @@ class Registration:
     uncovered: float
     rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repaired`
 
-
     def moved(self, by: np.ndarray) -> Registration:
         """The same at another place, `by` (3,) metres away."""
         return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices + by))
