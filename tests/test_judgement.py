@@ -22,11 +22,13 @@ from completion.mocap.subject.person import PersonConfig
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
+from completion.synthetic_people import synthetic_model
 from completion.tracking.cli import wrong_size
 from completion.tracking.sequence import tracking_problem
 from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import judge_model, learn_scape, learning_problem
+from model.people import ASKED, person_judgement
 from scanprep import Mesh, command_line, config_files, write_landmarks, write_mesh
 from scanprep.alignment.views import align_views, views_problem
 from scanprep.batch.room import Room
@@ -377,6 +379,13 @@ def test_many_results_are_as_good_as_the_worst_of_them():
 def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
     found = beyond_people(stature, volume, np.eye(18)[0] * betas)
     assert found.verdict == verdict and word in found.why, found
+
+
+def test_betas_that_somebody_typed_are_the_cause_of_the_body_that_they_make():
+    model = synthetic_model()
+    found = person_judgement(model, np.array([20.0]), ASKED)
+    assert found.verdict == "failed" and found.reasons[0].endswith(ASKED) and "--unit" not in found.why
+    assert person_judgement(model, np.array([2.0, -1.0]), ASKED).verdict == "good"
 
 
 def test_time_that_is_told_wrongly_is_seen_in_the_speed_of_markers():

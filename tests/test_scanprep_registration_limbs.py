@@ -3,6 +3,7 @@ import pytest
 
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
+from scanprep.pipeline.scan import size_doubts
 from scanprep.registration import unmarked
 from scanprep.registration.limb_ends import bending
 from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_bending, rolls
@@ -114,3 +115,10 @@ def test_where_a_limb_was_lost_its_ends_lead(person, monkeypatch, first, second,
     monkeypatch.setattr(unmarked, "register", register)
     fit, _ = unmarked.register_unmarked(person.mesh, person.mesh)
     assert led == kept and fit.uncovered == (min(first, second) if len(kept) > 1 else first)
+
+
+@pytest.mark.parametrize(("scale", "excess", "word"), [(1.0, None, ""), (0.7, 1.0, "a child"), (0.5, 2.0, "scale")])
+def test_a_set_says_of_a_scan_that_it_has_the_size_of_no_adult(person, parts, scale, excess, word):
+    found = size_doubts(person.mesh, parts, scale * person.mesh.vertices)
+    assert [doubt.excess for doubt in found] == ([] if excess is None else [excess])
+    assert all(word in doubt.words for doubt in found)

@@ -24,7 +24,7 @@ from ..files import load_model
 from ..linear import Subject
 from ..motion.files import betas_for
 from ..motion.onto import read_motion
-from ..people import person_judgement
+from ..people import ASKED, person_judgement
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
@@ -141,17 +141,16 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     TURNS.check(turns, f"{pose}: turns")
     if (subject is not None) + bool(betas) + own_body > 1:
         raise UsageError("--betas, --subject and --own-body: expected one of them")
-    if subject is not None or own_body:
-        vertices = read_subject(loaded, subject).vertices(turns)
-    elif not loaded.n_betas:
+    if not (subject is not None or own_body or loaded.n_betas):
         raise ValueError(f"{model}: it has no shape components; ask for --own-body")
-    else:
-        vertices = loaded.vertices(turns, np.array(betas if betas else (0.0,)))
+    person = read_subject(loaded, subject) if subject is not None or own_body else loaded.subject(
+        np.array(betas if betas else (0.0,)))
+    vertices = person.vertices(turns)
     body = loaded.template.with_vertices(vertices)
     write_mesh(output, standing(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")],
-                   judgement=person_judgement(loaded, np.array(betas)) if betas else Judgement())
+                   judgement=Judgement() if person.betas is None else person_judgement(loaded, person.betas, ASKED))
 
 
 def _read_turns(path: Path) -> dict[str, np.ndarray]:
