@@ -13,6 +13,7 @@ from ..judgement import Judgement
 from ..ranges import Settings
 from ..registration.limbs import Doubt
 
+UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 CROWDED = 0.3                  # share of a scan off the template that may be a second person, who is half of it
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
