@@ -157,7 +157,7 @@ def changes(seed: int, posed: bool) -> dict[str, tuple[Mesh, dict[str, np.ndarra
     half = v[:, 0] > middle[0]
     low = v[:, 2] < 0.5 * middle[2]
     inner = {n: p for n, p in marks.items() if p[0] > middle[0]}
-    apart = other.scan.with_vertices(other.scan.vertices + [0.9, 0, 0])
+    beside, behind = (other.scan.with_vertices(other.scan.vertices + at) for at in ([0.9, 0, 0], [0, 1.2, 0]))
     few = np.zeros(len(v), dtype=bool)
     few[np.argsort(np.linalg.norm(v - marks["left middle finger"], axis=1))[: len(v) // 50]] = True
     over, wide = rotations.exp(np.array([np.pi, 0, 0])).T, np.array([1.6, 1.6, 1])
@@ -169,7 +169,8 @@ def changes(seed: int, posed: bool) -> dict[str, tuple[Mesh, dict[str, np.ndarra
             "landmarks shuffled": (one.scan, shuffle(marks), one.truth),
             "mirrored, marks not": (one.scan.with_vertices(v * mirror), marks, None),
             "landmarks of another": (one.scan, {n: p + [0.3, 0.1, 0.2] for n, p in other.marks.items()}, one.truth),
-            "two people": (together(one.scan, apart), marks, one.truth), "wall and floor": (wall, marks, one.truth),
+            "two people": (together(one.scan, beside), marks, one.truth),
+            "one behind another": (together(one.scan, behind), marks, one.truth), "wall and floor": (wall, marks, one.truth),
             "chair": (chair(), None, None), "cylinder": (cylinder(), None, None), "horse": (horse(), None, None),
             "left half": (cut(one.scan, half), inner, one.truth),
             "shins and feet": (cut(one.scan, low), None, one.truth), "a hand": (cut(one.scan, few), None, one.truth),
@@ -199,7 +200,8 @@ def scan_cases() -> Iterator[Case]:
 
 def statue_cases() -> Iterator[Case]:
     """Wrong and right scans for a statue; they stand, and nobody clicks."""
-    for what in ("0.5 of the size", "two people", "left half", "chair", "cylinder", "horse", "shins and feet"):
+    for what in ("0.5 of the size", "two people", "one behind another", "left half", "chair", "cylinder", "horse",
+                 "shins and feet"):
         def make(folder: Path, what: str = what) -> None:
             write(folder, changes(300, False)[what][0])
         yield Case(f"statue: {what}", "statue fit scan.ply -o out --unit m --size 512", make)
