@@ -25,7 +25,7 @@ from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
 from completion.synthetic_people import synthetic_model
 from completion.tracking.cli import wrong_size
-from completion.tracking.sequence import tracking_problem
+from completion.tracking.sequence import tracking_doubts, tracking_problem
 from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import judge_model, learn_scape, learning_problem
@@ -186,6 +186,8 @@ def test_a_body_that_is_not_found_in_the_frames_means_nothing():
     assert tracking_problem(dataclasses.replace(motion, converged=found[::-1] | (np.arange(20) > 9))) is None
     nothing = dataclasses.replace(motion, residuals=np.full((20, 1), np.nan))
     assert "no frame shows anything" in tracking_problem(nothing)
+    assert tracking_doubts(nothing) == [] and "lost in 19 of 20 frames" in tracking_doubts(motion)[0]
+    assert tracking_doubts(dataclasses.replace(motion, converged=np.arange(20) > 0)) == []
 
 
 def test_frames_that_cannot_show_the_body_mean_nothing():

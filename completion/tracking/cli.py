@@ -21,7 +21,7 @@ from scanprep.ranges import Positive
 from ..cli import ModelOrNone, read_landmark_pairs, read_model
 from ..motion import Motion
 from .folder import FrameFolder, follow_folder
-from .sequence import Tracker, as_motion, tracking_problem
+from .sequence import Tracker, as_motion, tracking_doubts, tracking_problem
 from .settings import TrackConfig
 
 FramesArg = Annotated[Path, Place("FRAMES")]
@@ -81,7 +81,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     of_motion = done.key, config.smoothing
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, metrics, frames.name), write)
-    judgement = Judgement.of(wrong_size(found, person) or tracking_problem(motion))
+    judgement = Judgement.of(wrong_size(found, person) or tracking_problem(motion), tracking_doubts(motion))
     if not isinstance(body, Subject):
         judgement = judgement.joined(person_judgement(loaded, motion.betas))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
