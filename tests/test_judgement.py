@@ -26,12 +26,12 @@ from completion.partial.work import Inputs, Work, complete_files
 from completion.synthetic_people import synthetic_model
 from completion.tracking.cli import wrong_size
 from completion.tracking.sequence import tracking_doubts, tracking_problem
-from model.coregistration.rounds import coregistration_problem
+from model.coregistration.rounds import coregistration_doubts, coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import judge_model, learn_scape, learning_problem
 from model.people import ASKED, person_judgement
 from scanprep import Mesh, command_line, config_files, write_landmarks, write_mesh
-from scanprep.alignment.views import align_views, views_problem
+from scanprep.alignment.views import align_views, views_doubts, views_problem
 from scanprep.batch.room import Room
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.console import Metric, Outcome
@@ -246,6 +246,8 @@ def test_a_model_says_which_joints_it_never_saw_bend():
     found = judge_model(model)
     assert found.verdict == "check" and found.why.startswith("the right elbow never bent more than 5 degrees")
     assert judge_model(dataclasses.replace(model, info={"poses": 8})).verdict == "good"
+    crude = judge_model(dataclasses.replace(model, info={"poses": 8, "left_out_error": 0.04}))
+    assert crude.verdict == "check" and "40 mm off: it needs more poses" in crude.why
     assert judge_model(dataclasses.replace(model, info={"poses": 6, "left_out_error": 0.2})).verdict == "failed"
 
 
@@ -270,6 +272,7 @@ def test_co_registrations_that_explain_nothing_mean_nothing():
         return SimpleNamespace(registrations=found, good=np.array(good), model=model)
 
     assert coregistration_problem(done([0.99, 0.2], [True, False]), [scan, scan]) is None
+    assert coregistration_doubts(done([0.9, 0.9], [True, False]), ["a", "b"]) == ["b does not fit the model"]
     assert "0 of 2 scans" in coregistration_problem(done([0.9, 0.9], [False, False]), [scan, scan])
     assert "--unit" in coregistration_problem(done([0.1, 0.1], [True, False]), [1000 * scan, 1000 * scan])
 
@@ -279,6 +282,7 @@ def test_views_of_which_none_is_in_place_mean_nothing():
     apart = [(Mesh(mesh.vertices + 5 * k, mesh.faces), camera) for k, (mesh, camera) in enumerate(views)]
     found = align_views(apart)
     assert not found.converged and np.isnan(found.rms) and "no view is in its place" in views_problem(found)
+    assert views_doubts(found, ["front", "back"])[1] == "the place of back is uncertain"
 
 
 def test_a_skeleton_of_one_part_means_nothing():

@@ -11,7 +11,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from model.people import person_judgement
-from model.priors import stiff_joints
+from model.priors import CRUDE, stiff_joints
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
@@ -39,7 +39,6 @@ KIND, VERSION = "completion", 3       # 1 had no scale, expected error and confi
 _ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
 _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
-CRUDE = 0.03                         # metres off in poses that were left out: from there on a model itself is doubtful
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
 PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space

@@ -97,7 +97,13 @@ def character(mesh: CharacterArg, model: Annotated[Path, Alias("-m")], output: O
     found.model.save(output)
     save_png(output.with_suffix(".png"), picture_character(found.model))
     return Outcome(output, _about(loaded, found), {"character": config},
-                   judgement=Judgement.of(character_problem(found)))
+                   judgement=Judgement.of(character_problem(found), _outside(loaded, found)))
+
+
+def _outside(model: BodyModel, found: Character) -> list[str]:
+    """The joints that do not lie inside a character, in one line; none where all do."""
+    outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
+    return [f"outside: {', '.join(outside)}"] if outside else []
 
 
 def _about(model: BodyModel, found: Character) -> list[Metric]:
@@ -106,10 +112,9 @@ def _about(model: BodyModel, found: Character) -> list[Metric]:
         Metric("character off the template", 100 * found.registration.uncovered, "%"),
         Metric("distance of landmarks, RMS", 1e3 * found.registration.landmark_rms, "mm"),
         Metric("inverted triangles", found.registration.inverted)]
-    outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
     return [*rows, Metric("height, length or width", float(np.ptp(found.mesh.vertices, axis=0).max()), "m"),
             Metric("joints inside it", f"{found.inside.sum()} of {len(found.inside)}"
-                   + (f", outside: {', '.join(outside)}" if outside else "")),
+                   + "".join(f", {told}" for told in _outside(model, found))),
             Metric("most turned joint", float(np.degrees(np.linalg.norm(found.pose[1:], axis=1).max())), "°")]
 
 
