@@ -213,6 +213,7 @@ def test_unsure_correspondences_mean_nothing():
     vertices, points = np.arange(5), np.zeros((5, 3))
     assert correspondences_problem(Correspondences(vertices, points, np.full(5, 0.8))) is None
     assert "0.30" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.3)))
+    assert "0.43" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.43)))      # limbs mistaken
     assert "0 pairs" in correspondences_problem(Correspondences(vertices[:0], points[:0], np.zeros(0)))
 
 
