@@ -10,18 +10,19 @@ from scanprep.skeleton.roles import find_roles
 
 from .body import BodyModel
 
+ASKED = "betas are standard deviations, and hardly anybody is beyond 3"      # cause where somebody typed them
 HUMAN = {"skullbase", "l_hip", "r_hip", "l_knee", "r_knee"}    # joints that a horse has not under these names
 
 
-def person_judgement(model: BodyModel, betas: np.ndarray | None) -> Judgement:
+def person_judgement(model: BodyModel, betas: np.ndarray | None, cause: str = "") -> Judgement:
     """Whether the body of betas (k,) is one that a person can have; of models of other things nothing is said.
 
-    Without betas it is the template's own body.
+    Without betas it is the template's own body. `cause` as in `beyond_people`.
     """
     if not find_roles(model.skeleton.names).keys() >= HUMAN:
         return Judgement()
     body = model.subject(betas).vertices(np.zeros((len(model.skeleton.parents), 3)))
-    return beyond_people(*stature_and_volume(model.template.with_vertices(body)), betas)
+    return beyond_people(*stature_and_volume(model.template.with_vertices(body)), betas, cause)
 
 
 def stature_and_volume(body: Mesh) -> tuple[float, float | None]:

@@ -136,7 +136,8 @@ def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judge
     return Judgement.of(problems, doubts)
 
 
-def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray | None = None) -> Judgement:
+def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray | None = None, cause: str = ""
+                  ) -> Judgement:
     """Whether a body is one that a person can have, with the likely cause where it is not.
 
     Parameters
@@ -144,6 +145,8 @@ def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray
     stature : float, metres
     volume : float, litres, optional
     betas : (K,) float, standard deviations, optional
+    cause : str
+        Why it may not be, where that is known; else that of a scan or a recording.
 
     Examples
     --------
@@ -154,22 +157,22 @@ def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray
     """
     failed, check = [], []
     if not ANYBODY[0] <= stature <= ANYBODY[1]:
-        failed.append(f"the person is {stature:.2f} m tall: the wrong unit or scale? (--unit)")
+        failed.append(f"the person is {stature:.2f} m tall: {cause or 'the wrong unit or scale? (--unit)'}")
     elif not ADULTS[0] <= stature <= ADULTS[1]:
-        check.append(f"the person is {stature:.2f} m tall: {'a child' if stature < ADULTS[0] else 'a giant'}, or the "
-                     "wrong scale?")
+        who = "a child" if stature < ADULTS[0] else "a giant"
+        check.append(f"the person is {stature:.2f} m tall: {cause or who + ', or the wrong scale?'}")
     if volume is not None and not failed:
         build = volume / stature**2
         words = f"the person has {volume:.0f} litres at {stature:.2f} m"
         if not ANY_BUILD[0] <= build <= ANY_BUILD[1]:
-            failed.append(f"{words}, as nobody has: something else than a person, or several?")
+            failed.append(f"{words}, as nobody has: {cause or 'something else than a person, or several?'}")
         elif not BUILD[0] <= build <= BUILD[1] or (stature >= ADULTS[0] and not VOLUMES[0] <= volume <= VOLUMES[1]):
-            check.append(f"{words}: clothes, a second person, or the wrong scale?")
+            check.append(f"{words}: {cause or 'clothes, a second person, or the wrong scale?'}")
     if betas is not None and len(betas):
         length, usual = float(np.linalg.norm(betas)), float(np.sqrt(len(betas)))
         words = f"the shape is {length:.0f} standard deviations from the mean, {usual:.0f} are usual"
         if length > TOO_LONG * usual:
-            failed.append(f"{words}: something else than a person, or the wrong scale?")
+            failed.append(f"{words}: {cause or 'something else than a person, or the wrong scale?'}")
         elif length > LONG * usual:
             check.append(words)
     return Judgement.of(failed, check)

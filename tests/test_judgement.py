@@ -14,6 +14,7 @@ from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from scanned_shapes import ball as sphere
 
 from completion import MarkerLayout, MarkerSequence, write_markers
+from completion.__main__ import COMMANDS as SCAPE
 from completion.__main__ import main
 from completion.mocap.animate.work import Work as Follow
 from completion.mocap.pose.robust import hardly_seen, motion_doubts, motion_problem
@@ -22,13 +23,15 @@ from completion.mocap.subject.person import PersonConfig
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
+from completion.synthetic_people import synthetic_model
 from completion.tracking.cli import wrong_size
-from completion.tracking.sequence import tracking_problem
-from model.coregistration.rounds import coregistration_problem
+from completion.tracking.sequence import tracking_doubts, tracking_problem
+from model.coregistration.rounds import coregistration_doubts, coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import judge_model, learn_scape, learning_problem
+from model.people import ASKED, person_judgement
 from scanprep import Mesh, command_line, config_files, write_landmarks, write_mesh
-from scanprep.alignment.views import align_views, views_problem
+from scanprep.alignment.views import align_views, views_doubts, views_problem
 from scanprep.batch.room import Room
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.console import Metric, Outcome
@@ -183,6 +186,8 @@ def test_a_body_that_is_not_found_in_the_frames_means_nothing():
     assert tracking_problem(dataclasses.replace(motion, converged=found[::-1] | (np.arange(20) > 9))) is None
     nothing = dataclasses.replace(motion, residuals=np.full((20, 1), np.nan))
     assert "no frame shows anything" in tracking_problem(nothing)
+    assert tracking_doubts(nothing) == [] and "lost in 19 of 20 frames" in tracking_doubts(motion)[0]
+    assert tracking_doubts(dataclasses.replace(motion, converged=np.arange(20) > 0)) == []
 
 
 def test_frames_that_cannot_show_the_body_mean_nothing():
@@ -208,6 +213,7 @@ def test_unsure_correspondences_mean_nothing():
     vertices, points = np.arange(5), np.zeros((5, 3))
     assert correspondences_problem(Correspondences(vertices, points, np.full(5, 0.8))) is None
     assert "0.30" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.3)))
+    assert "0.43" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.43)))      # limbs mistaken
     assert "0 pairs" in correspondences_problem(Correspondences(vertices[:0], points[:0], np.zeros(0)))
 
 
@@ -241,6 +247,8 @@ def test_a_model_says_which_joints_it_never_saw_bend():
     found = judge_model(model)
     assert found.verdict == "check" and found.why.startswith("the right elbow never bent more than 5 degrees")
     assert judge_model(dataclasses.replace(model, info={"poses": 8})).verdict == "good"
+    crude = judge_model(dataclasses.replace(model, info={"poses": 8, "left_out_error": 0.04}))
+    assert crude.verdict == "check" and "40 mm off: it needs more poses" in crude.why
     assert judge_model(dataclasses.replace(model, info={"poses": 6, "left_out_error": 0.2})).verdict == "failed"
 
 
@@ -265,6 +273,7 @@ def test_co_registrations_that_explain_nothing_mean_nothing():
         return SimpleNamespace(registrations=found, good=np.array(good), model=model)
 
     assert coregistration_problem(done([0.99, 0.2], [True, False]), [scan, scan]) is None
+    assert coregistration_doubts(done([0.9, 0.9], [True, False]), ["a", "b"]) == ["b does not fit the model"]
     assert "0 of 2 scans" in coregistration_problem(done([0.9, 0.9], [False, False]), [scan, scan])
     assert "--unit" in coregistration_problem(done([0.1, 0.1], [True, False]), [1000 * scan, 1000 * scan])
 
@@ -274,6 +283,7 @@ def test_views_of_which_none_is_in_place_mean_nothing():
     apart = [(Mesh(mesh.vertices + 5 * k, mesh.faces), camera) for k, (mesh, camera) in enumerate(views)]
     found = align_views(apart)
     assert not found.converged and np.isnan(found.rms) and "no view is in its place" in views_problem(found)
+    assert views_doubts(found, ["front", "back"])[1] == "the place of back is uncertain"
 
 
 def test_a_skeleton_of_one_part_means_nothing():
@@ -307,13 +317,30 @@ def test_an_alignment_that_did_not_converge_is_to_be_looked_at(place, capsys):
 def test_an_outcome_always_says_what_it_is_worth():
     with pytest.raises(TypeError, match="judgement"):
         Outcome(None, [])
+    with pytest.raises(AssertionError, match="has a judgement"):        # so in every test that runs a command
+        Outcome(Path("out.ply"), [], judgement=None)
 
 
 COMMANDS = ("prep clean good.ply -o clean.ply", "prep fill good.ply -o filled.ply",
-            "prep decimate good.ply --faces 300 -o fewer.ply", "prep align good.ply template.ply -o aligned.ply",
+            "prep decimate good.ply --faces 300 -o fewer.ply", "prep template good.ply --faces 500 -o mine.ply",
+            "prep repair good.ply -o repaired.ply", "prep correspond good.ply --template template.ply -o pairs.json",
+            "prep register good.ply --template template.ply --config quick.toml -o out.ply",
+            "prep align good.ply template.ply -o aligned.ply",
             "model info model.npz", "model mesh model.npz -o mesh.ply", "model sample model.npz -n 2 -o sampled",
             "model export model.npz -o body.bvh", "model export model.npz -o body.ply",
             "model resample model.npz --vertices 200 -o small.npz")
+# Commands that take minutes or other inputs, and the tests that run them; an outcome without a judgement ends there.
+ELSEWHERE = {
+    "test_scanprep_cli": ("prep run", "prep page", "prep views", "prep merge", "prep skeleton", "prep edit-skeleton"),
+    "test_model_importing": ("model import",), "test_model_evaluation": ("model evaluate",),
+    "test_model_coregistration": ("model coregister",), "test_model_character": ("model character",),
+    "test_completion_cli": ("complete",), "test_completion_measuring": ("measure",),
+    "test_model_learning_cli": ("learn",), "test_completion_animate_cli": ("animate",),
+    "test_completion_mosh_cli": ("mosh",), "test_completion_tracking_cli": ("track",),
+    "test_completion_layout_cli": ("layout show", "layout transfer"), "test_demo": ("demo",),
+    "test_completion_marker_selection_cli": ("layout design",), "test_completion_motions": ("model repose",),
+    "test_model_statue_cli": ("statue fit", "statue reconstruct", "statue animate")}
+SHOW_ONLY = ("view", "pick", "layout list", "completion")                 # they make nothing of their own
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -321,12 +348,22 @@ def test_the_first_row_of_every_command_is_a_verdict(place, monkeypatch, command
     shown = []
     monkeypatch.setattr(command_line, "show", shown.extend)
     worm_with_prior().save("model.npz")
-    assert main(command.split()) == 0
-    assert shown[0].name == "judgement" and shown[0].value in ("good", "check")
+    code = main(command.split())                         # a worm has no limbs by which correspondences would be sure
+    assert shown[0].name == "judgement" and shown[0].value == ("failed" if code else "good")
     if "-o" in command:
         output = Path(command.split()[-1])
         report = output / "report.json" if output.is_dir() else Path(f"{output}.report.json")
         assert json.loads(report.read_text())["judgement"]["verdict"] == shown[0].value
+
+
+def test_every_command_is_among_those_that_are_run():
+    quick = {" ".join(word for word in command.split()[:2]) for command in COMMANDS}
+    known = [*quick, *SHOW_ONLY, *(command for some in ELSEWHERE.values() for command in some)]
+    assert sorted(f"scape {command}" for command in known) == sorted(command_line.listed(SCAPE, "scape"))
+    tests = Path(__file__).parent
+    for name, some in ELSEWHERE.items():
+        text = (tests / f"{name}.py").read_text()
+        assert all(command.split()[-1] in text for command in some), name
 
 
 def reported(path, verdict, *reasons, written=None):
@@ -377,6 +414,13 @@ def test_many_results_are_as_good_as_the_worst_of_them():
 def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
     found = beyond_people(stature, volume, np.eye(18)[0] * betas)
     assert found.verdict == verdict and word in found.why, found
+
+
+def test_betas_that_somebody_typed_are_the_cause_of_the_body_that_they_make():
+    model = synthetic_model()
+    found = person_judgement(model, np.array([20.0]), ASKED)
+    assert found.verdict == "failed" and found.reasons[0].endswith(ASKED) and "--unit" not in found.why
+    assert person_judgement(model, np.array([2.0, -1.0]), ASKED).verdict == "good"
 
 
 def test_time_that_is_told_wrongly_is_seen_in_the_speed_of_markers():

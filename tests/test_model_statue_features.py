@@ -1,8 +1,11 @@
 """Registration of the control model by features: known poses come back, derivatives are right, clicks find depths."""
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from model.statue.control.files import humanoid
+from model.statue.registration import automatic
 from model.statue.registration.articulated import Articulated, Points
 from model.statue.registration.automatic import find_features, likely_unit
 from model.statue.registration.clicks import MedialAxis
@@ -246,3 +249,13 @@ def test_a_ball_is_no_person(control):
     assert "no person" in found.problem and not found.joints and not found.points
     with pytest.raises(ValueError, match="100 points"):
         find_features(control, Mesh(points[:50], np.zeros((0, 3), dtype=int)))
+
+
+def test_what_has_too_few_joints_says_so(control, monkeypatch):
+    stand = SimpleNamespace(off=0.01, T=np.eye(4), posed=None, to_scan=lambda places: places)
+    nothing = SimpleNamespace(mesh=control.mesh, uncovered=0.0, confidence=np.zeros(len(control.mesh.vertices)))
+    monkeypatch.setattr(automatic, "find_person", lambda *given: [stand])
+    monkeypatch.setattr(automatic, "PoseSearch", lambda body: SimpleNamespace(mesh=lambda posed: control.mesh))
+    monkeypatch.setattr(automatic, "register", lambda *given, **named: nothing)
+    found = find_features(control, control.mesh)
+    assert found.fit is None and "0 joints and 0 points" in found.problem

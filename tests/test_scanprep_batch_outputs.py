@@ -13,6 +13,7 @@ from scanprep.batch.ownership import HOME
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output
 from scanprep.console import Metric, Outcome
+from scanprep.judgement import Judgement
 
 
 def write(output: Output, text: str = "text") -> Outcome:
@@ -22,33 +23,33 @@ def write(output: Output, text: str = "text") -> Outcome:
         raise ValueError(f"{output}: failed")
     output.write_text(text)
     output.with_suffix(".more.txt").write_text(text)
-    return Outcome(output, [Metric("letters", len(text))], judgement=None)
+    return Outcome(output, [Metric("letters", len(text))], judgement=Judgement())
 
 
 def write_alone(output: Output, text: str = "text") -> Outcome:
     """Write nothing beside it."""
     output.write_text(text)
-    return Outcome(output, [Metric("letters", len(text))], judgement=None)
+    return Outcome(output, [Metric("letters", len(text))], judgement=Judgement())
 
 
 def write_folder(output: Output) -> Outcome:
     """Write a folder."""
     (output / "inner").mkdir(parents=True)
     (output / "inner" / "a.txt").write_text("a")
-    return Outcome(output, [], judgement=None)
+    return Outcome(output, [], judgement=Judgement())
 
 
 def resumed(output: Output, text: str = "text", *, space: Workspace) -> Outcome:
     """Write in steps."""
     length = space.step("s", text, lambda folder: (folder / "a.txt").write_text(text))
-    return Outcome(output, [Metric("letters", length)], judgement=None)
+    return Outcome(output, [Metric("letters", length)], judgement=Judgement())
 
 
 def learned(output: Output, text: str = "text", *, space: FileWorkspace) -> Outcome:
     """Write a file in steps."""
     length = space.step("s", text, lambda folder: len(text))
     output.write_text(text)
-    return Outcome(output, [Metric("letters", length)], judgement=None)
+    return Outcome(output, [Metric("letters", length)], judgement=Judgement())
 
 
 def command(function, output, *words):

@@ -13,6 +13,7 @@ import numpy as np
 from scanprep import command_line
 from scanprep.console import Metric, Outcome
 from scanprep.geometry import storage
+from scanprep.judgement import Judgement
 from scanprep.ranges import FLAG, Settings
 
 
@@ -27,7 +28,7 @@ def work(out: Path, times: int = 2, settings: Choices = Choices()) -> Outcome:
         raise ValueError(f"times: expected a count,\n got {times}")
     out.write_text("done")
     return Outcome(out, [Metric("distance", 0.00123456, "m"), Metric("times", times)], {"settings": settings},
-                   ["scan7: empty"] if times == 7 else [], judgement=None)
+                   ["scan7: empty"] if times == 7 else [], judgement=Judgement())
 
 
 def test_done(tmp_path, capsys):

@@ -65,10 +65,12 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
 
     told = (Doubt(1.5, "the head is rolled by 90 degrees against the chest"),)
     monkeypatch.setattr(one_scan, "repaired", repaired)
+    small = Doubt(1.0, "the person is 1.20 m tall: a child, or the wrong scale?")
     monkeypatch.setattr(one_scan, "limb_doubts", lambda body, parts, vertices: told)
+    monkeypatch.setattr(one_scan, "size_doubts", lambda body, parts, vertices: (small,))
     task = find_scans(scans)[0]
     found = one_scan.register_scan(task, template, MARKS, QUICK.scan, person).figures
-    assert found.rolled and found.doubts == told
+    assert found.rolled and found.doubts == (*told, small)
     animal = one_scan.register_scan(task, template, MARKS, QUICK.scan).figures
     assert not animal.rolled and animal.doubts == ()
     assert given == [(who, len(MARKS), QUICK.scan.registration, None) for who in (person, None)]

@@ -5,6 +5,7 @@ from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.target import target_of
 from scanprep.judgement import size
+from scanprep.pipeline.scan import size_doubts
 from scanprep.registration import unmarked
 from scanprep.registration.limb_ends import RigidFit, bending, find_ends, rotated_ends
 from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_bending, rolls
@@ -130,3 +131,10 @@ def test_a_hand_bent_at_the_wrist_is_found(person):
         tried = rotated_ends(template, end, template.vertices, RigidFit(target_of(scan), size(template)))
         off = min(np.linalg.norm(places[mine] - scan.vertices[end.vertices[mine]], axis=1).mean() for places in tried)
         assert off < 0.025, (axis, degrees)
+
+
+@pytest.mark.parametrize(("scale", "excess", "word"), [(1.0, None, ""), (0.7, 1.0, "a child"), (0.5, 2.0, "scale")])
+def test_a_set_says_of_a_scan_that_it_has_the_size_of_no_adult(person, parts, scale, excess, word):
+    found = size_doubts(person.mesh, parts, scale * person.mesh.vertices)
+    assert [doubt.excess for doubt in found] == ([] if excess is None else [excess])
+    assert all(word in doubt.words for doubt in found)

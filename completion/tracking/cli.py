@@ -9,6 +9,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.people import person_judgement
 from model.posing.cli import read_subject
 from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
@@ -20,7 +21,7 @@ from scanprep.ranges import Positive
 from ..cli import ModelOrNone, read_landmark_pairs, read_model
 from ..motion import Motion
 from .folder import FrameFolder, follow_folder
-from .sequence import Tracker, as_motion, tracking_problem
+from .sequence import Tracker, as_motion, tracking_doubts, tracking_problem
 from .settings import TrackConfig
 
 FramesArg = Annotated[Path, Place("FRAMES")]
@@ -80,8 +81,11 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     of_motion = done.key, config.smoothing
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, metrics, frames.name), write)
+    judgement = Judgement.of(wrong_size(found, person) or tracking_problem(motion), tracking_doubts(motion))
+    if not isinstance(body, Subject):
+        judgement = judgement.joined(person_judgement(loaded, motion.betas))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
-                   judgement=Judgement.of(wrong_size(found, person) or tracking_problem(motion)))
+                   judgement=judgement)
 
 
 def wrong_size(frames: FrameFolder, person: Subject) -> str | None:

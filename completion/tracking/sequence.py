@@ -100,6 +100,14 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
                   converged=np.array([frame.found for frame in frames]))
 
 
+def tracking_doubts(motion: Motion) -> list[str]:
+    """Why the motion of tracked frames is to be looked at: the body was lost where something was seen."""
+    seen = np.isfinite(motion.residuals[:, 0])
+    lost = seen & ~motion.converged
+    return [f"the body was lost in {lost.sum()} of {seen.sum()} frames that show something"] \
+        if lost.sum() > LOST_FRAMES * seen.sum() else []
+
+
 def tracking_problem(motion: Motion) -> str | None:
     """Why the motion of tracked frames means nothing, with the likely cause; None where it means something."""
     found = float(motion.converged.mean())
@@ -111,6 +119,7 @@ def tracking_problem(motion: Motion) -> str | None:
             "something else, or another model?")
 
 
+LOST_FRAMES = 0.05                   # share of the frames with points; the six runs of the benchmark lose none
 MOMENTUM, LOST = 0.9, 0.5            # share of the velocity that the prediction keeps; after a lost frame
 
 

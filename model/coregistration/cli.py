@@ -24,7 +24,7 @@ from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from .config import CoregistrationConfig
-from .rounds import Coregistration, coregister, coregistration_problem
+from .rounds import Coregistration, coregister, coregistration_doubts, coregistration_problem
 from .single import Landmarks
 
 FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "score", "starts")
@@ -76,7 +76,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     with space.staging("set") as staged:
         write_coregistered(staged.folder, loaded, kept, done)
     return Outcome(output, _figures(done, names), {"coregistration": config}, [*failures, *done.failures.values()],
-                   judgement=Judgement.of(coregistration_problem(done, read)))
+                   judgement=Judgement.of(coregistration_problem(done, read), coregistration_doubts(done, names)))
 
 
 def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask], done: Coregistration) -> None:

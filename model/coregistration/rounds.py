@@ -240,6 +240,11 @@ def _settled(history: Sequence[Round], model: BodyModel, config: CoregistrationC
     return bool(history and history[-1].change <= config.tolerance * size)
 
 
+def coregistration_doubts(done: Coregistration, names: Sequence[str]) -> list[str]:
+    """Why co-registered scans, by name, are to be looked at: some do not fit the model."""
+    return [f"{name} does not fit the model" for name, fits in zip(names, done.good, strict=True) if not fits]
+
+
 def coregistration_problem(done: Coregistration, scans: Sequence[Scan]) -> str | None:
     """Why co-registered scans mean nothing, with the likely cause; None where they mean something."""
     explained = float(np.mean([0.0 if r is None else r.explained for r in done.registrations]))

@@ -23,7 +23,7 @@ from ..files import load_model
 from ..linear import Subject
 from ..motion.amass import write_amass
 from ..motion.onto import BodyMotion, read_motion
-from ..people import person_judgement
+from ..people import ASKED, person_judgement
 from .bvh import write_bvh
 from .conventions import for_programs, standing
 from .correctives import motion_correctives, off_exact, pose_features, spaced, write_body_npz
@@ -83,7 +83,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
                             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
                             "names": names, "ground": ground, "front": front, "fps": fps})
     loaded = load_model(model)
-    judgement = person_judgement(loaded, np.array(betas)) if betas else Judgement()
+    judgement = person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement()
     if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded), judgement=judgement)
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None

@@ -27,7 +27,7 @@ from ..gradients import GradientSystem, pose_gradients, shape_gradients
 from ..human_poses import mixed, with_human_poses
 from ..linear import Subject
 from ..pose_space import PoseSpace
-from ..priors import STIFF, stiff_joints
+from ..priors import CRUDE, STIFF, stiff_joints
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
@@ -346,6 +346,9 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
         doubts = [f"the {', '.join(joint_in_words(model.skeleton.names[j]) for j in stiff)} {never}"]
     elif len(model.skeleton.parents) == 1 and model.n_betas:
         doubts = ["the body has one part and no joint: it takes no pose"]
+    error = model.info.get("left_out_error", 0.0)
+    doubts += [f"a pose that was left out is predicted {1000 * error:.0f} mm off: it needs more poses"] \
+        if error > CRUDE else []
     return Judgement.of(learning_problem(model, people), doubts)
 
 

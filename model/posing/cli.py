@@ -24,7 +24,7 @@ from ..files import load_model
 from ..linear import Subject
 from ..motion.files import betas_for
 from ..motion.onto import read_motion
-from ..people import person_judgement
+from ..people import ASKED, person_judgement
 from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
@@ -97,7 +97,13 @@ def character(mesh: CharacterArg, model: Annotated[Path, Alias("-m")], output: O
     found.model.save(output)
     save_png(output.with_suffix(".png"), picture_character(found.model))
     return Outcome(output, _about(loaded, found), {"character": config},
-                   judgement=Judgement.of(character_problem(found)))
+                   judgement=Judgement.of(character_problem(found), _outside(loaded, found)))
+
+
+def _outside(model: BodyModel, found: Character) -> list[str]:
+    """The joints that do not lie inside a character, in one line; none where all do."""
+    outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
+    return [f"outside: {', '.join(outside)}"] if outside else []
 
 
 def _about(model: BodyModel, found: Character) -> list[Metric]:
@@ -106,10 +112,9 @@ def _about(model: BodyModel, found: Character) -> list[Metric]:
         Metric("character off the template", 100 * found.registration.uncovered, "%"),
         Metric("distance of landmarks, RMS", 1e3 * found.registration.landmark_rms, "mm"),
         Metric("inverted triangles", found.registration.inverted)]
-    outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
     return [*rows, Metric("height, length or width", float(np.ptp(found.mesh.vertices, axis=0).max()), "m"),
             Metric("joints inside it", f"{found.inside.sum()} of {len(found.inside)}"
-                   + (f", outside: {', '.join(outside)}" if outside else "")),
+                   + "".join(f", {told}" for told in _outside(model, found))),
             Metric("most turned joint", float(np.degrees(np.linalg.norm(found.pose[1:], axis=1).max())), "°")]
 
 
@@ -141,17 +146,16 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     TURNS.check(turns, f"{pose}: turns")
     if (subject is not None) + bool(betas) + own_body > 1:
         raise UsageError("--betas, --subject and --own-body: expected one of them")
-    if subject is not None or own_body:
-        vertices = read_subject(loaded, subject).vertices(turns)
-    elif not loaded.n_betas:
+    if not (subject is not None or own_body or loaded.n_betas):
         raise ValueError(f"{model}: it has no shape components; ask for --own-body")
-    else:
-        vertices = loaded.vertices(turns, np.array(betas if betas else (0.0,)))
+    person = read_subject(loaded, subject) if subject is not None or own_body else loaded.subject(
+        np.array(betas if betas else (0.0,)))
+    vertices = person.vertices(turns)
     body = loaded.template.with_vertices(vertices)
     write_mesh(output, standing(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")],
-                   judgement=person_judgement(loaded, np.array(betas)) if betas else Judgement())
+                   judgement=Judgement() if person.betas is None else person_judgement(loaded, person.betas, ASKED))
 
 
 def _read_turns(path: Path) -> dict[str, np.ndarray]:

@@ -156,6 +156,11 @@ def _solve(placed: list[tuple[np.ndarray, np.ndarray]],
     return T, np.concatenate(residuals)
 
 
+def views_doubts(found: AlignedViews, names: Sequence[str]) -> list[str]:
+    """Why aligned views, by name, are to be looked at: the place of some is uncertain."""
+    return [f"the place of {name} is uncertain" for name, sure in zip(names, found.trusted, strict=True) if not sure]
+
+
 def views_problem(found: AlignedViews) -> str | None:
     """Why aligned views mean nothing; None where some are in place."""
     if found.trusted.any():

@@ -13,6 +13,7 @@ from ..judgement import Judgement
 from ..ranges import Settings
 from ..registration.limbs import Doubt
 
+UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 CROWDED = 0.3                  # share of a scan off the template that may be a second person, who is half of it
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
@@ -130,6 +131,9 @@ class Limits(Settings):
         that alone.
     """
 
+    # Of 24 synthetic people that are registered right, the median and the most: missed 0.0004, 0.010; distance 0.00065,
+    # 0.00067; stretch 0.001, 0.009; landmarks 0.0015, 0.0018; none inverted. A real one that is 20 mm off has stretch
+    # 0.047; with sides exchanged, missed 0.13 and stretch 0.10.
     missed: float = 0.005
     distance: float = 0.002
     unseen: float = 0.15

@@ -14,11 +14,11 @@ from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, read_landmarks, shared_landmarks
 from ..geometry.mesh import Mesh
-from ..judgement import extent
+from ..judgement import beyond_people, extent
 from ..ranges import FLAG, Settings
-from ..registration.limbs import limb_doubts
+from ..registration.limbs import Doubt, limb_doubts
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
-from ..registration.person import PersonParts
+from ..registration.person import PersonParts, stature
 from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
 from ..registration.unmarked import register_unmarked
@@ -94,10 +94,17 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             from .page import pictures_of
 
             picture, scene = pictures_of(template, scan, fit)
-        doubts = () if parts is None else limb_doubts(template, parts, fit.mesh.vertices)
+        doubts = () if parts is None else (*limb_doubts(template, parts, fit.mesh.vertices),
+                                           *size_doubts(template, parts, fit.mesh.vertices))
     figures = replace(figures_of(task.name, init, template, fit), removed=removed, doubts=doubts,
                       seconds=time.perf_counter() - start)
     return RegisteredScan(fit.mesh.vertices, figures, picture, scene)
+
+
+def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:
+    """What is unlikely in the size of a person on whom the template's vertices (N, 3), metres, lie."""
+    sized = beyond_people(stature(template, parts, vertices))
+    return tuple(Doubt(2.0 if sized.problems else 1.0, reason) for reason in sized.reasons)
 
 
 def _check_unit(task: ScanTask, scan: Mesh | np.ndarray, template: Mesh) -> None:

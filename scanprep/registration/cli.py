@@ -27,7 +27,7 @@ from ..geometry.landmarks import (
 )
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement, beyond_people, size
-from ..pipeline.figures import review
+from ..pipeline.figures import UNSEEN, review
 from ..pipeline.scan import figures_of
 from .limbs import limb_doubts
 from .nonrigid import Registration, register, registration_problem
@@ -73,7 +73,6 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
             f"it did not converge, at {MM * found.rms:.0f} mm RMS: a start far from the target?"]))
 
 
-UNSEEN = 0.15                        # share of vertices that four views of a person leave without data
 NO_LANDMARKS = Path("none")          # as `--landmarks none`
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..alignment.views import AlignViewsConfig, align_views, views_problem
+from ..alignment.views import AlignViewsConfig, align_views, views_doubts, views_problem
 from ..arguments import Called, Place, UsageError
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan, cleaning_doubts
 from ..cli import MM, MeshArg, Output, ScanArg, Unit, about_mesh
@@ -197,15 +197,15 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
     storage.write_json(output / "cameras.json",
                        {name: camera.tolist() for name, (_, camera) in zip(names, found.views, strict=True)})
     shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
-    uncertain = [name for name, trusted in zip(names, found.trusted, strict=True) if not trusted]
+    doubts = views_doubts(found, names)
     return Outcome(output, [
         Metric("views", len(seen)), Metric("distance between views, RMS", MM * found.rms, "mm"),
         Metric("rounds", found.iterations), Metric("converged", str(found.converged)),
         Metric("largest shift of a camera", MM * max(shifts), "mm"),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
-        {"views": config}, [f"{name}: its place is uncertain" for name in uncertain],
-        judgement=Judgement.of(views_problem(found)))
+        {"views": config}, doubts,
+        judgement=Judgement.of(views_problem(found), doubts))
 
 
 def _view_landmarks(folder: Path, path: Path, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
