@@ -21,6 +21,7 @@ from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
+from scanprep.registration.ground import on_floor_row
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
@@ -151,7 +152,7 @@ def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.nd
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
-    return [*rows, Metric(LEFT, MM * done.rms, "mm"),
+    return [*rows, *on_floor_row(done.beyond_floor), Metric(LEFT, MM * done.rms, "mm"),
             Metric("model", work.model), *details([Metric("settled", "yes" if done.converged else "no"),
                                                    Metric("rounds", done.iterations)])]
 
