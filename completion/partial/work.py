@@ -21,10 +21,10 @@ from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
-from scanprep.registration.ground import on_floor_row
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
+from scanprep.registration.ground import on_floor_row
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, save_completion

@@ -26,7 +26,7 @@ from .person import PersonParts
 NEAR = 0.04                  # metres from the skin of the feet within which points are of them
 FLAT = 0.002                 # metres from the plane within which a scan that ends flat ends
 REACH = 0.015                # metres along the floor between the outline of a foot and where the scan ends
-AROUND = 0.7                 # share of the outline of the feet along which the scan must end there; seen from the front 0.67
+AROUND = 0.7                 # share of the outline of the feet along which the scan ends there; seen from in front 0.67
 DEEPEST = 0.04               # metres beyond the plane: what is longer is a shin or a hand, not a sole
 BEHIND = 0.005               # share of the points at the feet that may lie behind the floor: specks
 WALL = 0.006                 # metres above the floor where feet have an outline, wherever their soles came to lie
@@ -76,7 +76,7 @@ def with_soles(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts
 
 
 def on_floor_row(beyond: float) -> list[Metric]:
-    """The row that tells that soles were brought to the floor, from how far beyond it (metres); none where it is NaN."""
+    """The row that tells of soles that were `beyond` the floor, metres; none where that is NaN."""
     return [] if np.isnan(beyond) else [
         Metric("soles", f"rest on the floor at which the scan ends flat, {1000 * beyond:.0f} mm beyond it before")]
 
@@ -112,14 +112,14 @@ def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, 
 
 
 def _bent(reference: Mesh, body: Mesh, shown: np.ndarray) -> float:
-    """By how much a foot had to change its shape where it was seen, (N,) bool, metres; nothing of it is known if not."""
+    """By how much a foot had to change its shape where it was shown, (N,) bool, metres; without limit if it was not."""
     if shown.sum() < 20:
         return np.inf
     return bending(reference.vertices[shown], body.vertices[shown], body.vertex_areas[shown])[0]
 
 
 def find_floor(body: Mesh, feet: np.ndarray, points: np.ndarray, normals: np.ndarray) -> Plane | None:
-    """The plane in which a scan, points and normals (n, 3), ends around the feet (N,) of a body on it; None where there is none.
+    """The plane in which a scan, points and normals (n, 3), ends around the feet (N,) of a body on it, or None.
 
     All of the scan lies above it, and of the body nothing but soles below. Soles that were scanned need no floor.
     """
