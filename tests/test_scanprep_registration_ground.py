@@ -5,7 +5,7 @@ import pytest
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import target_of
-from scanprep.registration.ground import find_floor, foot_of_vertex, grounded, on_floor_row, with_soles
+from scanprep.registration.ground import find_floor, foot_of_vertex, grounded, soles_row, with_soles
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts
 from scanprep.skeleton.tree import Skeleton
@@ -101,7 +101,7 @@ def test_soles_below_the_floor_come_to_rest_on_it(person, other, sunken, foot, s
     scan = scanned(person.mesh)
     turned, body = (mesh.with_vertices(mesh.vertices @ R.T + T) for mesh in (scan, sunken))
     found = on(turned, other, body, foot)
-    assert found is not None and found.depth > 0.02
+    assert found is not None and found.beyond[0] > 0.02
     np.testing.assert_allclose(found.floor.normal, R @ UP, atol=1e-3)
     back = (found.vertices - T) @ R
     assert abs(back[:, 2].min()) < 0.005 and np.ptp(back[:, 2]) == pytest.approx(person.shape.stature, abs=0.005)
@@ -154,8 +154,8 @@ def test_a_registration_tells_what_was_done(person, other, sunken):
     fit = Registration(sunken, none, none == 0, 0.0, 0.0, True, 1, {}, 0, none, 0.0)
     done = with_soles(other, walled(person.mesh, 0.009), fit, parts)
     assert abs(done.mesh.vertices[:, 2].min()) < 0.005 and done.inverted == 0
-    assert done.beyond_floor == pytest.approx(0.022, abs=0.001)
-    assert "rest on the floor" in str(on_floor_row(done.beyond_floor)[0])
-    assert with_soles(other, person.mesh, fit, None) is fit and not on_floor_row(fit.beyond_floor)
+    assert done.soles[0] == pytest.approx(0.022, abs=0.001) and done.soles[1] < 0.005
+    assert "soles rest on it" in str(soles_row(done.soles)[0])
+    assert with_soles(other, person.mesh, fit, None) is fit and not soles_row(fit.soles)
     cloud = with_soles(other, walled(person.mesh, 0.009).vertices, fit, parts)
     assert abs(cloud.mesh.vertices[:, 2].min()) < 0.005

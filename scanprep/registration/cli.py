@@ -29,7 +29,7 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement, beyond_people, size
 from ..pipeline.figures import review
 from ..pipeline.scan import figures_of
-from .ground import on_floor_row, with_soles
+from .ground import soles_row, with_soles
 from .limbs import limb_doubts
 from .nonrigid import Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
@@ -152,7 +152,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("scan off the template", 100 * fit.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
-        *on_floor_row(fit.beyond_floor),
+        *soles_row(fit.soles),
         Metric("converged", str(fit.converged))], {"register": config},
         judgement=judge_registration(scan.name, body, data, fit, pairs, parts))
 

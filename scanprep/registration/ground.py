@@ -42,11 +42,14 @@ UNMEASURED = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Grounded:
-    """A body whose soles rest on the floor: its vertices (N, 3), metres, the floor, and how far they were beyond it."""
+    """A body with its soles on the floor: its vertices (N, 3), metres, and the floor.
+
+    `beyond` is how far the lowest vertex was beyond the floor, and how far it is now, metres.
+    """
 
     vertices: np.ndarray
     floor: Plane
-    depth: float                 # metres, of the lowest vertex before
+    beyond: tuple[float, float]
 
 
 def foot_of_vertex(template: Mesh, skeleton: Skeleton) -> np.ndarray:
@@ -71,14 +74,15 @@ def with_soles(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts
     found = grounded(template, fit.mesh, foot_of_vertex(template, parts.skeleton), target.points, target.normals)
     if found is None:
         return fit
-    return replace(fit, mesh=template.with_vertices(found.vertices), beyond_floor=found.depth,
+    return replace(fit, mesh=template.with_vertices(found.vertices), soles=found.beyond,
                    inverted=int(inverted_triangles(template, found.vertices).sum()))
 
 
-def on_floor_row(beyond: float) -> list[Metric]:
-    """The row that tells of soles that were `beyond` the floor, metres; none where that is NaN."""
-    return [] if np.isnan(beyond) else [
-        Metric("soles", f"rest on the floor at which the scan ends flat, {1000 * beyond:.0f} mm beyond it before")]
+def soles_row(beyond: tuple[float, float] | None) -> list[Metric]:
+    """The row that tells that soles were brought to the floor, from how far beyond it to how far, metres."""
+    return [] if beyond is None else [
+        Metric("soles", f"the scan ends flat at the floor: soles rest on it, {1000 * beyond[1]:.0f} mm beyond, "
+                        f"{1000 * beyond[0]:.0f} mm before")]
 
 
 def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, normals: np.ndarray
@@ -108,7 +112,8 @@ def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, 
     off = UNMEASURED * max(_bent(reference, body, shown & (foot == number)) for number in np.unique(foot[foot > 0]))
     pressed = CUT**2 / (CUT**2 + off**2)
     below = np.maximum(-height, 0)
-    return Grounded(body.vertices + ((1 - pressed) * below)[:, None] * floor.normal, floor, float(below.max()))
+    return Grounded(body.vertices + ((1 - pressed) * below)[:, None] * floor.normal, floor,
+                    (float(below.max()), float(pressed * below.max())))
 
 
 def _bent(reference: Mesh, body: Mesh, shown: np.ndarray) -> float:

@@ -48,7 +48,7 @@ class Registration:
     confidence: np.ndarray       # (N,) from 0, made up from the surroundings, to 1: data here, from both directions
     uncovered: float
     rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repaired`
-    beyond_floor: float = np.nan  # metres that soles went beyond the floor at which the scan ends: see `with_soles`
+    soles: tuple[float, float] | None = None    # metres beyond the floor where the scan ends: see `with_soles`
 
 
 @one_thread()
