@@ -4,7 +4,8 @@ from completion_bodies import half_view, worm_with_prior
 
 from completion import energy
 from completion.bodies import FixedBody
-from completion.partial.completion import complete
+from completion.partial import completion as completing
+from completion.partial.completion import complete, load_completion, save_completion
 from completion.partial.free_space import Contact
 from completion.partial.limbs import limbs, redrawn
 from completion.partial.settings import CompletionConfig
@@ -12,6 +13,7 @@ from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.registration.ground import Grounded
 
 POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
 TRANS = np.array([0.4, -0.3, 1.1])
@@ -75,6 +77,18 @@ def test_the_completed_mesh_follows_the_scan_where_the_model_cannot(model, known
         return Surface(mesh).closest(dented[deep]).distances.mean()
 
     assert at(result.completed) < 0.003 < 0.006 < at(result.predicted)
+
+
+def test_soles_that_come_to_rest_on_a_floor_are_told(model, known, monkeypatch, tmp_path):
+    """The completed mesh is the one that stands, and the files say what was done."""
+    _, points, _, landmarks, result, _ = known
+    monkeypatch.setattr(completing, "grounded", lambda reference, body, foot, points, normals: Grounded(
+        body.vertices + 0.01, None, (0.022, 0.001)))
+    stands = complete(model.subject(None), points, landmarks, QUICK)
+    np.testing.assert_allclose(stands.completed.vertices, result.completed.vertices + 0.01)
+    assert result.soles is None and stands.soles == (0.022, 0.001)
+    assert load_completion(save_completion(tmp_path, stands)).soles == (0.022, 0.001)
+    assert load_completion(save_completion(tmp_path, result)).soles is None
 
 
 def test_a_mesh_with_borders_serves_as_scan(model, known):

@@ -57,7 +57,7 @@ def test_dots_belong_to_the_names_of_scans(scans, tmp_path):
 
 def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, template, monkeypatch):
     """What a scan was registered with is what its limbs are tried again with, and the table says that they were."""
-    given, person = [], object()
+    given, stood, person = [], [], object()
 
     def repaired(body, scan, fit, parts, landmarks, config, correspondences):
         given.append((parts, len(landmarks[0]), config, correspondences))
@@ -68,12 +68,14 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
     small = Doubt(1.0, "the person is 1.20 m tall: a child, or the wrong scale?")
     monkeypatch.setattr(one_scan, "limb_doubts", lambda body, parts, vertices: told)
     monkeypatch.setattr(one_scan, "size_doubts", lambda body, parts, vertices: (small,))
+    monkeypatch.setattr(one_scan, "with_soles", lambda body, scan, fit, parts: stood.append((fit.rolled, parts)) or fit)
     task = find_scans(scans)[0]
     found = one_scan.register_scan(task, template, MARKS, QUICK.scan, person).figures
     assert found.rolled and found.doubts == (*told, small)
     animal = one_scan.register_scan(task, template, MARKS, QUICK.scan).figures
     assert not animal.rolled and animal.doubts == ()
     assert given == [(who, len(MARKS), QUICK.scan.registration, None) for who in (person, None)]
+    assert stood == [(True, person), (False, None)]
 
 
 def test_folders_that_cannot_be_meant(scans, tmp_path):

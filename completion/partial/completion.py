@@ -16,6 +16,7 @@ from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.registration.ground import foot_of_vertex, grounded
 from scanprep.skeleton.roles import in_words, joint_in_words
 from scanprep.threads import one_thread
 
@@ -90,6 +91,9 @@ class Completion:
         Probability that the vertex is within `config.tolerance` of the truth. None in files of earlier versions.
     judgement : Judgement
         Whether it can be used as it is, and why not. Of files of earlier versions: to be looked at.
+    soles : (float, float), metres, or None
+        Where the scan ends flat at the floor: how far the soles went beyond it before they were brought to rest there,
+        and how far they still do.
     """
 
     completed: Mesh
@@ -108,6 +112,7 @@ class Completion:
     expected_error: np.ndarray | None = None
     confidence: np.ndarray | None = None
     judgement: Judgement = UNJUDGED
+    soles: tuple[float, float] | None = None
 
 
 @one_thread()
@@ -159,6 +164,9 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     predicted = person.template.with_vertices(person.vertices(x))
     cloud = fit.without_ignored(given.cloud, predicted)
     completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
+    foot = foot_of_vertex(predicted, person.skeleton)
+    standing = grounded(predicted, completed, foot, cloud.points, cloud.normals)
+    completed = completed if standing is None else completed.with_vertices(standing.vertices)
     if cloud.person is not None:                # what it shows is clothes, and noisier than the model is inexact
         completed, rms = predicted, distance_to(predicted, cloud.points[used])
     error = expected_error(open_error, distance_to_seen(predicted, seen), rms, person.left_out_error)
@@ -169,7 +177,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     landmark_rms = float(np.sqrt((off**2).mean())) if len(off) else np.nan
     done = Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()), landmark_rms,
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
-                      probability_within(error, config.tolerance))
+                      probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
     problems = [problem for problem in (completion_problem(done, given.cloud.points, config.free_scale),
                                         contorted(fit, solved.x)) if problem]
     found = doubts(fit, solved.x, error, seen) + left_over(fit, done.explained) + ambiguous(fit, solved.x, rival)
@@ -272,10 +280,14 @@ def save_completion(folder: str | Path, completion: Completion) -> Path:
     write_mesh(folder / "completed.ply", completion.completed)
     write_mesh(folder / "predicted.ply", completion.predicted)
     arrays = {name: getattr(completion, name) for name in _ARRAYS if getattr(completion, name) is not None}
-    facts = {name: getattr(completion, name) for name in (*_FACTS, "energies", "scale")}
+    facts = {name: getattr(completion, name) for name in (*_FACTS, "energies", "scale", "soles")}
     facts["judgement"] = str(completion.judgement)
     storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
     return folder
+
+
+def _pair(value: Any) -> tuple[float, float] | None:
+    return None if value is None else (float(value[0]), float(value[1]))
 
 
 def load_completion(folder: str | Path) -> Completion:
@@ -297,4 +309,5 @@ def load_completion(folder: str | Path) -> Completion:
                           converged=bool(header["converged"]), iterations=int(header["iterations"]),
                           energies={name: float(value) for name, value in header["energies"].items()},
                           scale=float(header["scale"]) if header["version"] > 1 else 1.0,
-                          judgement=Judgement.read(header["judgement"]) if header["version"] > 2 else UNJUDGED)
+                          judgement=Judgement.read(header["judgement"]) if header["version"] > 2 else UNJUDGED,
+                          soles=_pair(header.get("soles")))

@@ -24,6 +24,7 @@ from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
+from scanprep.registration.ground import soles_row
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, save_completion
@@ -151,7 +152,7 @@ def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.nd
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
-    return [*rows, Metric(LEFT, MM * done.rms, "mm"),
+    return [*rows, *soles_row(done.soles), Metric(LEFT, MM * done.rms, "mm"),
             Metric("model", work.model), *details([Metric("settled", "yes" if done.converged else "no"),
                                                    Metric("rounds", done.iterations)])]
 

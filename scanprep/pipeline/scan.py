@@ -16,6 +16,7 @@ from ..geometry.landmarks import check_on_surface, read_landmarks, shared_landma
 from ..geometry.mesh import Mesh
 from ..judgement import beyond_people, extent
 from ..ranges import FLAG, Settings
+from ..registration.ground import with_soles
 from ..registration.limbs import Doubt, limb_doubts
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
 from ..registration.person import PersonParts, stature
@@ -89,6 +90,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         fit = repaired(template, scan, fit, parts, landmarks, settings.registration, correspondences=pairs)
+        fit = with_soles(template, scan, fit, parts)
         picture = scene = b""
         if settings.pictures:
             from .page import pictures_of

@@ -29,6 +29,7 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement, beyond_people, size
 from ..pipeline.figures import UNSEEN, review
 from ..pipeline.scan import figures_of
+from .ground import soles_row, with_soles
 from .limbs import limb_doubts
 from .nonrigid import Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
@@ -140,6 +141,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         parts = person_parts(body, progress)
     with bar("trying other rolls of limbs") as progress:
         fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
+    fit = with_soles(body, data, fit, parts)
     write_mesh(output, fit.mesh)
     return Outcome(output, [
         *_led_by(given, pairs),
@@ -149,6 +151,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("scan off the template", 100 * fit.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
+        *soles_row(fit.soles),
         Metric("converged", str(fit.converged))], {"register": config},
         judgement=judge_registration(scan.name, body, data, fit, pairs, parts))
 

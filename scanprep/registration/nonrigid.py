@@ -51,6 +51,7 @@ class Registration:
     confidence: np.ndarray       # (N,) from 0, made up from the surroundings, to 1: data here, from both directions
     uncovered: float
     rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repaired`
+    soles: tuple[float, float] | None = None    # metres beyond the floor where the scan ends: see `with_soles`
 
     def moved(self, by: np.ndarray) -> Registration:
         """The same at another place, `by` (3,) metres away."""
