@@ -214,8 +214,8 @@ def test_unsure_correspondences_mean_nothing():
     assert correspondences_problem(Correspondences(vertices, points, np.full(5, 0.8))) is None
     assert "0.30" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.3)))
     assert "0.43" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.43)))      # limbs mistaken
-    assert "0.66" in correspondences_doubts(Correspondences(vertices, points, np.full(5, 0.66)))[0]
-    assert correspondences_doubts(Correspondences(vertices, points, np.full(5, 0.71))) == []
+    assert "0.73" in correspondences_doubts(Correspondences(vertices, points, np.full(5, 0.73)))[0]
+    assert correspondences_doubts(Correspondences(vertices, points, np.full(5, 0.79))) == []
     assert "0 pairs" in correspondences_problem(Correspondences(vertices[:0], points[:0], np.zeros(0)))
 
 
