@@ -51,7 +51,7 @@ MONSTROUS = np.radians(75)           # from any known way to hold a joint; a cha
 LEFT_OVER = 0.03                     # share of a scan without a body near; of long hair 0.05, of clothes 0.04 to 0.31
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 # the same where hardly half of the body has data; a cylinder ends at 0.60 and 0.37, a chair at 0.57 and 0.30, one view
-# of a person with raised arms, mistaken, at 0.59 and 0.29 or 0.38
+# of a dressed person with raised arms at 0.59 and 0.29 or 0.38
 CROWDED = 0.7
 COVERED = 0.5                        # share of the body with data; of one of two people it is 0.94, at 0.58 explained
 UNJUDGED = Judgement.of(check=["no judgement was made"])
