@@ -47,7 +47,7 @@ PART_SHOWN = 0.5                     # share of a part within the picture, below
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
 UNLIKELY = 150.0                     # squared deviations of a pose from those that are known, all joints together
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
-MONSTROUS = np.radians(75)           # from any known way to hold a joint; a chair has 58, another wrong body 94
+MONSTROUS = np.radians(75)           # from any known way to hold a joint; a chair has 58, sides exchanged 133
 LEFT_OVER = 0.03                     # share of a scan without a body near; of long hair 0.05, of clothes 0.04 to 0.31
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 # the same where hardly half of the body has data; a cylinder ends at 0.60 and 0.37, a chair at 0.57 and 0.30, one view
