@@ -35,7 +35,7 @@ from scanprep.alignment.views import align_views, views_doubts, views_problem
 from scanprep.batch.room import Room
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.console import Metric, Outcome
-from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
+from scanprep.correspondence.correspondences import Correspondences, correspondences_doubts, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.judgement import Judgement, beyond_people, carry_judgements, judge_many, read_judgement, size
 from scanprep.pipeline.prepare import PrepareConfig
@@ -214,6 +214,8 @@ def test_unsure_correspondences_mean_nothing():
     assert correspondences_problem(Correspondences(vertices, points, np.full(5, 0.8))) is None
     assert "0.30" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.3)))
     assert "0.43" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.43)))      # limbs mistaken
+    assert "0.73" in correspondences_doubts(Correspondences(vertices, points, np.full(5, 0.73)))[0]
+    assert correspondences_doubts(Correspondences(vertices, points, np.full(5, 0.79))) == []
     assert "0 pairs" in correspondences_problem(Correspondences(vertices[:0], points[:0], np.zeros(0)))
 
 

@@ -12,6 +12,7 @@ from ..cli import MM, MeshArg, Output, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import find_correspondences
 from ..correspondence.correspondences import (
+    correspondences_doubts,
     correspondences_problem,
     read_correspondences,
     write_correspondences,
@@ -110,7 +111,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         Metric("method", found.method), *_led_by(given, pairs), Metric("correspondences", len(found)),
         Metric("confidence, median", float(np.median(found.confidence))),
         Metric("converged", str(found.converged))], {"correspond": config},
-        judgement=Judgement.of(correspondences_problem(found)))
+        judgement=Judgement.of(correspondences_problem(found), correspondences_doubts(found)))
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
