@@ -86,8 +86,8 @@ def with_soles(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts
 def soles_row(beyond: tuple[float, float] | None) -> list[Metric]:
     """The row that tells that soles were brought to the floor, from how far beyond it to how far, metres."""
     return [] if beyond is None else [
-        Metric("soles", f"the scan ends flat at the floor: soles rest on it, {1000 * beyond[1]:.0f} mm beyond, "
-                        f"{1000 * beyond[0]:.0f} mm before")]
+        Metric("soles", f"the scan ends flat at the floor: soles rest on it, {1000 * beyond[1]:.0f} mm beyond its "
+                        f"end, where they were {1000 * beyond[0]:.0f} mm")]
 
 
 def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, normals: np.ndarray
