@@ -192,7 +192,7 @@ def test_places_clicked_on_the_template_are_a_layout(tmp_path):
         posed = person.vertices(0.2 * rng.normal(size=(len(person.skeleton.parents), 3)), None)
         np.testing.assert_allclose(layout.skin_points(posed), np.einsum("nk,nkd->nd", bary, posed[body.faces[face]]),
                                    atol=1e-5)
-    write_landmarks(tmp_path / "far.json", {**clicked, "M03": points[3] + [0, 0, 0.3]})
+    write_landmarks(tmp_path / "far.json", {**clicked, "M03": points[3] + [0, 0.6, 0]})
     with pytest.raises(MarkerFileError, match=r"far\.json: .*'M03' is \d+ mm off"):
         read_layout(tmp_path / "far.json", body)
     layout.save(tmp_path / "layout.json")

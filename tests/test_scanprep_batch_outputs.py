@@ -171,7 +171,7 @@ def failing(output: Output, works: bool = False, *, space: Workspace) -> Outcome
     """Prepare, then fail at all tasks but one, if that."""
     space.step("prepared", 0, lambda folder: (folder / "a.txt").write_text("a"))
     done = space.run(Refuse(works), [Task("1", 1, "1"), Task("2", 2, "2")])
-    return Outcome(output, [], failures=list(done.failures.values()), judgement=None)
+    return Outcome(output, [], failures=list(done.failures.values()), judgement=Judgement())
 
 
 def test_where_all_tasks_fail_no_output_of_the_command_stays(tmp_path, capsys):

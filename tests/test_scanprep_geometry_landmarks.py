@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 
+from scanprep.decimation.decimate import decimate
 from scanprep.geometry.files import MeshFileError
 from scanprep.geometry.landmark_names import TEN, known_landmarks, landmark_name, paired_names
 from scanprep.geometry.landmarks import (
@@ -17,6 +18,7 @@ from scanprep.geometry.landmarks import (
     write_landmarks,
 )
 from scanprep.geometry.mesh import Mesh
+from scanprep.synthetic.people import Person
 
 MESH = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 POINTS = {"nose": [0.1, -0.2, 1.6], "left knee": [0.3, 0.25, 0.5], "10th rib": [-0.2, 0.1, 1.2]}
@@ -344,3 +346,16 @@ def test_landmarks_that_lie_on_no_scan_of_any_unit_stay_as_they_are(tmp_path, re
     far = {"a": [9.0, 1.0, 0.0], "b": [9.0, 2.0, 1.0], "c": [8.0, 1.0, 3.0]}
     found = read_landmarks(written(tmp_path / "a.json", far), scan)
     assert all((found[name] == far[name]).all() for name in far) and not recwarn.list
+
+
+def test_axes_that_a_slicer_file_tells_are_doubted_only_where_the_others_fit_far_better(tmp_path):
+    """A body looks alike from in front and behind: few triangles, and clicks between their corners, tell nothing."""
+    body = decimate(Person().mesh, 300)
+    for seed in range(8):
+        points = dict(zip("abcdefghijkl", body.sample(12, np.random.default_rng(seed))[0], strict=True))
+        write_landmarks(tmp_path / "a.mrk.json", points)
+        found = read_landmarks(tmp_path / "a.mrk.json", body)
+        assert all(np.allclose(found[name], point, atol=1e-6) for name, point in points.items()), seed
+        turned = body.with_vertices(body.vertices * [-1, -1, 1])            # a scan that was saved in RAS
+        found = read_landmarks(tmp_path / "a.mrk.json", turned)
+        assert all(np.allclose(found[name], point * [-1, -1, 1], atol=1e-6) for name, point in points.items()), seed

@@ -20,6 +20,7 @@ from completion.mocap.subject.person import PersonConfig
 from scanprep import command_line, config_files
 from scanprep.console import Metric, Outcome
 from scanprep.geometry import storage
+from scanprep.judgement import Judgement
 from scanprep.ranges import LARGE, OutOfRange, Range, Settings, ranges
 
 
@@ -155,7 +156,7 @@ def test_defaults_are_in_their_ranges(prog, monkeypatch, tmp_path):
     @functools.wraps(function)
     def spy(*args, **named):
         called.append(named)
-        return Outcome(None, [Metric("done", 1)], judgement=None)
+        return Outcome(None, [Metric("done", 1)], judgement=Judgement())
 
     assert command_line.run(spy, prog, needed(function)) == 0 and len(called) == 1
 

@@ -17,8 +17,10 @@ from .landmark_names import paired_names
 from .landmark_reading import Entry, entries_of
 from .landmark_writing import as_bytes
 from .mesh import Mesh
+from .surface import Surface
 
 ON_SURFACE = 0.03                    # of its size: clicks lie so near to a scan, those in another unit do not
+AXES = 2.0                           # times as near the points must lie in other axes than those that the file tells
 SPREAD = 0.2                         # of its size: landmarks of a person, who has hands, feet and a head, spread wider
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt",
                     ".landmarks.csv", ".fcsv", ".scalismo.json")
@@ -218,35 +220,42 @@ def _entries(path: Path, mesh: Mesh | np.ndarray | None, unit: str | None) -> di
             if not (np.abs(value) <= FARTHEST).all():
                 problem = f"lies beyond {FARTHEST:g}" if np.isfinite(value).all() else "is not finite"
                 raise MeshFileError(f"{path}: landmark '{name}' {problem}: {value.tolist()}")
-    surface, scale = mesh.vertices if isinstance(mesh, Mesh) else mesh, np.ones(3)
-    if points and surface is None:
+    scale = np.ones(3)
+    if points and mesh is None:
         scale = metres_per_unit(path, np.array(points), unit or own_unit, smallest=0.0) * scale
-    elif points and surface is not None:
-        scale = _metres_on_surface(path, np.array(points), surface, unit or own_unit, flipped)
+    elif points and mesh is not None:
+        scale = _metres_on_surface(path, np.array(points), mesh, unit or own_unit, flipped)
     return {name: scale * v if isinstance(v, np.ndarray) else v for name, v in entries.items()}
 
 
-def _metres_on_surface(path: Path, points: np.ndarray, surface: np.ndarray, unit: str | None, flipped: bool
+def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, unit: str | None, flipped: bool
                        ) -> np.ndarray:
-    """What to multiply the points (L, 3) of a file with (3,), so that they lie on a surface (n, 3), metres.
+    """What to multiply the points (L, 3) of a file with (3,), so that they lie on a scan, a mesh or points (n, 3).
 
     Programs write units that are not those of the scan: 3D Slicer calls everything millimetres. So the unit told
-    counts where the points then lie on the scan, else the one in which they do.
+    counts where the points then lie on the scan, else the one in which they do. A body looks much alike from in front
+    and from behind, so axes that the file tells are doubted only where the others fit far better.
     """
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
-    told = UNITS[unit or "m"]
-    tree, size = cKDTree(surface), float(np.linalg.norm(np.ptp(surface, axis=0)))
+    told, places = UNITS[unit or "m"], scan.vertices if isinstance(scan, Mesh) else scan
+    size = float(np.linalg.norm(np.ptp(places, axis=0)))
+    surface = Surface(scan) if isinstance(scan, Mesh) and len(scan.faces) else cKDTree(places)
     signs = [np.ones(3), np.array([-1.0, -1, 1])] if flipped else [np.ones(3)]
 
     def away(scale: np.ndarray) -> float:
-        return float(np.median(tree.query(points * scale)[0]))
+        near = points * scale
+        return float(np.median(surface.closest(near).distances if isinstance(surface, Surface)
+                               else surface.query(near)[0]))
+
+    def doubted(scale: np.ndarray) -> float:
+        return away(scale) * (1.0 if scale[0] > 0 else AXES)
 
     def fits(scale: np.ndarray) -> bool:
         spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # on one spot of it anything lies on it
         return spread > SPREAD * size and away(scale) <= ON_SURFACE * size
 
-    best = min((told * sign for sign in signs), key=away)
+    best = min((told * sign for sign in signs), key=doubted)
     if len(points) < 3 or fits(best):
         return best
     # every ratio of two units, as the scan may have been converted and the landmarks not, or the other way round
@@ -254,7 +263,7 @@ def _metres_on_surface(path: Path, points: np.ndarray, surface: np.ndarray, unit
     others = [scale for factor in factors for sign in signs if fits(scale := told * factor * sign)]
     if not others:
         return best
-    other = min(others, key=away)
+    other = min(others, key=doubted)
     warnings.warn(f"{path}: read in {unit or 'm'} the landmarks do not lie on the scan; multiplied by "
                   f"{abs(other[0]) / told:.4g} they do, and so they are used", stacklevel=4)
     return other
