@@ -38,10 +38,11 @@ LEVEL = 0.7                  # cosine between the normal of a floor and the way 
 TRIED, ENDS = 500, 12        # planes through three points, and points that a plane is fitted to at least
 SCANNED = 0.5                # share of the soles with data, above which they were scanned themselves
 # Metres, RMS, that feet are bent from which on they say less of their soles than the end of the scan: synthetic feet
-# are bent by 0.9 to 1.9 mm on other synthetic people and know the soles to 3 mm, by 4 to 9 mm on real men, to 13 mm.
-UNLIKE = 0.0055
+# are bent by 0.9 to 1.9 mm on other synthetic people and know the soles to 3 mm; by 4 to 9 mm on real men, to 13 mm; by
+# 3 and 8 mm on two scans of a booth whose floor is known, to 12 and 18 mm.
+UNLIKE = 0.003
 # Metres above the floor that scanners cut at, lest it shows: usually, and hardly ever; deeper soles are doubted more.
-CUT, HIGHEST = 0.003, 0.012
+CUT, HIGHEST = 0.0015, 0.012
 UNSEEN = 0.05                # metres that a foot counts as bent of which nothing was seen
 
 

@@ -153,7 +153,7 @@ class SyntheticScan:
         return self.folder / "truth" / f"{self.name}.npz"
 
 
-HELD = 0.4                      # radians by which hands and feet are held otherwise than named poses have them, at most
+WRIST, ANKLE = 0.6, 0.4                # radians by which hands and feet are held other than in named poses, at most
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
 
 
@@ -197,8 +197,8 @@ def subject_pose(k: int, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         loose = 0.08 * rng.normal(size=(16, 3))
         loose[[0, 5, 8, 11, 14]] *= 0.3
         # hands and feet held in all ways, or none could tell where they begin
-        loose[[6, 9]] = np.clip(4.5 * loose[[6, 9]], -HELD, HELD)
-        loose[[12, 15]] = np.clip(3.0 * loose[[12, 15]], -HELD, HELD)
+        loose[[6, 9]] = np.clip(4.5 * loose[[6, 9]], -WRIST, WRIST)
+        loose[[12, 15]] = np.clip(3.0 * loose[[12, 15]], -ANKLE, ANKLE)
         pose = named_pose(name) + loose
         return name, mirrored_pose(pose) if rng.random() < 0.4 else pose
     return f"random{k}", random_pose(rng)
