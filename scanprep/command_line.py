@@ -192,6 +192,7 @@ class _Call:
     def judged(self, outcome: Outcome) -> Outcome:
         """An outcome whose judgement has what was told of the files that it was made of."""
         if outcome.judgement is None:
+            assert outcome.output is None, "what was made has a judgement"
             return outcome
         return dataclasses.replace(outcome, judgement=outcome.judgement.joined(self.before))
 

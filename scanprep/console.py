@@ -54,9 +54,6 @@ class Outcome:
     judgement: Judgement | None = dataclasses.field(kw_only=True)
     following: str = ""
 
-    def __post_init__(self) -> None:
-        assert self.output is None or self.judgement is not None, "what was made has a judgement"
-
 
 MOST_ROWS = 12                       # of the closing table: what is read at a glance
 

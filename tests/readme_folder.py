@@ -52,13 +52,16 @@ def opened_once(app, *_given):
 
 
 def user_folder(demo, folder):
-    """Five scans, a template, a half view, a recording, frames of a walk, registered meshes, range views."""
+    """Ten scans, a template, a half view, a recording, frames of a walk, registered meshes, range views.
+
+    From six of these scans comes a model that loses a shin of the half view, and says so.
+    """
     shutil.copytree(demo, folder / "scape_demo")
     demo = folder / "scape_demo"
     (folder / "scans").mkdir()
     rows = (demo / "scans" / "scans.csv").read_text().splitlines()
-    mine = [row for row in rows[1:] if row.split(",")[1] == "subject"][:5]
-    others = [row for row in rows[1:] if row.split(",")[1] != "subject"][:1]
+    mine = [row for row in rows[1:] if row.split(",")[1] == "subject"][:8]
+    others = [row for row in rows[1:] if row.split(",")[1] != "subject"][:2]
     (folder / "scans" / "scans.csv").write_text("\n".join([rows[0], *mine, *others]) + "\n")
     for row in [*mine, *others]:
         for ending in (".ply", ".landmarks.json"):

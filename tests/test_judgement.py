@@ -34,6 +34,7 @@ from scanprep import Mesh, command_line, config_files, write_landmarks, write_me
 from scanprep.alignment.views import align_views, views_doubts, views_problem
 from scanprep.batch.room import Room
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
+from scanprep.cli import Output
 from scanprep.console import Metric, Outcome
 from scanprep.correspondence.correspondences import Correspondences, correspondences_doubts, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
@@ -316,11 +317,17 @@ def test_an_alignment_that_did_not_converge_is_to_be_looked_at(place, capsys):
     assert told["judgement"]["verdict"] == "check" and "did not converge" in told["judgement"]["reasons"][0]
 
 
-def test_an_outcome_always_says_what_it_is_worth():
+def test_an_outcome_always_says_what_it_is_worth(tmp_path, capsys):
+    def make(output: Path) -> Outcome:
+        """Make something of unknown worth."""
+        output.write_text("made")
+        return Outcome(output, [], judgement=None)
+
+    make.__annotations__ = {"output": Output, "return": Outcome}
     with pytest.raises(TypeError, match="judgement"):
         Outcome(None, [])
-    with pytest.raises(AssertionError, match="has a judgement"):        # so in every test that runs a command
-        Outcome(Path("out.ply"), [], judgement=None)
+    assert command_line.run(make, "scape x", ["-o", str(tmp_path / "a.txt")]) == 1      # so in every test that runs one
+    assert "what was made has a judgement" in capsys.readouterr().err
 
 
 COMMANDS = ("prep clean good.ply -o clean.ply", "prep fill good.ply -o filled.ply",
