@@ -97,7 +97,8 @@ def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, 
 
     A scanner may cut some millimetres above the floor, and a body that is like the person knows its soles better then.
     So what is beyond the plane is pressed towards it the more, the more the feet had to be bent to lie on the scan, up
-    to what scanners usually take away with the floor.
+    to what scanners usually take away with the floor. Who is unlike the body, and was cut higher, comes out too short:
+    two men cut at 12 mm by 10 mm, at 5 mm by 2.
 
     Parameters
     ----------
