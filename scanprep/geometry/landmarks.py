@@ -238,24 +238,24 @@ def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, 
     """
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
-    told, places = UNITS[unit or "m"], scan.vertices if isinstance(scan, Mesh) else scan
-    size = float(np.linalg.norm(np.ptp(places, axis=0)))
-    surface = Surface(scan) if isinstance(scan, Mesh) and len(scan.faces) else cKDTree(places)
+    told, of_scan = UNITS[unit or "m"], scan.vertices if isinstance(scan, Mesh) else scan
+    size = float(np.linalg.norm(np.ptp(of_scan, axis=0)))
+    surface = Surface(scan) if isinstance(scan, Mesh) and len(scan.faces) else cKDTree(of_scan)
     signs = [np.ones(3), np.array([-1.0, -1, 1])] if flipped else [np.ones(3)]
 
     def away(scale: np.ndarray) -> float:
-        near = points * scale
-        return float(np.median(surface.closest(near).distances if isinstance(surface, Surface)
-                               else surface.query(near)[0]))
+        places = points * scale
+        return float(np.median(surface.closest(places).distances if isinstance(surface, Surface)
+                               else surface.query(places)[0]))
 
-    def doubted(scale: np.ndarray) -> float:
+    def misfit(scale: np.ndarray) -> float:
         return away(scale) * (1.0 if scale[0] > 0 else AXES)
 
     def fits(scale: np.ndarray) -> bool:
         spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # on one spot of it anything lies on it
         return spread > SPREAD * size and away(scale) <= ON_SURFACE * size
 
-    best = min((told * sign for sign in signs), key=doubted)
+    best = min((told * sign for sign in signs), key=misfit)
     if len(points) < 3 or fits(best):
         return best
     # every ratio of two units, as the scan may have been converted and the landmarks not, or the other way round
@@ -263,7 +263,7 @@ def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, 
     others = [scale for factor in factors for sign in signs if fits(scale := told * factor * sign)]
     if not others:
         return best
-    other = min(others, key=doubted)
+    other = min(others, key=misfit)
     warnings.warn(f"{path}: read in {unit or 'm'} the landmarks do not lie on the scan; multiplied by "
                   f"{abs(other[0]) / told:.4g} they do, and so they are used", stacklevel=4)
     return other

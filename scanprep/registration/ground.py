@@ -39,7 +39,7 @@ TRIED, ENDS = 500, 12        # planes through three points, and points that a pl
 SCANNED = 0.5                # share of the soles with data, above which they were scanned themselves
 # Metres, RMS, that feet are bent from which on they say less of their soles than the end of the scan: synthetic feet
 # are bent by 0.9 to 1.9 mm on other synthetic people and know the soles to 3 mm; by 4 to 9 mm on real men, to 13 mm; by
-# 3 and 8 mm on two scans of a booth whose floor is known, to 12 and 18 mm.
+# 3.5 and 8 mm on two scans of a booth whose floor is known, to 12 and 18 mm.
 UNLIKE = 0.003
 # Metres above the floor that scanners cut at, lest it shows: usually, and hardly ever; deeper soles are doubted more.
 CUT, HIGHEST = 0.0015, 0.012

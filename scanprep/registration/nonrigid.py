@@ -53,10 +53,6 @@ class Registration:
     rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repaired`
     soles: tuple[float, float] | None = None    # metres beyond the floor where the scan ends: see `with_soles`
 
-    def moved(self, by: np.ndarray) -> Registration:
-        """The same at another place, `by` (3,) metres away."""
-        return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices + by))
-
 
 def offset_of(scan: Mesh | np.ndarray) -> np.ndarray:
     """(3,) metres: the middle of a scan that is so far from the origin that sums lose digits, as in UTM; else zero."""
@@ -65,23 +61,22 @@ def offset_of(scan: Mesh | np.ndarray) -> np.ndarray:
     return middle if np.abs(middle).max() > FAR else np.zeros(3)
 
 
-def moved(what: Any, by: np.ndarray) -> Any:
-    """A mesh, points (n, 3), landmarks or correspondences at another place, `by` (3,) metres away; None stays None."""
+def translate(what: Any, by: np.ndarray) -> Any:
+    """What registrations are made of, or one itself, at another place, `by` (3,) metres away; None stays None.
+
+    A mesh, points (n, 3), landmarks as vertices and points, or correspondences.
+    """
     if what is None:
         return None
     if isinstance(what, Mesh):
         return what.with_vertices(what.vertices + by)
+    if isinstance(what, Registration):
+        return replace(what, mesh=translate(what.mesh, by))
     if isinstance(what, Correspondences):
         return replace(what, scan_points=what.scan_points + by)
     if isinstance(what, tuple):
-        return what[0], np.asarray(what[1], dtype=np.float64) + by
+        return what[0], translate(what[1], by)
     return np.asarray(what, dtype=np.float64) + by
-
-
-def _translation(by: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = by
-    return T
 
 
 @one_thread()
@@ -118,9 +113,12 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     """
     away = offset_of(scan)
     if away.any():
-        begin = None if start is None else _translation(-away) @ start
-        return register(template, moved(scan, -away), moved(landmarks, -away), config, progress,
-                        moved(correspondences, -away), begin).moved(away)
+        if start is not None:
+            start = np.array(start, dtype=np.float64)
+            start[:3, 3] -= away
+        there = register(template, translate(scan, -away), translate(landmarks, -away), config, progress,
+                         translate(correspondences, -away), start)
+        return translate(there, away)
     config = config or RegistrationConfig()
     given = prepare(template, scan, landmarks, correspondences)
     stages = tuple(s for s in config.graph if s.positions == 1 or given.descriptors is not None)

@@ -20,7 +20,7 @@ from .deformation_graph import DeformationGraph, build_graph
 from .graph_fit import GraphFit, NodeMotion, deform, followed
 from .limbs import Doubt, frames, limb_doubts, limb_measures
 from .matches import Inputs, Landmarks, prepare
-from .nonrigid import Registration, finished, measured, moved, offset_of, principal_stretches, uncovered_share
+from .nonrigid import Registration, finished, measured, offset_of, principal_stretches, translate, uncovered_share
 from .person import PersonParts
 from .rolls import other_rolls
 from .schedule import GraphStage, RegistrationConfig
@@ -54,8 +54,9 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     """
     away = offset_of(scan)
     if away.any():
-        return repaired(template, moved(scan, -away), fit.moved(-away), parts, moved(landmarks, -away), config,
-                        progress, moved(correspondences, -away)).moved(away)
+        there = repaired(template, translate(scan, -away), translate(fit, -away), parts, translate(landmarks, -away),
+                         config, progress, translate(correspondences, -away))
+        return translate(there, away)
     config = config or RegistrationConfig()
     stages = tuple(stage for stage in config.graph if stage.positions == 1 and not stage.paths and stage.reach)
     x = fit.mesh.vertices

@@ -10,7 +10,7 @@ from ..correspondence.correlated import find_correspondences, find_seeds
 from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.mesh import Mesh
-from .nonrigid import Registration, moved, offset_of, register
+from .nonrigid import Registration, offset_of, register, translate
 from .schedule import RegistrationConfig
 
 LOST = 0.005                           # share of a scan off the template from which on a limb may be lost
@@ -27,8 +27,8 @@ def register_unmarked(template: Mesh, scan: Mesh | np.ndarray, config: Registrat
     """
     away = offset_of(scan)
     if away.any():
-        fit, pairs = register_unmarked(template, moved(scan, -away), config, search, progress)
-        return fit.moved(away), moved(pairs, away)
+        fit, pairs = register_unmarked(template, translate(scan, -away), config, search, progress)
+        return translate(fit, away), translate(pairs, away)
     seeds = find_seeds(template, scan)
     ends = seeds.template_vertices, seeds.scan_points
     pairs = find_correspondences(template, scan, ends, search)
