@@ -86,7 +86,7 @@ def _person(template: Mesh, skeleton: Skeleton) -> _Person | None:
     names = skeleton.names
     chains = {(kind, side): limb_parts(names, skeleton.parents, skeleton.joints, kind, side)
               for kind in LIMBS for side in ("left", "right")}
-    if not all(chains.values()) or "head" not in names:
+    if not all(chains.values()):
         return None
     joint = {key: skeleton.joints[chain[0]] for key, chain in chains.items()}
     hips, shoulders = (np.mean([joint[kind, side] for side in ("left", "right")], axis=0) for kind in ("leg", "arm"))

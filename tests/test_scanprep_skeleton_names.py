@@ -7,10 +7,12 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.edit import merge_parts, split_part
 from scanprep.skeleton.names import name_parts
-from scanprep.skeleton.roles import find_roles, in_words, joint_in_words, limb_parts, part_name
+from scanprep.skeleton.roles import find_roles, in_words, joint_in_words, limb_parts, missing_joints, part_name
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import BodyShape, Person
+
+SIDES = "left", "right"
 
 
 def unnamed(skeleton):
@@ -72,17 +74,42 @@ def test_coarser_and_finer_trees_are_named(person):
     assert names(stumps) == whole - {"hand_left", "hand_right"}
 
 
+def test_a_head_that_never_moved_is_in_the_chest(person):
+    mesh, whole = person.mesh, set(person.names)
+    still = merge_parts(person.skeleton, mesh, "chest", "head")
+    assert set(named(mesh, unnamed(still))) == whole - {"head"}
+    stiff = merge_parts(merge_parts(still, mesh, "abdomen", "chest"), mesh, "pelvis", "abdomen")
+    assert set(named(mesh, unnamed(stiff))) == whole - {"head", "pelvis", "abdomen", "chest"} | {"trunk"}
+
+
+def test_joints_that_never_bent_are_told(person):
+    """A leg whose knee was never seen to bend ends in a foot, not in a shin."""
+    mesh, tree = person.mesh, person.skeleton
+    assert missing_joints(tree.names, tree.joints) == []
+    for side in SIDES:
+        tree = merge_parts(tree, mesh, f"thigh_{side}", f"shin_{side}")
+        tree = merge_parts(tree, mesh, f"upper_arm_{side}", f"forearm_{side}")
+    found = named(mesh, unnamed(tree))
+    assert {"leg_left", "foot_left", "arm_right", "hand_right"} < set(found)
+    assert missing_joints(found, tree.joints) == ["elbows", "knees"]
+    tree = merge_parts(tree, mesh, "chest", "head")
+    assert missing_joints(named(mesh, unnamed(tree)), tree.joints) == ["neck", "elbows", "knees"]
+    one_hand = merge_parts(person.skeleton, mesh, "forearm_left", "hand_left")
+    assert missing_joints(one_hand.names, one_hand.joints) == ["left wrist"]
+    assert missing_joints(("barrel", "neck", "tail"), np.zeros((3, 3))) == []
+
+
 def test_what_is_no_person_keeps_its_names(person):
     mesh = person.mesh
     lame = unnamed(merge_parts(person.skeleton, mesh, "hand_left", "forearm_left"))
     assert named(mesh, lame) == lame.names
-    headless = unnamed(merge_parts(person.skeleton, mesh, "chest", "head"))
-    assert named(mesh, headless) == headless.names
     for animal in (Animal(), Animal(Build(aside=0.0))):
         assert named(animal.mesh, animal.skeleton) == animal.skeleton.names
     tailless = Animal(Build(aside=0.0))
     skeleton = unnamed(merge_parts(tailless.skeleton, tailless.mesh, "barrel", "tail"))
     assert named(tailless.mesh, skeleton) == skeleton.names
+    headless = merge_parts(merge_parts(skeleton, tailless.mesh, 0, 1), tailless.mesh, 0, 1)
+    assert len(headless.parents) == 9 and named(tailless.mesh, headless) == headless.names
 
 
 @pytest.mark.parametrize(("name", "part", "joint"), [

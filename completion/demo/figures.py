@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 
 from model.learning.scape import judge_model
 from scanprep.console import Metric
+from scanprep.dataset import RegisteredSet
 from scanprep.judgement import Judgement, judge_many
-from scanprep.pipeline.page import judge_set
+from scanprep.pipeline.page import judge_set, judge_whole
 
 from ..mocap.pose.robust import motion_doubts
 from .chain import Demo
@@ -28,7 +29,8 @@ def figures(demo: Demo) -> list[Metric]:
 
 def judge(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
     """What each result says of itself, whether it came near the truth, and whether parts have the names of exports."""
-    set_of_scans = judge_many({one.name: one.judgement for one in judge_set(demo.folder / "set")})
+    folder = demo.folder / "set"
+    set_of_scans = judge_whole(RegisteredSet.load(folder), judge_set(folder))
     motion = Judgement.of(check=motion_doubts([demo.motion], [demo.walk[0]], demo.template))
     of_results = judge_many({"registration": set_of_scans, "model": judge_model(demo.model),
                              "completion": demo.completion.judgement, "animation": motion})

@@ -13,6 +13,7 @@ from scanprep.batch.pool import SideBySide
 from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.skeleton.names import skeleton_doubts
 from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -346,6 +347,7 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
         doubts = [f"the {', '.join(joint_in_words(model.skeleton.names[j]) for j in stiff)} {never}"]
     elif len(model.skeleton.parents) == 1 and model.n_betas:
         doubts = ["the body has one part and no joint: it takes no pose"]
+    doubts += skeleton_doubts(model.skeleton)
     error = model.info.get("left_out_error", 0.0)
     doubts += [f"a pose that was left out is predicted {1000 * error:.0f} mm off: it needs more poses"] \
         if error > CRUDE else []

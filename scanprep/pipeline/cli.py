@@ -15,11 +15,11 @@ from ..batch.workspace import Workspace
 from ..cleaning.clean_scan import CleanScanConfig
 from ..cli import MM, Output, Person, SetArg
 from ..console import Metric, Outcome, bar, say
+from ..dataset import RegisteredSet
 from ..geometry.mesh import Mesh
-from ..judgement import Judgement, judge_many
 from .again import LISTED, Call
-from .figures import UNSEEN, Limits, Verdict
-from .page import PAGE, judge_set, write_set_page
+from .figures import Limits, Verdict
+from .page import PAGE, judge_set, judge_whole, write_set_page
 from .prepare import PrepareConfig, Prepared, Progress, prepare
 from .scans import ScanTask
 
@@ -66,7 +66,7 @@ def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], 
     verdicts = judge_set(space.folder)
     return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(verdicts),
                                   Metric("unit assumed", call.config.scan.unit or "m")],
-                   {"prepare": call.config}, list(done.failures), judgement=_of_set(verdicts),
+                   {"prepare": call.config}, list(done.failures), judgement=judge_whole(done.registered, verdicts),
                    following=f"open {space.folder / 'report.html'}, then "
                              f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
@@ -83,20 +83,8 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B00
         write_set_page(registered, limits, to=staged.folder)
     say(f"written: {registered / PAGE}")
     verdicts = judge_set(registered, limits)
-    return Outcome(None, _quality(verdicts), {"limits": limits}, judgement=_of_set(verdicts, limits))
-
-
-def _of_set(verdicts: Sequence[Verdict], limits: Limits | None = None) -> Judgement:
-    """What a set is worth: the verdicts on its scans, and whether most of what lies on them has data.
-
-    No scan is blamed for what all lack. Of twenty real people seen from the front 16 are good by themselves, though a
-    limb of every second man is more than 45 mm off, where nothing was seen.
-    """
-    unseen = [1 - verdict.figures.seen for verdict in verdicts if verdict.figures is not None]
-    usual, most = float(np.median(unseen)) if unseen else 0.0, UNSEEN + (limits or Limits()).unseen
-    lacking = [f"{100 * usual:.0f}% of a body has no data in these scans: what is there is a guess"] if usual > most \
-        else []
-    return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).joined(Judgement.of(check=lacking))
+    return Outcome(None, _quality(verdicts), {"limits": limits},
+                   judgement=judge_whole(RegisteredSet.load(registered), verdicts, limits))
 
 
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:

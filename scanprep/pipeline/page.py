@@ -14,6 +14,7 @@ from ..dataset import RegisteredSet, SetEntry
 from ..geometry import rotations
 from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
+from ..judgement import Judgement, judge_many
 from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around
 from ..pictures.page import Page, data_uri
@@ -21,7 +22,8 @@ from ..pictures.scene import Pane, carried, small_scene, worst_that_turn
 from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
 from ..registration.nonrigid import Registration
-from .figures import Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
+from ..skeleton.names import skeleton_doubts
+from .figures import UNSEEN, Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
 WIDTH, HEIGHT, TALL = 150, 216, 300
@@ -41,6 +43,7 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     size = size_of(whole.template)
     entries = {entry.name: entry for entry in whole.entries}
     page = Page(f"Scans of {folder.absolute().name}", _lead(verdicts))
+    page.verdict(judge_whole(whole, verdicts, limits))
     page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
     page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
@@ -68,6 +71,20 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
     figures = [f for f in read_figures(folder) if f.name in whole.names]
     return review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits,
                   read_doubts(folder))
+
+
+def judge_whole(registered: RegisteredSet, verdicts: Sequence[Verdict], limits: Limits | None = None) -> Judgement:
+    """What a set is worth: its scans, whether most of what lies on them has data, and joints that a person lacks.
+
+    No scan is blamed for what all lack. Of twenty real people seen from the front 16 are good by themselves, though a
+    limb of every second man is more than 45 mm off, where nothing was seen.
+    """
+    unseen = [1 - verdict.figures.seen for verdict in verdicts if verdict.figures is not None]
+    usual, most = float(np.median(unseen)) if unseen else 0.0, UNSEEN + (limits or Limits()).unseen
+    doubts = [f"{100 * usual:.0f}% of a body has no data in these scans: what is there is a guess"] if usual > most \
+        else []
+    doubts += skeleton_doubts(registered.skeleton) if registered.skeleton is not None else []
+    return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).joined(Judgement.of(check=doubts))
 
 
 def _lead(verdicts: Sequence[Verdict]) -> str:

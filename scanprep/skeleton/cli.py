@@ -16,6 +16,7 @@ from ..judgement import Judgement
 from ..ranges import Signed
 from .edit import apply_edits, read_edits
 from .find import SkeletonSearch, search_skeleton, skeleton_problem
+from .names import skeleton_doubts
 from .parts import SkeletonConfig
 from .tree import Skeleton
 
@@ -44,7 +45,7 @@ def skeleton(poses: PosesArg, output: Output, template: Path | None = None,
     search.skeleton.save(output)
     return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(search.skeleton.parents)),
                             *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config},
-                   judgement=Judgement.of(skeleton_problem(search, config.parts)))
+                   judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(search.skeleton)))
 
 
 def _facts(search: SkeletonSearch) -> list[Metric]:

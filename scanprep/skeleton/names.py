@@ -6,20 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.mesh import Mesh
+from .roles import missing_joints
 from .symmetry import Symmetry
 from .tree import Skeleton
 
 ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
 LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
+FAR = 0.6                            # of a limb: elbows and knees are at 0.41 to 0.44, wrists and ankles at 0.75 to 0.81
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
     """Names of the parts of a person: pelvis, abdomen, chest, head, upper_arm_left, ..., foot_right.
 
-    A body counts as a person if it is symmetric with a tree that is, the parts in the middle form one chain that
-    ends in a head, one pair of limbs hangs at its other end and one further up, every limb is a chain, and the legs go
-    on where the trunk ends, as on somebody who stands. Left and right follow from the feet, whose soles are taken to
-    reach forward from the ankles. Any other body keeps the names it has.
+    A body counts as a person if it is symmetric with a tree that is, the parts in the middle form one chain, one pair
+    of limbs hangs at its lower end and one further up, every limb is a chain, and the legs go on where the trunk ends,
+    as on somebody who stands. Beyond the arms the chain ends in a head; a head that was never seen to move is in the
+    chest. Left and right follow from the feet, whose soles are taken to reach forward from the ankles. Any other body
+    keeps the names it has.
     """
     person = _person(template, skeleton, symmetry) if symmetry.holds else None
     if person is None:
@@ -31,19 +34,26 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
     for limbs, kinds, first in ((person.arms, ARM, "shoulder"), (person.legs, LEG, "hip")):
         for limb in limbs:
             side = "left" if (_middle(template, skeleton, limb) - person.centre) @ left > 0 else "right"
-            for part, name in zip(limb, _limb_names(skeleton, limb, kinds, first), strict=True):
+            for part, name in zip(limb, _limb_names(template, skeleton, limb, kinds, first), strict=True):
                 names[part] = f"{name}_{side}"
     return tuple(names[p] for p in range(len(skeleton.parents)))
 
 
+def skeleton_doubts(skeleton: Skeleton) -> list[str]:
+    """What a person's skeleton lacks, as reasons of a judgement; none of a body that is no person."""
+    missing = missing_joints(skeleton.names, skeleton.joints)
+    return [f"the skeleton has no joint at the {', '.join(missing)}: add scans in which they bend"] if missing else []
+
+
 @dataclass(frozen=True, eq=False)
 class _Person:
-    """The chain in the middle, pelvis first, the limbs as chains of parts, the way up and the middle of the pelvis."""
+    """The chain in the middle, pelvis first, the limbs as chains of parts, the way up and the middle of the hips."""
 
     spine: list[int]
     arms: list[list[int]]
     legs: list[list[int]]
     chest: int
+    has_head: bool                       # a part of its own at the end of the chain
     up: np.ndarray
     centre: np.ndarray
 
@@ -68,25 +78,32 @@ def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person |
     middle = [p for p in range(len(partner)) if partner[p] == p]
     along = {p: [q for q in near[p] if partner[q] == q] for p in middle}
     limbs = [(p, chain) for p in middle for q in near[p] if partner[q] != q and (chain := _chain(near, p, q))]
-    hung = {p for p, _ in limbs}
-    tips = [p for p in middle if len(along[p]) == 1 and p not in hung]
-    if (len(limbs) != 4 or len(tips) != 1 or max(len(q) for q in along.values()) > 2
+    if (len(limbs) != 4 or max(len(q) for q in along.values()) > 2
             or len(middle) + sum(len(chain) for _, chain in limbs) != len(partner)):
         return None
-    spine = _chain(along, -1, tips[0])[::-1]                                  # from the far end to the head
-    reach = [spine.index(p) for p, _ in limbs]
-    neck = _joint(skeleton, spine[-1], spine[-2])
+
+    # The chain in the middle from the legs to the head, and which limbs are legs: those far from the neck
+    heads = [p for p in middle if len(along[p]) < 2 and p not in {q for q, _ in limbs}]
+    if len(heads) > 1:
+        return None
     roots = np.array([_joint(skeleton, chain[0], p) for p, chain in limbs])
-    order = np.lexsort((-np.linalg.norm(roots - neck, axis=1), reach))    # legs first: far from the neck
+    if heads:
+        spine = _chain(along, -1, heads[0])[::-1]
+        neck = _joint(skeleton, spine[-1], spine[-2])
+        order = np.lexsort((-np.linalg.norm(roots - neck, axis=1), [spine.index(p) for p, _ in limbs]))
+    else:                                                                 # without one, the heavier limbs
+        order = np.argsort([-_points(template, skeleton, chain)[1].sum() for _, chain in limbs])
+        spine = _chain(along, -1, limbs[order[0]][0])
+        neck = roots[order[2:]].mean(axis=0)
     legs, arms = [limbs[i][1] for i in order[:2]], [limbs[i][1] for i in order[2:]]
-    if {partner[legs[0][0]], partner[arms[0][0]]} != {legs[1][0], arms[1][0]} or min(reach) != 0:
+    if {partner[legs[0][0]], partner[arms[0][0]]} != {legs[1][0], arms[1][0]} or limbs[order[0]][0] != spine[0]:
         return None
     hips = roots[order[:2]].mean(axis=0)
     up = (neck - hips) / np.linalg.norm(neck - hips)
-    down = np.mean([_end(template, skeleton, leg) for leg in legs], axis=0) - hips
+    down = np.mean([_bones(template, skeleton, leg)[-1] for leg in legs], axis=0) - hips
     if down @ up > -0.7 * np.linalg.norm(down):                           # the legs do not go on where the trunk ends
         return None
-    return _Person(spine, arms, legs, limbs[order[2]][0], up, hips)
+    return _Person(spine, arms, legs, limbs[order[2]][0], bool(heads), up, hips)
 
 
 def _neighbours(skeleton: Skeleton) -> dict[int, list[int]]:
@@ -125,12 +142,12 @@ def _middle(template: Mesh, skeleton: Skeleton, parts: list[int]) -> np.ndarray:
     return areas @ points / areas.sum()
 
 
-def _end(template: Mesh, skeleton: Skeleton, limb: list[int]) -> np.ndarray:
-    """The point of a limb's last part farthest from where the limb begins."""
+def _bones(template: Mesh, skeleton: Skeleton, limb: list[int]) -> np.ndarray:
+    """(n + 1, 3): where each part of a limb begins, and the point of the last that is farthest from the first."""
+    trunk = next(q for q in _neighbours(skeleton)[limb[0]] if q not in limb)
+    places = [_joint(skeleton, a, b) for a, b in zip(limb, [trunk, *limb], strict=False)]
     points, _ = _points(template, skeleton, limb[-1:])
-    parent = skeleton.parents[limb[0]]
-    start = skeleton.joints[limb[0]] if parent not in limb else _middle(template, skeleton, limb[:1])
-    return points[np.linalg.norm(points - start, axis=1).argmax()]
+    return np.array([*places, points[np.linalg.norm(points - places[0], axis=1).argmax()]])
 
 
 def _left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | None:
@@ -153,22 +170,25 @@ def _left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | N
 
 def _spine_names(person: _Person) -> list[str]:
     chest = person.spine.index(person.chest)
-    beyond = len(person.spine) - chest - 2                                    # between chest and head
     trunk = (["trunk"] if chest == 0 else
              ["pelvis", *([] if chest == 1 else ["abdomen"] if chest == 2 else
                           [f"abdomen{k}" for k in range(1, chest)]), "chest"])
+    if not person.has_head:
+        return trunk
+    beyond = len(person.spine) - chest - 2                                    # between chest and head
     return [*trunk, *([] if beyond == 0 else ["neck"] if beyond == 1 else [f"neck{k + 1}" for k in range(beyond)]),
             "head"]
 
 
-def _limb_names(skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str, ...]], first: str) -> tuple[str, ...]:
+def _limb_names(template: Mesh, skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str, ...]], first: str
+                ) -> tuple[str, ...]:
     """Names from the body outwards; limbs with more segments than are known are numbered."""
     n = len(limb)
-    places = [_joint(skeleton, a, b) for a, b in zip(limb[1:], limb, strict=False)]
-    if n in (3, 4) and len(places) > 1 and skeleton.parents[limb[0]] not in limb:
-        lengths = np.linalg.norm(np.diff([skeleton.joints[limb[0]], *places], axis=0), axis=1)
-        if lengths[0] < 0.45 * lengths[1]:                  # so short it is a shoulder or hip, no upper arm or thigh
-            return first, *kinds[n - 1]
+    lengths = np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1)
+    if n in (3, 4) and lengths[0] < 0.45 * lengths[1]:      # so short it is a shoulder or hip, no upper arm or thigh
+        return first, *_limb_names(template, skeleton, limb[1:], kinds, first)
+    if n == 2 and lengths[0] > FAR * lengths.sum():         # the knee was never seen to bend, the ankle was
+        return kinds[1][0], kinds[3][-1]
     if n in kinds:
         return kinds[n]
     whole = kinds[1][0]

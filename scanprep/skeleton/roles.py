@@ -117,6 +117,24 @@ def numbered_roles(names: Sequence[str], joints: np.ndarray) -> dict[str, int]:
     return roles
 
 
+def missing_joints(names: Sequence[str], joints: np.ndarray) -> list[str]:
+    """The joints of people, in words, that a person's skeleton has not; none for a body that is no person.
+
+    Parameters
+    ----------
+    names : names of the J parts
+    joints : (J, 3) float, metres, at rest
+    """
+    roles = numbered_roles(names, joints)
+    if not set(NEEDED) <= set(roles):
+        return []
+    missing = [] if "skullbase" in roles else ["neck"]
+    for name in ("elbow", "wrist", "knee", "ankle"):
+        sides = [side for side in ("left", "right") if f"{side[0]}_{name}" not in roles]
+        missing += [f"{name}s"] if len(sides) == 2 else [f"{sides[0]} {name}"] if sides else []
+    return missing
+
+
 def _pieces(joints: np.ndarray, starts: range) -> tuple[int, int, int]:
     """Which joints (n, 3) of a limb begin its upper piece, its lower piece and its end."""
     along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(joints, axis=0), axis=1))]

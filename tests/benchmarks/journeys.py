@@ -37,7 +37,7 @@ MM = 1000.0
 CLICKED = {"left hand": "left middle finger", "right hand": "right middle finger", "left foot": "left toe",
            "right foot": "right toe", "left elbow": "left elbow outside", "right elbow": "right elbow outside",
            "left knee": "left knee", "right knee": "right knee", "crown": "top of head", "navel": "navel"}
-POSES, PEOPLE = 6, 3                 # as few as README's figures allow: five poses show a skeleton
+POSES, PEOPLE = 8, 3                 # as few as README allows: they bend every joint
 BEST = "2024.05.01 anna rest"
 
 
