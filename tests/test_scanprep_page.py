@@ -13,7 +13,6 @@ from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.judgement import Judgement
 from scanprep.pipeline import page as pictures
-from scanprep.pipeline.cli import _of_set
 from scanprep.pipeline.figures import (
     Limits,
     ScanFigures,
@@ -25,7 +24,7 @@ from scanprep.pipeline.figures import (
     write_failures,
     write_figures,
 )
-from scanprep.pipeline.page import write_set_page
+from scanprep.pipeline.page import judge_whole, write_set_page
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration.limbs import Doubt
@@ -172,8 +171,8 @@ def test_scans_from_one_side_are_not_blamed_for_it():
     front = [replace(GOOD, name=f"front{k}", seen=0.4) for k in range(5)]
     verdicts = review(front, {}, 1.4, 25_000)
     assert not any(v.suspect for v in verdicts)
-    assert _of_set(verdicts).reasons == ("60% of a body has no data in these scans: what is there is a guess",)
-    assert _of_set(review([replace(f, seen=0.8) for f in front], {}, 1.4, 25_000)).verdict == "good"
+    assert judge_whole(verdicts, None).reasons == ("60% of a body has no data in these scans: what is there is a guess",)
+    assert judge_whole(review([replace(f, seen=0.8) for f in front], {}, 1.4, 25_000), None).verdict == "good"
 
 
 def test_stretches_of_a_known_map(template):

@@ -30,7 +30,7 @@ def figures(demo: Demo) -> list[Metric]:
 def judge(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
     """What each result says of itself, whether it came near the truth, and whether parts have the names of exports."""
     folder = demo.folder / "set"
-    set_of_scans = judge_whole(RegisteredSet.load(folder), judge_set(folder))
+    set_of_scans = judge_whole(judge_set(folder), RegisteredSet.load(folder).skeleton)
     motion = Judgement.of(check=motion_doubts([demo.motion], [demo.walk[0]], demo.template))
     of_results = judge_many({"registration": set_of_scans, "model": judge_model(demo.model),
                              "completion": demo.completion.judgement, "animation": motion})

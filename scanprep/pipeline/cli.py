@@ -66,7 +66,7 @@ def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], 
     verdicts = judge_set(space.folder)
     return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(verdicts),
                                   Metric("unit assumed", call.config.scan.unit or "m")],
-                   {"prepare": call.config}, list(done.failures), judgement=judge_whole(done.registered, verdicts),
+                   {"prepare": call.config}, list(done.failures), judgement=judge_whole(verdicts, done.registered.skeleton),
                    following=f"open {space.folder / 'report.html'}, then "
                              f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
@@ -84,7 +84,7 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B00
     say(f"written: {registered / PAGE}")
     verdicts = judge_set(registered, limits)
     return Outcome(None, _quality(verdicts), {"limits": limits},
-                   judgement=judge_whole(RegisteredSet.load(registered), verdicts, limits))
+                   judgement=judge_whole(verdicts, RegisteredSet.load(registered).skeleton, limits))
 
 
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:

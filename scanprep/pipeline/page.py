@@ -23,6 +23,7 @@ from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_c
 from ..pictures.sheets import webp_bytes
 from ..registration.nonrigid import Registration
 from ..skeleton.names import skeleton_doubts
+from ..skeleton.tree import Skeleton
 from .figures import UNSEEN, Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
@@ -43,7 +44,7 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     size = size_of(whole.template)
     entries = {entry.name: entry for entry in whole.entries}
     page = Page(f"Scans of {folder.absolute().name}", _lead(verdicts))
-    page.verdict(judge_whole(whole, verdicts, limits))
+    page.verdict(judge_whole(verdicts, whole.skeleton, limits))
     page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
     page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
@@ -73,7 +74,7 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
                   read_doubts(folder))
 
 
-def judge_whole(registered: RegisteredSet, verdicts: Sequence[Verdict], limits: Limits | None = None) -> Judgement:
+def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: Limits | None = None) -> Judgement:
     """What a set is worth: its scans, whether most of what lies on them has data, and joints that a person lacks.
 
     No scan is blamed for what all lack. Of twenty real people seen from the front 16 are good by themselves, though a
@@ -83,7 +84,7 @@ def judge_whole(registered: RegisteredSet, verdicts: Sequence[Verdict], limits: 
     usual, most = float(np.median(unseen)) if unseen else 0.0, UNSEEN + (limits or Limits()).unseen
     doubts = [f"{100 * usual:.0f}% of a body has no data in these scans: what is there is a guess"] if usual > most \
         else []
-    doubts += skeleton_doubts(registered.skeleton) if registered.skeleton is not None else []
+    doubts += skeleton_doubts(skeleton) if skeleton is not None else []
     return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).joined(Judgement.of(check=doubts))
 
 

@@ -12,7 +12,7 @@ from .tree import Skeleton
 
 ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
 LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
-FAR = 0.6                            # of a limb: elbows and knees are at 0.41 to 0.44, wrists and ankles at 0.75 to 0.81
+FAR = 0.6                            # of a limb: elbows and knees are at 0.41 to 0.44, wrists, ankles at 0.75 to 0.81
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
