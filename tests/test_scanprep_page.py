@@ -171,7 +171,8 @@ def test_scans_from_one_side_are_not_blamed_for_it():
     front = [replace(GOOD, name=f"front{k}", seen=0.4) for k in range(5)]
     verdicts = review(front, {}, 1.4, 25_000)
     assert not any(v.suspect for v in verdicts)
-    assert judge_whole(verdicts, None).reasons == ("60% of a body has no data in these scans: what is there is a guess",)
+    said = "60% of a body has no data in these scans: what is there is a guess"
+    assert judge_whole(verdicts, None).reasons == (said,)
     assert judge_whole(review([replace(f, seen=0.8) for f in front], {}, 1.4, 25_000), None).verdict == "good"
 
 

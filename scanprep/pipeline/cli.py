@@ -66,7 +66,8 @@ def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], 
     verdicts = judge_set(space.folder)
     return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(verdicts),
                                   Metric("unit assumed", call.config.scan.unit or "m")],
-                   {"prepare": call.config}, list(done.failures), judgement=judge_whole(verdicts, done.registered.skeleton),
+                   {"prepare": call.config}, list(done.failures),
+                   judgement=judge_whole(verdicts, done.registered.skeleton),
                    following=f"open {space.folder / 'report.html'}, then "
                              f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
