@@ -183,13 +183,10 @@ def _spine_names(person: _Person) -> list[str]:
 def _limb_names(template: Mesh, skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str, ...]], first: str
                 ) -> tuple[str, ...]:
     """Names from the body outwards; limbs with more segments than are known are numbered."""
-    n = len(limb)
-    lengths = np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1)
-    if n in (3, 4) and lengths[0] < 0.45 * lengths[1]:      # so short it is a shoulder or hip, no upper arm or thigh
-        return first, *_limb_names(template, skeleton, limb[1:], kinds, first)
-    if n == 2 and lengths[0] > FAR * lengths.sum():         # the knee was never seen to bend, the ankle was
-        return kinds[1][0], kinds[3][-1]
-    if n in kinds:
-        return kinds[n]
-    whole = kinds[1][0]
-    return tuple(f"{whole}{k + 1}" for k in range(n))
+    lengths, lead = np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1), ()
+    if len(limb) in (3, 4) and lengths[0] < 0.45 * lengths[1]:          # too short for an upper arm or thigh
+        lengths, lead = lengths[1:], (first,)
+    n, whole = len(lengths), kinds[1][0]
+    if n == 2 and lengths[0] > FAR * lengths.sum():                     # the knee was never seen to bend, the ankle was
+        return *lead, whole, kinds[3][-1]
+    return (*lead, *kinds[n]) if n in kinds else tuple(f"{whole}{k + 1}" for k in range(n))
