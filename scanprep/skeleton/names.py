@@ -183,7 +183,8 @@ def _spine_names(person: _Person) -> list[str]:
 def _limb_names(template: Mesh, skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str, ...]], first: str
                 ) -> tuple[str, ...]:
     """Names from the body outwards; limbs with more segments than are known are numbered."""
-    lengths, lead = np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1), ()
+    lengths = np.linalg.norm(np.diff(_bones(template, skeleton, limb), axis=0), axis=1)
+    lead: tuple[str, ...] = ()
     if len(limb) in (3, 4) and lengths[0] < 0.45 * lengths[1]:          # too short for an upper arm or thigh
         lengths, lead = lengths[1:], (first,)
     n, whole = len(lengths), kinds[1][0]
