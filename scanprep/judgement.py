@@ -39,9 +39,10 @@ class Judgement:
 
     @staticmethod
     def of(failed: str | Iterable[str] | None = None, check: Iterable[str] = ()) -> Judgement:
-        """The judgement from reasons why a result failed, and reasons to look at it."""
-        grave = (failed,) if isinstance(failed, str) else tuple(failed or ())
-        light = tuple(check)
+        """The judgement from reasons why a result failed, and reasons to look at it; each reason once."""
+        # "; " stands between reasons in one line, so never within one: what follows it there is the cause
+        grave, light = (tuple(dict.fromkeys(reason.replace("; ", ": ") for reason in reasons)) for reasons in
+                        ((failed,) if isinstance(failed, str) else failed or (), check))
         return Judgement("failed" if grave else "check" if light else "good", (*grave, *light))
 
     @staticmethod
@@ -87,7 +88,7 @@ def judge_many(results: Mapping[str, Judgement], failures: int = 0) -> Judgement
     failed = failures + sum(one.verdict == "failed" for one in bad.values())
     gravest = sorted(bad.items(), key=lambda item: item[1].verdict != "failed")
     reasons = [f"{name}: {one.reasons[0]}" for name, one in gravest[:NAMED]]
-    reasons += [f"{len(bad) - NAMED} more of {len(results)} are to be looked at"] if len(bad) > NAMED else []
+    reasons += [f"{len(bad) - NAMED} more of {len(results)} to be looked at"] if len(bad) > NAMED else []
     if failed:
         reasons.insert(0, f"{failed} of {len(results) + failures} failed")
     whole = failed == len(results) + failures
@@ -124,8 +125,10 @@ def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judge
     problems, doubts = [], []
     for path in dict.fromkeys(inputs):
         one = read_judgement(path)
-        problems += [f"{path}: its own report says that it failed: {one.why}"] if one and one.problems else []
-        doubts += [f"{path}: its own report says to look at it: {one.why}"] if one and one.doubts else []
+        problems += [f"{path}: its own report says that it failed: {', '.join(one.reasons)}"] \
+            if one and one.problems else []
+        doubts += [f"{path}: its own report says to look at it: {', '.join(one.reasons)}"] \
+            if one and one.doubts else []
         within = {p.parent.name: read_judgement(p.parent) for p in sorted(path.glob("*/report.json"))} \
             if one is None and path.is_dir() else {}
         known = {name: judgement for name, judgement in within.items() if judgement is not None}
@@ -134,7 +137,8 @@ def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judge
         doubts += [f"{path}: {reason}" for reason in told.doubts]
     for path in dict.fromkeys(used):
         one = read_judgement(path)
-        problems += [f"{path}: its own report says that it failed: {one.why}"] if one and one.problems else []
+        problems += [f"{path}: its own report says that it failed: {', '.join(one.reasons)}"] \
+            if one and one.problems else []
     return Judgement.of(problems, doubts)
 
 
@@ -169,7 +173,8 @@ def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray
         if not ANY_BUILD[0] <= build <= ANY_BUILD[1]:
             failed.append(f"{words}, as nobody has: {cause or 'something else than a person, or several?'}")
         elif not BUILD[0] <= build <= BUILD[1] or (stature >= ADULTS[0] and not VOLUMES[0] <= volume <= VOLUMES[1]):
-            check.append(f"{words}: {cause or 'clothes, a second person, or the wrong scale?'}")
+            much = "clothes, a second person, or the wrong scale?"
+            check.append(f"{words}: {cause or (much if build > BUILD[0] else 'flattened, or a part of a person?')}")
     if betas is not None and len(betas):
         length, usual = float(np.linalg.norm(betas)), float(np.sqrt(len(betas)))
         words = f"the shape is {length:.0f} standard deviations from the mean, {usual:.0f} are usual"

@@ -252,7 +252,7 @@ def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out():
     floating[3] += [0.0, 0.0, 0.3]
     found = worn_otherwise(3, sequence(floating).positions[:, 3])
     assert found.worn.unplaced == ("M03",) and not found.worn.moved and not found.worn.exchanged
-    assert "M03" not in found.layout.labels and "M03" in found.worn.doubts()[0]
+    assert "M03" not in found.layout.labels and "M03" in found.worn.doubts(found.layout.labels)[0]
     assert np.nanmean(found.motions[0].residuals) < 5e-3
     np.testing.assert_allclose(found.betas, beside().betas, atol=0.35)
 

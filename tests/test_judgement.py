@@ -418,7 +418,7 @@ def test_many_results_are_as_good_as_the_worst_of_them():
     (1.75, 75, 2.0, "good", ""), (1.50, 45, 4.0, "good", ""), (2.00, 140, 4.0, "good", ""),
     (2.61, 290, 20.0, "failed", "scale"), (4.04, 1150, 46.0, "failed", "scale"), (0.93, 12, 6.0, "failed", "scale"),
     (1.20, 25, 5.0, "check", "child"), (2.20, 120, 5.0, "check", "giant"), (1.75, 190, 5.0, "check", "second person"),
-    (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 14.0, "check", "standard deviations"),
+    (1.75, 30, 5.0, "check", "flattened"), (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 14.0, "check", "standard deviations"),
     (1.75, 75, 20.0, "failed", "scale")])
 def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
     found = beyond_people(stature, volume, np.eye(18)[0] * betas)
@@ -441,6 +441,15 @@ def test_time_that_is_told_wrongly_is_seen_in_the_speed_of_markers():
     assert told.endswith("frames in another order, or the wrong rate?")
     off = SimpleNamespace(residuals=motion.residuals + 0.02 * size(model.template), distrusted=(), labels=LABELS)
     assert "mm from where the body has them" in motion_doubts([off], [markers], model.template)[0]
+    lost = Motion(np.zeros((len(markers.positions), 1, 3)), np.zeros((len(markers.positions), 3)), None, 300.0,
+                  np.full(markers.positions.shape[:2], 0.5), LABELS)
+    told = motion_problem(lost, model.template, layout, dataclasses.replace(markers, rate=300.0))
+    assert told.endswith("the wrong rate?")                    # not swapped labels
+
+
+def test_a_reason_stays_one_when_it_is_read_again():
+    told = Judgement.of("the markers are 117 mm off; labels swapped?", ["look", "look"])
+    assert told.reasons == ("the markers are 117 mm off: labels swapped?", "look") and Judgement.read(str(told)) == told
 
 
 def test_a_second_person_is_no_furniture():

@@ -190,7 +190,7 @@ FLAT = Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1, 0]], [[0, 1, 2], [0, 2, 3]]
 
 @pytest.mark.parametrize(("mesh", "says"), [
     (Mesh(np.eye(3), np.zeros((0, 3))), "no triangles"),
-    (Mesh(np.r_[ball().vertices, [[1, 1, 1]]], ball().faces), "1 vertices belong to no triangle"),
+    (Mesh(np.r_[ball().vertices, [[1, 1, 1]]], ball().faces), "1 vertex belongs to no triangle"),
     (Mesh(np.r_[ball().vertices, ball().vertices + 3], np.r_[ball().faces, ball().faces + 162]), "2 components"),
     (Mesh(grid().vertices, np.r_[grid().faces, grid().faces[:1, [1, 2, 0]]]), "twice"),
     (FLAT, "no area, the first is face 0"),

@@ -124,13 +124,13 @@ def test_a_header_as_blender_2_4_wrote_it(tmp_path):
 def test_a_polygon_that_folds_over_is_told(tmp_path):
     corners = "v 0 0 0\nv 1 0 0\nv 0.1 0.1 0\nv 0 1 0\nv 2 2 0\n"
     (tmp_path / "a.obj").write_text(corners + "f 5 4 3 2\nf 2 3 4 1\nf 1 2 3 4\n")
-    with pytest.warns(UserWarning, match=r"a\.obj: 1 polygons fold over .* the first is face 1"):
+    with pytest.warns(UserWarning, match=r"a\.obj: 1 polygon folds over .* the first is face 1"):
         read_mesh(tmp_path / "a.obj")
 
 
 def test_several_objects_are_named(tmp_path):
     (tmp_path / "a.obj").write_text("o body\n" + CUBE + "o no faces\no left eye\nv 3 3 3\nf 1 2 9\n")
-    with pytest.warns(UserWarning, match=r"2 objects .* one mesh: body \(12 triangles\), left eye \(1 triangles\)"):
+    with pytest.warns(UserWarning, match=r"2 objects .* one mesh: body \(12 triangles\), left eye \(1 triangle\)"):
         read_mesh(tmp_path / "a.obj")
     trimesh.Scene({"body": BALL, "hat": trimesh.creation.box()}).export(tmp_path / "a.glb")
     with pytest.warns(UserWarning, match=r"2 objects .* one mesh: body \(320 triangles\), hat \(12 triangles\)"):

@@ -98,16 +98,16 @@ def test_triangles_that_are_no_surface_go(person):
     a, b, _ = person.faces[5]
     flap = Mesh(np.vstack([person.vertices, person.vertices[a] + 0.01]),
                 np.vstack([person.faces, [a, b, N], [b, a, N]]))
-    assert np.array_equal(told(flap, "1 flaps dropped").faces, person.faces)
+    assert np.array_equal(told(flap, "1 flap dropped").faces, person.faces)
     hanging = Mesh(np.vstack([person.vertices, person.vertices[[a, b]] + 0.01]),
                    np.vstack([person.faces, [a, N, N + 1], [N, a, N + 1]]))
-    assert np.array_equal(told(hanging, "1 flaps dropped").faces, person.faces)
+    assert np.array_equal(told(hanging, "1 flap dropped").faces, person.faces)
     again = Mesh(person.vertices, np.vstack([person.faces, np.roll(person.faces[:30], 1, axis=1)]))
     assert np.array_equal(told(again, "30 repeated triangles dropped").faces, person.faces)
     both = Mesh(person.vertices, np.vstack([person.faces, person.faces[:, ::-1]]))
-    assert np.array_equal(told(both, f"{F} triangles of two-sided surfaces dropped").faces, person.faces)
+    assert np.array_equal(told(both, f"{F:,} triangles of two-sided surfaces dropped").faces, person.faces)
     own = Mesh(np.tile(person.vertices, (2, 1)), np.vstack([person.faces, N + person.faces[:, ::-1]]))
-    assert np.array_equal(told(own, f"{F} triangles of two-sided surfaces dropped").faces, person.faces)
+    assert np.array_equal(told(own, f"{F:,} triangles of two-sided surfaces dropped").faces, person.faces)
 
 
 def test_every_point_of_a_target_has_a_normal_where_triangles_cancel(person):

@@ -11,6 +11,7 @@ import numpy as np
 from model.body import BodyModel
 from model.measurement.marks import MEASURED
 from model.measurement.tapes import Tapes
+from model.people import stature_and_volume
 from model.posing.cli import read_subject
 from scanprep.cli import Unit
 from scanprep.console import bar
@@ -19,7 +20,9 @@ from scanprep.geometry.files import list_meshes, name_of, read_mesh
 from scanprep.geometry.landmark_names import known_landmarks
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import beyond_people
 from scanprep.registration.person import find_landmarks
+from scanprep.words import number_of
 
 from ..partial.completion import load_completion
 from ..viewing.kinds import reported_model
@@ -131,13 +134,14 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
         found = find_landmarks(template, known, progress)
     more = {name: found[name] for name in lacking if name in found}
     if not more and not known:
-        raise ValueError("measuring begins at landmarks of the template, and there are none, nor does the average "
-                         "person come to lie on it; name a file of them with --landmarks (scape pick makes one), or "
-                         "a model that keeps them with -m")
+        size = beyond_people(*stature_and_volume(template)).reasons
+        raise ValueError("".join(f"{reason}; " for reason in size[:1]) + "measuring begins at landmarks of the "
+                         "template, and there are none, nor does the average person come to lie on it; name a file of "
+                         "them with --landmarks (scape pick makes one), or a model that keeps them with -m")
     if more:
-        warnings.warn(f"{len(more)} landmarks of the template that measuring begins at were found with the average "
-                      "person, a few centimetres from where you would click them; to place one yourself, click it "
-                      f"with scape pick under its name: {', '.join(more)}", stacklevel=2)
+        warnings.warn(f"{number_of(len(more), 'landmark was', 'landmarks were')} missing on the template and found "
+                      "with the average person, a few centimetres from where you would click; to place one yourself, "
+                      f"click it with scape pick under its name: {', '.join(more)}", stacklevel=2)
     return template, known | more
 
 

@@ -14,14 +14,17 @@ from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, measure, stands
 from model.measurement.tapes import Tapes
 from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
+from model.people import stature_and_volume
 from model.posing.transfer import own_body
 from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.files import write_mesh
+from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import write_json
 from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement, beyond_people
+from scanprep.words import number_of
 
 from ..cli import ModelOrNone, read_model
 from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
@@ -71,7 +74,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     write_measures(output, names, found)
     measures_page(names, stood, found, tapes).write(output.with_suffix(".html"))
     return Outcome(output, _figures(names, found), {"model": None if named is None else str(named)},
-                   judgement=judged(names, found))
+                   judgement=judged(names, found, [tapes.template.with_vertices(body) for body in stood]))
 
 
 def _measured(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
@@ -112,26 +115,28 @@ def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurement
     write_table(path, ["body", *columns, *(f"{c}_error" for c in columns), "note"], map(line, names, found))
 
 
-def judged(names: Sequence[str], found: Sequence[Measurements]) -> Judgement:
+def judged(names: Sequence[str], found: Sequence[Measurements], bodies: Sequence[Mesh]) -> Judgement:
     """Whether bodies were measured as people are: in the standard pose, completely, and in the right unit."""
     absurd, doubts = list[str](), list[str]()
-    for name, mine in zip(names, found, strict=True):
+    for name, mine, body in zip(names, found, bodies, strict=True):
+        if "stature" in mine.values:
+            known = beyond_people(mine.values["stature"], stature_and_volume(body)[1])
+            absurd += [f"{name}: {reason}" for reason in known.problems]
+            doubts += [f"{name}: {reason}" for reason in known.doubts]
         out = [word for word, value in mine.values.items()
                if not 0.7 * CATALOGUE[word].low <= value <= 1.3 * CATALOGUE[word].high]
         if len(out) > len(mine.values) / 2:
             absurd.append(f"{name}: no person measures so, {out[0]} {mine.values[out[0]]:.3g} m: the wrong unit "
                           "(--unit), or other landmarks?")
         elif out:
-            doubts.append(f"{name}: {out[0]} is {mine.values[out[0]]:.3g} m")
+            usual = CATALOGUE[out[0]]
+            doubts.append(f"{name}: {out[0].replace('_', ' ')} is {MM * mine.values[out[0]]:.0f} mm, people have "
+                          f"{MM * usual.low:.0f} to {MM * usual.high:.0f}: look at its tape on the page")
         doubts += [f"{name}: {turned}; name the model with -m" for turned in mine.turned[:1]]
-        if "stature" in mine.values:
-            known = beyond_people(mine.values["stature"])
-            absurd += [f"{name}: {reason}" for reason in known.problems]
-            doubts += [f"{name}: {reason}" for reason in known.doubts]
         missing = [word for word in mine.missing if word in CATALOGUE]
         if missing:
             doubts.append(f"{name}: no {missing[0].replace('_', ' ')}, {mine.missing[missing[0]]}"
-                          + (f", and {len(missing) - 1} others" if len(missing) > 1 else ""))
+                          + (f", and {number_of(len(missing) - 1, 'other')}" if len(missing) > 1 else ""))
     if absurd and len({line.partition(": ")[0] for line in absurd}) == len(names):
         return Judgement.of(absurd[:TOLD])
     told = [*absurd, *doubts]

@@ -21,6 +21,7 @@ from scanprep.pictures.page import Page, link_to
 from scanprep.pictures.scene import SCENE, worst_that_turn
 from scanprep.pictures.sheets import small_picture
 from scanprep.pipeline.scans import find_scans
+from scanprep.words import number_of
 
 from ..cli import read_model
 from .colors import ColorConfig
@@ -117,7 +118,7 @@ def summary(metrics: Mapping[str, Sequence[Metric]], fresh: int, count: int) -> 
 def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str], folder: Path, call: FolderCall
                 ) -> Page:
     """The page of all scans, worst first; what is told of them lies in the folder."""
-    page = Page(f"{len(metrics)} scans completed", "Worst first; each name leads to the page of its scan.")
+    page = Page(f"{number_of(len(metrics), 'scan')} completed", "Worst first; each name leads to the page of its scan.")
     page.text("To mend some, run the same command with --interactive: it opens these results in the browser, worst "
               f"first (scape complete {call.scans} ... -o {folder} --interactive).")
     if failures:

@@ -10,6 +10,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import heat
 from scanprep.pictures.low_rank import low_rank
 from scanprep.pictures.shading import CLAY, Dots, Moving
+from scanprep.words import number_of
 
 from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion, spread_frames
@@ -82,11 +83,11 @@ def of_markers(name: str, markers: MarkerSequence) -> Content:
     every = every[np.isfinite(every).all(axis=1)]
     every = np.concatenate([every, points])
     dots = replace(marker_dots(markers), labels=markers.labels, color=CLAY)
-    about = f"{len(markers.labels)} markers, {lasting(markers.positions, markers.rate)}"
+    about = f"{number_of(len(markers.labels), 'marker')}, {lasting(markers.positions, markers.rate)}"
     return Content(name, [Moving(dots, markers.positions, markers.rate)], stance.around(every), about,
                    stance.around(points))
 
 
 def lasting(frames: np.ndarray, rate: float) -> str:
     """How long a motion is."""
-    return f"{len(frames):,} frames at {rate:g}/s, {len(frames) / rate:.3g} s"
+    return f"{number_of(len(frames), 'frame')} at {rate:g}/s, {len(frames) / rate:.3g} s"

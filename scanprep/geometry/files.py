@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..words import number_of
 from . import format_draco, format_foreign, format_glb, format_pcd, format_ply, format_stl, format_text, storage
 from .format_common import (
     UNITS,
@@ -139,7 +140,7 @@ def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
         raise MeshFileError(f"{path}: {error}") from None
     mesh = _seamless(path, mesh)
     if len(contents.objects) > 1:
-        told = ", ".join(f"{name} ({count} triangles)" for name, count in contents.objects[:6])
+        told = ", ".join(f"{name} ({number_of(count, 'triangle')})" for name, count in contents.objects[:6])
         more = ", ..." if len(contents.objects) > 6 else ""
         warnings.warn(f"{path}: {len(contents.objects)} objects were taken for one mesh: {told}{more}", stacklevel=2)
     scale = metres_per_unit(path, mesh.vertices, unit)
@@ -349,7 +350,8 @@ def _finite(path: Path, contents: Contents) -> Contents:
     of_file, faces, lost = np.where(finite, np.cumsum(finite) - 1, -1), contents.faces, ""
     if faces is not None:
         kept = finite[faces].all(axis=1)
-        faces, lost = of_file[faces[kept]], f", with {np.count_nonzero(~kept)} triangles" * (not kept.all())
+        faces = of_file[faces[kept]]
+        lost = "" if kept.all() else f", with {number_of(np.count_nonzero(~kept), 'triangle')}"
     warnings.warn(f"{path}: {np.count_nonzero(~finite)} of {len(finite)} points are not finite and were left out{lost}",
                   stacklevel=2)
     colors, normals = (None if values is None else values[finite] for values in (contents.colors, contents.normals))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..words import number_of
 from . import storage
 
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
@@ -192,8 +193,8 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     faces = np.stack([corners[begin + first[of]], corners[begin + (within + 1) % size],
                       corners[begin + (within + 2) % size]], axis=1)
     if vertices is not None and len(folded := _folded(vertices, faces, of)):
-        warnings.warn(f"{path}: {len(folded)} polygons fold over where they are cut into triangles, the first is face "
-                      f"{folded[0]}: cut them in the program they are from", stacklevel=4)
+        warnings.warn(f"{path}: {number_of(len(folded), 'polygon folds', 'polygons fold')} over where cut into "
+                      f"triangles, the first is face {folded[0]}: cut them in the program they are from", stacklevel=4)
     return faces
 
 

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from ..words import number_of
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -245,7 +247,7 @@ def template_problem(mesh: Mesh) -> str | None:
         return "it has no triangles"
     unused = len(mesh.vertices) - len(np.unique(mesh.faces))
     if unused:
-        return f"{unused} vertices belong to no triangle"
+        return f"{number_of(unused, 'vertex belongs', 'vertices belong')} to no triangle"
     components = mesh.vertex_component.max() + 1
     if components > 1:
         sizes = np.bincount(mesh.vertex_component)
@@ -254,7 +256,7 @@ def template_problem(mesh: Mesh) -> str | None:
         return "some triangles appear twice"
     flat = np.flatnonzero(mesh.face_areas < 1e-12)
     if len(flat):
-        return f"{len(flat)} triangles have no area, the first is face {flat[0]}"
+        return f"{number_of(len(flat), 'triangle has', 'triangles have')} no area, the first is face {flat[0]}"
     if not mesh.is_edge_manifold:
         return "it is not manifold: some edges have more than two triangles or triangles facing opposite ways"
     if not mesh.is_vertex_manifold:

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..threads import search_threads
+from ..words import number_of
 from .mesh import Mesh
 from .places import distinct_rows
 from .surface import Rays
@@ -83,7 +84,7 @@ def _surface_triangles(mesh: Mesh) -> tuple[np.ndarray, list[str]]:
     sides = mesh.corners - np.roll(mesh.corners, -1, axis=1)
     longest = np.einsum("fsd,fsd->fs", sides, sides).max(axis=1)
     flat = mesh.face_areas <= FLAT * longest
-    notes = [f"{flat.sum()} triangles without area dropped"] if flat.any() else []
+    notes = [f"{number_of(flat.sum(), 'triangle')} without area dropped"] if flat.any() else []
     group = distinct_rows(np.sort(mesh.faces, axis=1))
     if group is None:
         return ~flat, notes
@@ -100,11 +101,12 @@ def _surface_triangles(mesh: Mesh) -> tuple[np.ndarray, list[str]]:
     flap = np.zeros(len(keep), dtype=bool)
     flap[keep] = two_sided[keep] & ((use > 2).any(axis=1) | (use == 1).all(axis=1))
     reverse = repeated & (odd != odd[group])
-    for what, which in (("repeated triangles dropped", repeated & ~reverse),
-                        ("triangles of two-sided surfaces dropped, one of each pair", reverse & ~flap[group]),
-                        ("flaps dropped, a triangle and its reverse each", flap)):
+    for one, what, which in (
+            ("repeated triangle", "dropped", repeated & ~reverse),
+            ("triangle", "of two-sided surfaces dropped, one of each pair", reverse & ~flap[group]),
+            ("flap", "dropped, a triangle and its reverse each", flap)):
         if which.any():
-            notes.append(f"{which.sum()} {what}")
+            notes.append(f"{number_of(which.sum(), one)} {what}")
     return keep & ~flap, notes
 
 

@@ -12,6 +12,7 @@ from ..geometry import tables
 from ..judgement import Judgement
 from ..ranges import Settings
 from ..registration.limbs import Doubt
+from ..words import number_of
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 CROWDED = 0.3                  # share of a scan off the template that may be a second person, who is half of it
@@ -197,7 +198,7 @@ def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits
             (1 - f.seen - usual) / limits.unseen,
         f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half":
             f.stretch / limits.stretch,
-        f"{f.inverted} triangles inverted": f.inverted / faces / limits.inverted,
+        f"{number_of(f.inverted, 'triangle')} inverted": f.inverted / faces / limits.inverted,
         f"landmarks {1000 * f.landmarks:.0f} mm off": f.landmarks / (limits.landmarks * size),
         "not converged": 0.0 if f.converged else limits.not_converged,
         "nowhere near the scan": 0.0 if f.seen else 100.0,

@@ -24,6 +24,7 @@ from ..pictures.sheets import webp_bytes
 from ..registration.nonrigid import Registration
 from ..skeleton.names import skeleton_doubts
 from ..skeleton.tree import Skeleton
+from ..words import number_of
 from .figures import UNSEEN, Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
@@ -92,7 +93,7 @@ def _lead(verdicts: Sequence[Verdict]) -> str:
     failed = sum(v.failed for v in verdicts)
     suspect = sum(v.suspect and not v.failed for v in verdicts)
     parts = [f"{failed} could not be registered"] * bool(failed) + [f"{suspect} need a look"] * bool(suspect)
-    return f"{len(verdicts)} scans: {', '.join(parts) or 'all within their limits'}."
+    return f"{number_of(len(verdicts), 'scan')}: {', '.join(parts) or 'all within their limits'}."
 
 
 def _summary(verdicts: Sequence[Verdict]) -> list[tuple[str, float, float, str]]:

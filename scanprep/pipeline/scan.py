@@ -24,6 +24,7 @@ from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
 from ..registration.unmarked import register_unmarked
 from ..threads import one_thread
+from ..words import number_of
 from .figures import ScanFigures
 from .scans import ScanTask
 
@@ -136,10 +137,10 @@ def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | 
     """The template on the scan, and what led it there: landmarks, or correspondences, or its pose; that in words."""
     if landmarks is not None or settings.init == "pose":
         return (register(template, scan, landmarks, settings.registration, progress), None,
-                "pose" if landmarks is None else f"{len(landmarks[0])} landmarks")
+                "pose" if landmarks is None else number_of(len(landmarks[0]), "landmark"))
     try:
         fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences, progress)
-        return fit, pairs, f"{len(pairs)} correspondences"
+        return fit, pairs, number_of(len(pairs), "correspondence")
     except ValueError as error:
         raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
 

@@ -36,6 +36,7 @@ from ..judgement import Judgement
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
 from ..repair.manifold import repair
+from ..words import number_of
 from .cloud import read_surface
 from .template import carry_landmarks, make_template, template_of_scan, views_without_cameras
 
@@ -259,7 +260,8 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
             report = fill_report(before, config, progress, seen)
             after, holes = report.mesh, report.holes
     write_mesh(output, after)
-    left_open = [f"{len(after.boundary_loops)} holes are still open"] if len(after.boundary_loops) else []
+    loops = len(after.boundary_loops)
+    left_open = [f"{number_of(loops, 'hole is', 'holes are')} still open"] if loops else []
     return Outcome(output, [
         Metric("holes before", len(before.boundary_loops)),
         *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),

@@ -20,6 +20,7 @@ from ..ranges import Settings
 from ..repair.hole_filling import FillConfig, close
 from ..repair.manifold import drop_thin, repair
 from ..skeleton.symmetry import find_symmetry
+from ..words import number_of
 from .cloud import AWAY, mesh_of_cloud, mesh_of_view
 
 ONE_PIECE = 0.9                        # of the surface of a body that is one mesh hangs together
@@ -76,7 +77,8 @@ class MadeTemplate:
         """What somebody should look at before scans are registered with it."""
         return [*([f"{100 * self.filled:.0f}% of the surface is filled, nothing was scanned there"]
                   if self.filled > MOST_FILLED else []),
-                *([f"the surface is joined to itself in {self.handles} places: thighs, armpits or fingers that touch"]
+                *([f"the surface is joined to itself in {number_of(self.handles, 'place')}: thighs, armpits or "
+                   "fingers that touch"]
                   if self.handles else [])]
 
 
@@ -162,7 +164,7 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     scanned = mesh = smooth(mesh, rounds)                        # smooth rims make fair patches
     holes = len(mesh.boundary_loops)
     if holes:
-        notes.append(f"{holes} holes were filled")
+        notes.append(f"{number_of(holes, 'hole was', 'holes were')} filled")
     tell(2, 4)
     mesh = close(mesh, config.fill)
     mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), rounds)

@@ -21,6 +21,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.sides import other_side
 from ..judgement import extent
 from ..pictures.scene import Pane, pack_scene
+from ..words import number_of
 from .app import Send
 from .clicked import Clicked, Places, camera_like, camera_of, predict_landmarks
 from .landmark_names import next_name
@@ -335,7 +336,7 @@ class PickApp:
             found = predict_landmarks(template, on_template, body, on_scan, tell)
             with self._lock:
                 one.predicted = found
-                return f"{sum(name not in one.places for name in found)} landmarks predicted: confirm or correct"
+                return f"{number_of(len(found.keys() - one.places), 'landmark')} predicted: confirm or correct"
 
         self.beside("looking for the other landmarks", work, send, "the other landmarks could not be predicted")
 

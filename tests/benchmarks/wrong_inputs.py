@@ -25,10 +25,12 @@ from protocols import machine, write_report
 
 from completion.__main__ import main as scape
 from completion.mocap.files.markers import MarkerSequence, write_markers
-from completion.mocap.marker_sets.layout import DISTANCE
+from completion.mocap.marker_sets.named import choose_layout
+from completion.motion import Motion
 from completion.synthetic_people import synthetic_model
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
+from scanprep.geometry.files import read_mesh
 from scanprep.synthetic.people import MARKERS, BodyShape, Person, random_pose, walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
@@ -235,16 +237,14 @@ def measured_cases() -> Iterator[Case]:
         yield Case(f"model mesh: {what}", f"model mesh model.npz --betas {betas} -o out.ply", model_file, wrong)
 
 
-def recording(seed: int) -> MarkerSequence:
-    """A person who walks, 41 markers."""
-    rng = np.random.default_rng([seed, 78])
-    person = Person(BodyShape.random(rng))
-    places, normals = np.array(list(MARKERS.values())), person.mesh
-    out = []
-    for pose, trans in zip(*walk(FRAMES, RATE), strict=True):
-        body = Mesh(person.posed(pose, trans), normals.faces)
-        out.append(body.vertices[places] + DISTANCE * body.vertex_normals[places])
-    return MarkerSequence(np.stack(out) + rng.normal(0, 0.001, (FRAMES, len(places), 3)), tuple(MARKERS), RATE)
+def recording(seed: int) -> tuple[MarkerSequence, np.ndarray]:
+    """A person who walks, with the 41 markers where their layout has them, some on bars; the vertices (T, N, 3)."""
+    rng, model = np.random.default_rng([seed, 78]), synthetic_model()
+    person, kept = Person(BodyShape.random(rng)), np.array(model.info["people_vertices"])
+    bodies = np.stack([person.posed(pose, trans)[kept] for pose, trans in zip(*walk(FRAMES, RATE), strict=True)])
+    layout = choose_layout(model, None, tuple(MARKERS))[0]
+    places = np.stack([layout.place(model.template.with_vertices(body)) for body in bodies])
+    return MarkerSequence(places + rng.normal(0, 0.001, places.shape), layout.labels, RATE), bodies
 
 
 def marker_cases() -> Iterator[Case]:
@@ -254,27 +254,36 @@ def marker_cases() -> Iterator[Case]:
             {"L": "R", "R": "L"}.get(label[0], label[0]) + label[1:] if label not in ("RBAC",) else label
             for label in one.labels), one.rate)
 
-    def changed(how: str, one: MarkerSequence) -> MarkerSequence:
-        rng, p = np.random.default_rng(5), one.positions
-        return {
-            "scaled by 1.6": lambda: MarkerSequence(1.6 * p, one.labels, one.rate),
-            "scaled by 2.54": lambda: MarkerSequence(2.54 * p, one.labels, one.rate),
-            "scaled by 0.5": lambda: MarkerSequence(0.5 * p, one.labels, one.rate),
-            "frames shuffled": lambda: MarkerSequence(p[rng.permutation(len(p))], one.labels, one.rate),
-            "rate ten times": lambda: MarkerSequence(p, one.labels, 10 * one.rate),
-            "left and right exchanged": lambda: swapped(one),
-            "labels shuffled": lambda: MarkerSequence(p, tuple(rng.permutation(one.labels).tolist()), one.rate),
-            "mirrored": lambda: MarkerSequence(p * [-1, 1, 1], one.labels, one.rate),
-            "as it is": lambda: one}[how]()
+    def changed(how: str) -> tuple[MarkerSequence, np.ndarray | None]:
+        """The recording, and the bodies that are right for it all the same."""
+        rng, (one, bodies) = np.random.default_rng(5), recording(500)
+        p, order = one.positions, rng.permutation(len(bodies))
 
-    for verb in ("animate", "mosh"):
+        def of(positions: np.ndarray, rate: float = one.rate) -> MarkerSequence:
+            return MarkerSequence(positions, one.labels, rate)
+
+        return {
+            "scaled by 1.6": (of(1.6 * p), None),
+            "scaled by 2.54": (of(2.54 * p), None),
+            "scaled by 0.5": (of(0.5 * p), None),
+            "frames shuffled": (of(p[order]), bodies[order]),
+            "rate ten times": (of(p, 10 * one.rate), bodies),
+            "left and right exchanged": (swapped(one), bodies),
+            "labels shuffled": (MarkerSequence(p, tuple(rng.permutation(one.labels).tolist()), one.rate), bodies),
+            "mirrored": (of(p * [-1, 1, 1]), None)}[how]
+
+    def put(folder: Path, markers: MarkerSequence, bodies: np.ndarray | None) -> np.ndarray | None:
+        write_markers(folder / "walk.c3d", markers)
+        return bodies
+
+    for verb, body in (("animate", "out/motion.npz"), ("mosh", "out/walk/walk/motion.npz")):
         for how in ("scaled by 1.6", "scaled by 2.54", "scaled by 0.5", "frames shuffled", "rate ten times",
                     "left and right exchanged", "labels shuffled", "mirrored"):
-            yield Case(f"{verb}: {how}", f"{verb} walk.c3d -o out", lambda folder, how=how: write_markers(
-                folder / "walk.c3d", changed(how, recording(500))))
+            yield Case(f"{verb}: {how}", f"{verb} walk.c3d -o out", lambda folder, how=how: put(folder, *changed(how)),
+                       body=body)
         for seed in (510, 511, 512):
-            yield Case(f"{verb}: person {seed}", f"{verb} walk.c3d -o out", lambda folder, seed=seed: write_markers(
-                folder / "walk.c3d", recording(seed)), False)
+            yield Case(f"{verb}: person {seed}", f"{verb} walk.c3d -o out",
+                       lambda folder, seed=seed: put(folder, *recording(seed)), False, body)
 
 
 def run(case: Case, folder: Path) -> dict[str, object]:
@@ -299,11 +308,14 @@ def run(case: Case, folder: Path) -> dict[str, object]:
 
 
 def errors(body: Path, truth: np.ndarray) -> dict[str, float]:
-    """Millimetres that vertices are off on average, and those of the worst part."""
-    from scanprep.geometry.files import read_mesh
-
+    """Millimetres that vertices (N, 3), or (T, N, 3) of a motion, are off on average, and those of the worst part."""
     model = synthetic_model()
-    off = 1000 * np.linalg.norm(read_mesh(body).vertices - truth, axis=1)
+    if body.suffix == ".npz":
+        motion = Motion.load(body)
+        found = model.subject(motion.betas).vertices(motion.poses, motion.trans)
+    else:
+        found = read_mesh(body).vertices[None]
+    off = 1000 * np.linalg.norm(found - truth, axis=2).mean(axis=0)
     part = model.skeleton.part_of_vertex(model.template)
     return {"mean_mm": float(off.mean()), "part_mm": float((np.bincount(part, off) / np.bincount(part)).max())}
 

@@ -18,6 +18,7 @@ from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, ju
 from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page, link_to
 from scanprep.ranges import BETAS
+from scanprep.words import number_of
 
 from ...cli import ModelOrNone, read_model
 from ..files.markers import READERS
@@ -110,7 +111,8 @@ def _error(metrics: list[Metric]) -> float:
 
 def _folder_page(results: Results) -> Page:
     """The files, worst first."""
-    page = Page(f"{len(results.values)} files followed", "Worst first; each name leads to the page of its file.")
+    page = Page(f"{number_of(len(results.values), 'file')} followed",
+                "Worst first; each name leads to the page of its file.")
     if results.failures:
         page.section("Failed").table([(line,) for line in results.failures.values()])
     page.section("Distance of markers or joint centres to where the body puts them, mean")

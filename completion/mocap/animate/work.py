@@ -35,7 +35,7 @@ from ..files.opensim import believed
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import markers_told, motion_doubts, motion_problem
+from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
@@ -96,10 +96,10 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        doubts = (*worn.doubts(), *motion_doubts([motion], [sequence], body.template))
+        doubts = (*motion_doubts([motion], [sequence], body.template), *worn.doubts(sequence.labels))
         judgement = Judgement.of(problem, doubts)
         if found is not None:
-            judgement = person_judgement(self.model, found.betas).joined(judgement)
+            judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body, believed(motion, sequence))
         metrics += write_glb(output / "animation.glb", motion, body)

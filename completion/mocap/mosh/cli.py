@@ -16,6 +16,7 @@ from scanprep.cli import Output, Unit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, details, judgement_of, say
 from scanprep.judgement import Judgement, judge_many
 from scanprep.pictures.page import Page
+from scanprep.words import number_of
 
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
@@ -146,7 +147,7 @@ def _summary(metrics: Mapping[str, Sequence[Metric]], count: int, before: int) -
 
 def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]) -> Page:
     """All people, those with the largest error first."""
-    page = Page(f"{len(metrics)} {'person' if len(metrics) == 1 else 'people'} from markers, worst first",
+    page = Page(f"{number_of(len(metrics), 'person', 'people')} from markers, worst first",
                 "Each picture leads to the page of the person, and that to the sequences.")
     page.text("A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should "
               "not be used: open this folder with `scape view` and press `mend` to put them right and run again.")

@@ -12,6 +12,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import look_around, stance
 from scanprep.pictures.scene import Pane, picture_pane, picture_panes
 from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid, side_by_side
+from scanprep.words import number_of
 
 from ...motion_pictures import MARKER, chart_states, facing, frames_apart, mean_over, moving_pane, played, upwards
 from ..artefacts.results import MarkerArtefacts
@@ -225,7 +226,7 @@ def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int =
     figure.legend(handles=[Patch(color=STATES[kind], alpha=0.45, label=kind) for kind in used], frameon=False,
                   fontsize=8, ncols=len(used), loc="upper right")
     figure.text(0.01, 0.99, "millimetres from the simulated marker; grey: as it came, black: repaired"
-                + (f"; {hidden} more markers" if hidden else ""), fontsize=8, va="top")
+                + (f"; {number_of(hidden, 'more marker')}" if hidden else ""), fontsize=8, va="top")
     figure.subplots_adjust(left=0.11, right=0.985, top=1 - 0.32 / figure.get_figheight(),
                            bottom=0.42 / figure.get_figheight(), hspace=0.25)
     return figure

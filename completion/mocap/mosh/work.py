@@ -30,7 +30,7 @@ from ..files.motion_files import joint_centres, write_glb, write_motion, write_r
 from ..files.opensim import centre_sequence
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.robust import markers_told, motion_doubts, motion_problem
+from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
@@ -83,9 +83,9 @@ class Work:
         pages -= clocks()
         problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
         motions = [take.motion for take in found.takes]
-        doubts = (*found.result.worn.doubts(), *motion_doubts(motions, [take.markers for take in found.takes],
-                                                              found.model.template))
-        judgement = found.person.joined(Judgement.of(problems, doubts))
+        doubts = (*motion_doubts(motions, [take.markers for take in found.takes], found.model.template),
+                  *found.result.worn.doubts(found.usual.labels))
+        judgement = judge_motions(found.person, Judgement.of(problems, doubts), motions, found.model.template)
         metrics = [judgement_row(judgement), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
@@ -186,8 +186,10 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, picture)
-        doubts = (*found.result.worn.doubts(), *motion_doubts([take.motion], [take.markers], found.model.template))
-        judgement = found.person.joined(Judgement.of(found.problem(take), doubts))
+        body = found.model.template
+        doubts = (*motion_doubts([take.motion], [take.markers], body),
+                  *found.result.worn.doubts(found.usual.labels))
+        judgement = judge_motions(found.person, Judgement.of(found.problem(take), doubts), [take.motion], body)
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 

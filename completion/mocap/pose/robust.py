@@ -7,7 +7,7 @@ import numpy as np
 
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import extent, size, unit_problem
+from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
@@ -132,7 +132,7 @@ def markers_told(motions: Sequence[Motion]) -> Metric:
 def hardly_believed(motions: Sequence[Motion]) -> tuple[str, ...]:
     """A reason to look at motions of one body: markers that are distrusted throughout."""
     out = sorted({label for motion in motions for label in motion.distrusted})
-    return (f"{', '.join(out)} hardly ever believed: not worn where the layout has it, and not in the mean distance",
+    return (f"{', '.join(out)} hardly ever believed: not worn where the layout says, and not in the mean distance",
             ) if out else ()
 
 
@@ -144,17 +144,34 @@ def hardly_seen(motions: Sequence[Motion]) -> tuple[str, ...]:
             ) if few > frames / 2 else ()
 
 
+def judge_motions(person: Judgement, own: Judgement, motions: Sequence[Motion], body: Mesh) -> Judgement:
+    """What motions are worth, by themselves and by the `person` that was found from the same markers.
+
+    On a body that is nowhere near its markers, the size of the person is no cause but an effect, and told last.
+    """
+    return own.joined(person) if mean_off(motions) > HAND * size(body) else person.joined(own)
+
+
+def mean_off(motions: Sequence[Motion]) -> float:
+    """Mean distance of all markers from where the body has them, metres; 0 without any."""
+    found = [motion.residuals[np.isfinite(motion.residuals)] for motion in motions]
+    return float(np.concatenate(found).mean()) if any(map(len, found)) else 0.0
+
+
 def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], body: Mesh) -> tuple[str, ...]:
     """Reasons to look at motions of one body, made from markers; `body` is the model's template."""
     reasons = [*hardly_seen(motions), *hardly_believed(motions)]
-    found = [motion.residuals[np.isfinite(motion.residuals)] for motion in motions]
-    off = float(np.concatenate(found).mean()) if any(map(len, found)) else 0.0
+    off = mean_off(motions)
     if off > DOUBTFUL * size(body):
         reasons.append(f"the markers are {1000 * off:.0f} mm from where the body has them")
-    speed = max((marker_speed(one) for one in markers), default=0.0) / size(body)
-    if speed > HASTY:
-        reasons.append(f"the markers move at {speed * size(body):.0f} m/s: frames in another order, or the wrong rate?")
-    return tuple(reasons)
+    return (*filter(None, (haste(one, body) for one in markers)), *reasons)
+
+
+def haste(markers: MarkerSequence, body: Mesh) -> str | None:
+    """Why markers of a recording cannot have moved so, with the likely cause; None where they can."""
+    speed = marker_speed(markers)
+    return f"the markers move at {speed:.0f} m/s: frames in another order, or the wrong rate?" \
+        if speed > HASTY * size(body) else None
 
 
 def marker_speed(markers: MarkerSequence) -> float:
@@ -181,4 +198,4 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     believed = 100 * float(motion.trusted[seen].mean())
     return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
             f"of the frames converged and {believed:.0f}% of the markers are believed; "
-            + (wrong or "labels of left and right swapped, another layout, or another model?"))
+            + (wrong or haste(markers, body) or "labels that are mixed up, another layout, or another model?"))

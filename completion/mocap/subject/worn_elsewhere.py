@@ -14,6 +14,7 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
+from scanprep.words import number_of
 
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import DISTANCE, MarkerLayout
@@ -91,11 +92,15 @@ class Worn:
                 *(Metric("far from the layout's place, and found nowhere: left out", label) for label in self.unplaced),
                 *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many)]
 
-    def doubts(self) -> tuple[str, ...]:
-        """Reasons to look at what was found with these markers."""
-        told = ((self.unplaced, "not worn where the layout has it, and found nowhere: left out"),
-                (self.too_many, "far from where the layout has it: the wrong layout, or the wrong body?"))
-        return tuple(f"{', '.join(labels)} {words}" for labels, words in told if labels)
+    def doubts(self, labels: Sequence[str]) -> tuple[str, ...]:
+        """Reasons to look at what was found with these markers, of all `labels` of a recording."""
+        sides = sum(i < j for i, j in enumerate(label_pairs(labels)))
+        mirrored = (f"left and right of {len(self.exchanged)} of {number_of(sides, 'pair')} of markers were exchanged "
+                    "and put back: labels of the other side, or a mirrored recording, which is to be mirrored first?"
+                    ,) if 2 * len(self.exchanged) > sides else ()
+        told = ((self.unplaced, "not worn where the layout says, and found nowhere: left out"),
+                (self.too_many, "far from where the layout says: the wrong layout, or the wrong body?"))
+        return (*mirrored, *(f"{', '.join(some)} {words}" for some, words in told if some))
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""

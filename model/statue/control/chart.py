@@ -14,6 +14,7 @@ from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
+from scanprep.words import number_of
 
 
 def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
@@ -242,7 +243,7 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     corners = chart.uv[chart.faces]
     inverted = np.flatnonzero(orientation(*corners.swapaxes(0, 1)) <= 0)
     if len(inverted):
-        return f"{len(inverted)} triangles are inverted, the first is face {inverted[0]}"
+        return f"{number_of(len(inverted), 'triangle is', 'triangles are')} inverted, the first is face {inverted[0]}"
     if crossings(chart.uv[flat.boundary_loops[0]]):
         return "its border crosses itself: places of the image belong to two places of the surface"
     return None

@@ -14,6 +14,7 @@ from scanprep.geometry.target import Target, target_of
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
+from scanprep.words import number_of
 
 from ..control.model import ControlModel
 from .articulated import Articulated
@@ -72,7 +73,8 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
     problem = why_uncertain(best.off, margin, found.uncovered) if fit else (
-        f"{len(joints)} joints and {len(points)} points of the face have data around them, too few to place a person: "
+        f"{number_of(len(joints), 'joint')} and {number_of(len(points), 'point')} of the face have data around them, "
+        "too few to place a person: "
         "a part of one only?")
     return Features(joints, points, missing, registered, fit, problem)
 
