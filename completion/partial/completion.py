@@ -45,7 +45,6 @@ _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
 PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
-UNLIKELY = 150.0                     # squared deviations of a pose from those that are known, all joints together
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
 MONSTROUS = np.radians(75)           # from any known way to hold a joint; a chair has 58, sides exchanged 133
 LEFT_OVER = 0.03                     # share of a scan without a body near; of long hair 0.05, of clothes 0.04 to 0.31
@@ -252,8 +251,6 @@ def strayed(fit: ScanFit, x: np.ndarray) -> list[str]:
         found.append(f"{100 * lost.mean():.1f}% of what was seen of the person has no body near")
     if entered.mean() > ENTERED:
         found.append(f"{100 * entered.mean():.1f}% of the body is where the camera saw that nothing is")
-    if fit.unlikely(x) > UNLIKELY:
-        found.append("the pose is unlike those that are known")
     return found
 
 

@@ -18,7 +18,8 @@ from ..cli import ModelArg
 from ..files import load_model
 from .change import ResolutionConfig, change_resolution, resample, resolution_gap
 
-FAR = 0.01                           # metres; half the vertices of a man move his surface by 1 mm
+# metres; of 5,002 vertices of a model of people 1,000 are left at 4 mm, 500 at 8, 300, hands and feet gone, at 13
+FAR = 0.01
 MEASURED = 20                        # poses in which the two models are compared
 
 
@@ -58,7 +59,7 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
 
 
 def _judge_gaps(gaps: Mapping[str, np.ndarray]) -> Judgement:
-    """Whether bodies are where those of the model before are; a hand's width from them they are something else."""
+    """Whether bodies are where those of the model before are."""
     off = {who: float(gap.mean()) for who, gap in gaps.items()}
-    return Judgement.of(check=[f"{who} in random poses lies {1000 * mean:.0f} mm from where it was" for who, mean in
+    return Judgement.of(check=[f"{who} in random poses lies {1000 * mean:.0f} mm from where it was: more vertices?" for who, mean in
                                off.items() if mean > FAR])
