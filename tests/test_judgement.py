@@ -16,10 +16,12 @@ from scanned_shapes import ball as sphere
 from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import COMMANDS as SCAPE
 from completion.__main__ import main
+from completion.measuring import bodies
 from completion.mocap.animate.work import Work as Follow
-from completion.mocap.pose.robust import hardly_seen, motion_doubts, motion_problem
+from completion.mocap.pose.robust import hardly_seen, judge_motions, motion_doubts, motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.person import PersonConfig
+from completion.mocap.subject.worn_elsewhere import Worn
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
@@ -418,7 +420,8 @@ def test_many_results_are_as_good_as_the_worst_of_them():
     (1.75, 75, 2.0, "good", ""), (1.50, 45, 4.0, "good", ""), (2.00, 140, 4.0, "good", ""),
     (2.61, 290, 20.0, "failed", "scale"), (4.04, 1150, 46.0, "failed", "scale"), (0.93, 12, 6.0, "failed", "scale"),
     (1.20, 25, 5.0, "check", "child"), (2.20, 120, 5.0, "check", "giant"), (1.75, 190, 5.0, "check", "second person"),
-    (1.75, 30, 5.0, "check", "flattened"), (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 14.0, "check", "standard deviations"),
+    (1.75, 30, 5.0, "check", "flattened"),
+    (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 14.0, "check", "standard deviations"),
     (1.75, 75, 20.0, "failed", "scale")])
 def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
     found = beyond_people(stature, volume, np.eye(18)[0] * betas)
@@ -445,6 +448,30 @@ def test_time_that_is_told_wrongly_is_seen_in_the_speed_of_markers():
                   np.full(markers.positions.shape[:2], 0.5), LABELS)
     told = motion_problem(lost, model.template, layout, dataclasses.replace(markers, rate=300.0))
     assert told.endswith("the wrong rate?")                    # not swapped labels
+
+
+def test_the_size_of_a_body_far_from_its_markers_is_told_last():
+    person, own = Judgement.of("the person is 3.08 m tall"), Judgement.of("the markers are 421 mm off")
+    body = worm_with_prior().template
+    for off, first in ((0.5, own), (0.03, person)):
+        motion = SimpleNamespace(residuals=np.full((3, 2), off * size(body)))
+        assert judge_motions(person, own, [motion], body).reasons[0] == first.reasons[0]
+
+
+def test_a_recording_whose_sides_are_all_exchanged_may_be_mirrored():
+    labels = ("LSHO", "RSHO", "LELB", "RELB", "LKNE", "RKNE", "C7")
+    pairs = tuple(zip(labels[:6:2], labels[1:6:2], strict=True))
+    assert "mirrored recording" in Worn(exchanged=pairs).doubts(labels)[0]
+    assert Worn(exchanged=pairs[:1]).doubts(labels) == ()                  # two labels mixed up are put back
+
+
+def test_what_cannot_be_measured_for_its_size_is_told_so(monkeypatch):
+    monkeypatch.setattr(bodies, "find_landmarks", lambda *given: {})
+    ball = sphere(2, 1.0)
+    for half, told in ((2.5, "wrong unit or scale"), (0.9, "^measuring begins")):
+        slim = ball.with_vertices(half * ball.vertices * [0.15, 0.15, 1])
+        with pytest.raises(ValueError, match=told):
+            bodies.landmarks_of(None, [bodies.Body("a", slim, Path("a.ply"))], None)
 
 
 def test_a_reason_stays_one_when_it_is_read_again():

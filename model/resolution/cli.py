@@ -61,5 +61,5 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
 def _judge_gaps(gaps: Mapping[str, np.ndarray]) -> Judgement:
     """Whether bodies are where those of the model before are."""
     off = {who: float(gap.mean()) for who, gap in gaps.items()}
-    return Judgement.of(check=[f"{who} in random poses lies {1000 * mean:.0f} mm from where it was: more vertices?" for who, mean in
-                               off.items() if mean > FAR])
+    return Judgement.of(check=[f"{who} in random poses: {1000 * mean:.0f} mm from where it was; take more vertices"
+                               for who, mean in off.items() if mean > FAR])

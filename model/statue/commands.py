@@ -171,7 +171,7 @@ def judge_statue(statue: FittedStatue, scan: Mesh, left_out: Sequence[str] = ())
         failed.append(f"{told}; a part of a person only, or the control model is not where the person is: features "
                       "given by hand (--features) may help")
     elif shares["folded"] > FOLDED or shares["measured"] < LACKING:
-        check.append(told)
+        check.append(f"{told}; clothes and hair, a part of a person, or joints in wrong places: look at the page")
     lacking = parts_without_data(statue)
     check += [f"the scan has no data on {', '.join(in_words(name) for name in lacking[:NAMED])}"] if lacking else []
     check += [statue.posed.problem] if statue.posed and statue.posed.problem else []
