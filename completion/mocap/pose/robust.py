@@ -198,4 +198,5 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     believed = 100 * float(motion.trusted[seen].mean())
     return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
             f"of the frames converged and {believed:.0f}% of the markers are believed; "
-            + (wrong or haste(markers, body) or "labels mixed up, left and right exchanged, another layout, or another model?"))
+            + (wrong or haste(markers, body)
+               or "labels mixed up, left and right exchanged, another layout, or another model?"))
