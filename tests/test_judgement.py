@@ -189,8 +189,11 @@ def test_a_body_that_is_not_found_in_the_frames_means_nothing():
     assert tracking_problem(dataclasses.replace(motion, converged=found[::-1] | (np.arange(20) > 9))) is None
     nothing = dataclasses.replace(motion, residuals=np.full((20, 1), np.nan))
     assert "no frame shows anything" in tracking_problem(nothing)
-    assert tracking_doubts(nothing) == [] and "lost in 19 of 20 frames" in tracking_doubts(motion)[0]
-    assert tracking_doubts(dataclasses.replace(motion, converged=np.arange(20) > 0)) == []
+    body = worm_with_prior().template
+    assert tracking_doubts(nothing, body) == [] and "lost in 19 of 20 frames" in tracking_doubts(motion, body)[0]
+    near = dataclasses.replace(motion, converged=np.arange(20) > 0, residuals=np.full((20, 1), 0.002 * size(body)))
+    assert tracking_doubts(near, body) == []
+    assert "the wrong scale" in tracking_doubts(dataclasses.replace(near, residuals=10 * near.residuals), body)[0]
 
 
 def test_frames_that_cannot_show_the_body_mean_nothing():

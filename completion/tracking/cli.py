@@ -81,7 +81,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     of_motion = done.key, config.smoothing
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
     space.step("motion", (of_motion, metrics, frames.name), write)
-    judgement = Judgement.of(wrong_size(found, person) or tracking_problem(motion), tracking_doubts(motion))
+    judgement = Judgement.of(wrong_size(found, person) or tracking_problem(motion),
+                             tracking_doubts(motion, loaded.template))
     if not isinstance(body, Subject):
         judgement = judgement.joined(person_judgement(loaded, motion.betas))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
