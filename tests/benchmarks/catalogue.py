@@ -210,6 +210,11 @@ BENCHMARKS = (
               "Half views of held-out poses, known subject: as they are, exchanged, or one of them at the place of "
               "another. Told rightly: the body that is found without landmarks is far from the wrong ones alone.",
               quick="wrong_landmarks.py -m FOLD_0 --only 0 8"),
+    Benchmark("wrong_inputs", "Verdicts on wrong inputs and on right ones", "wrong_inputs.py --folder SCRATCH",
+              completion.verdicts,
+              "Commands on files of synthetic people whose seeds chose no limit. Off on average and in the worst part "
+              "is the body that was written, where the input has a right one: a wrong input may be mended.",
+              quick="wrong_inputs.py --folder SCRATCH --only measure model"),
     Benchmark("worn_markers", "Markers clicked on a scan of the person who wears them", "worn_markers.py -m MEN",
               completion.worn_markers,
               "Seven landmarks, all clicks without error, `cmu41`. Where we lose: places on a limb that is rolled "

@@ -166,6 +166,16 @@ def wrong_landmarks(report: dict) -> str:
     return table(("landmarks", "views", "judged good", "check", "failed", "told rightly", "time (s CPU)"), rows)
 
 
+def verdicts(report: dict) -> str:
+    """Every input, the wrong ones first: what was said of it, why, and how far the body is off."""
+    ordered = sorted(report["rows"], key=lambda r: not r["wrong"])
+    rows: Rows = [("wrong" if r["wrong"] else "right", r["case"], r["verdict"], "; ".join(r["reasons"][:1]),
+                   r.get("mean_mm", ""), r.get("part_mm", "")) for r in ordered]
+    counts = ", ".join(f"{name}: {len(value) if isinstance(value, list) else value}"
+                       for name, value in report["summary"].items())
+    return f"{counts}.\n\n" + table(("input", "case", "verdict", "first reason", "off (mm)", "worst part (mm)"), rows)
+
+
 def viewer_speed(report: dict) -> str:
     """Round trips of sliders."""
     rows: Rows = [(kind, report[kind]["a_second"], report[kind]["median_ms"], report[kind]["p95_ms"])
