@@ -11,7 +11,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from model.people import person_judgement
-from model.priors import CRUDE, stiff_joints
+from model.priors import CRUDE
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
@@ -45,7 +45,6 @@ _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
 PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
-BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
 MONSTROUS = np.radians(75)           # from any known way to hold a joint; a chair has 58, sides exchanged 133
 LEFT_OVER = 0.03                     # share of a scan without a body near; of long hair 0.05, of clothes 0.04 to 0.31
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
@@ -212,13 +211,9 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
             share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
                 "nothing of it was seen"
             found.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {share}")
-    angles = np.linalg.norm(fit.body.split(x)[0], axis=1)
-    stiff = [j for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
-    found += [f"the {joint_in_words(names[j])} is bent by {np.degrees(angles[j]):.0f} degrees, "
-              f"and never was when the model was learned" for j in stiff]
     strange = fit.body.joints_from_known(fit.body.split(x)[0])
     found += [f"the {joint_in_words(names[j])} is {np.degrees(strange[j]):.0f} degrees from any way that it is known "
-              "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE and j not in stiff]
+              "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE]
     if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE:
         found.append(f"the model was {1000 * left_out:.0f} mm off in poses that it was not learned from: it needs more")
     return found + strayed(fit, x)

@@ -169,7 +169,8 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
                      len(template.faces), doubts={name: doubts}, usual=UNSEEN)[0]
     if parts is None or problem is not None:
         return verdict.judgement
-    return verdict.judgement.joined(beyond_people(stature(template, parts, fit.mesh.vertices)))
+    # of a body that is too large or too small the size is the cause, limbs out of shape are what comes of it
+    return beyond_people(stature(template, parts, fit.mesh.vertices)).joined(verdict.judgement)
 
 
 def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path | None,
