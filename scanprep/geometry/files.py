@@ -351,7 +351,7 @@ def _finite(path: Path, contents: Contents) -> Contents:
     if faces is not None:
         kept = finite[faces].all(axis=1)
         faces = of_file[faces[kept]]
-        lost = "" if kept.all() else f", with {number_of(np.count_nonzero(~kept), 'triangle')}"
+        lost = "" if kept.all() else f", with {number_of(int((~kept).sum()), 'triangle')}"
     warnings.warn(f"{path}: {np.count_nonzero(~finite)} of {len(finite)} points are not finite and were left out{lost}",
                   stacklevel=2)
     colors, normals = (None if values is None else values[finite] for values in (contents.colors, contents.normals))
