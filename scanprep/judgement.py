@@ -169,12 +169,14 @@ def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray
         check.append(f"the person is {stature:.2f} m tall: {cause or who + ', or the wrong scale?'}")
     if volume is not None and not failed:
         build = volume / stature**2
+        little = "flattened, or something else than a person?"
         words = f"the person has {volume:.0f} litres at {stature:.2f} m"
         if not ANY_BUILD[0] <= build <= ANY_BUILD[1]:
-            failed.append(f"{words}, as nobody has: {cause or 'something else than a person, or several?'}")
+            what = "something else than a person, or several?" if build > BUILD[0] else little
+            failed.append(f"{words}, as nobody has: {cause or what}")
         elif not BUILD[0] <= build <= BUILD[1] or (stature >= ADULTS[0] and not VOLUMES[0] <= volume <= VOLUMES[1]):
             much = "clothes, a second person, or the wrong scale?"
-            check.append(f"{words}: {cause or (much if build > BUILD[0] else 'flattened, or a part of a person?')}")
+            check.append(f"{words}: {cause or (much if build > BUILD[0] else little)}")
     if betas is not None and len(betas):
         length, usual = float(np.linalg.norm(betas)), float(np.sqrt(len(betas)))
         words = f"the shape is {length:.0f} standard deviations from the mean, {usual:.0f} are usual"

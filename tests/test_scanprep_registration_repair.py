@@ -9,7 +9,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration import person as person_module
 from scanprep.registration.deformation_graph import build_graph
 from scanprep.registration.graph_fit import deform, start_fit, start_motion
-from scanprep.registration.limbs import beyond_people, frames, joint_angles, limb_doubts
+from scanprep.registration.limbs import beyond_people, exchanged_sides, frames, joint_angles, limb_doubts
 from scanprep.registration.matches import prepare
 from scanprep.registration.nonrigid import Registration, measured
 from scanprep.registration.person import PersonParts, average_person, person_parts
@@ -17,6 +17,7 @@ from scanprep.registration.repair import better, motion_of, repaired, rolled
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import PARENTS, PARTS, named_pose
 
 FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("forearm_left", "shin_right", "head"))
@@ -138,6 +139,14 @@ def test_a_limb_rolled_in_a_registration_is_put_right(person, parts, part, angle
     assert off[0] > 0.05 and off[1] < 0.3 * off[0], off
     assert after.rolled and not limb_doubts(person.mesh, parts, after.mesh.vertices)
     assert after.uncovered <= before.uncovered + 0.001 and told[-1][0] <= told[-1][1]
+
+
+def test_shins_rolled_on_both_sides_mean_that_left_and_right_are_exchanged(person, parts):
+    body = person.posed(named_pose("run"))
+    one = with_rolled_skin(person, body, SHIN, 2.3)
+    both = with_rolled_skin(person, one, MIRROR_PART[SHIN], -2.3)
+    assert exchanged_sides(person.mesh, parts, body) is exchanged_sides(person.mesh, parts, one) is None
+    assert "the left shin by" in (told := exchanged_sides(person.mesh, parts, both)) and "exchanged" in told
 
 
 def test_what_needs_no_repair_stays(person, parts):

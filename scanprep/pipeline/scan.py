@@ -17,7 +17,7 @@ from ..geometry.mesh import Mesh
 from ..judgement import beyond_people, extent
 from ..ranges import FLAG, Settings
 from ..registration.ground import with_soles
-from ..registration.limbs import Doubt, limb_doubts
+from ..registration.limbs import Doubt, exchanged_sides, limb_doubts
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repaired
@@ -91,6 +91,8 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         fit = repaired(template, scan, fit, parts, landmarks, settings.registration, correspondences=pairs)
+        if parts is not None and (problem := exchanged_sides(template, parts, fit.mesh.vertices)):
+            raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         fit = with_soles(template, scan, fit, parts)
         picture = scene = b""
         if settings.pictures:

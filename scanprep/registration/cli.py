@@ -31,7 +31,7 @@ from ..judgement import Judgement, beyond_people, size
 from ..pipeline.figures import UNSEEN, review
 from ..pipeline.scan import figures_of
 from .ground import soles_row, with_soles
-from .limbs import limb_doubts
+from .limbs import exchanged_sides, limb_doubts
 from .nonrigid import Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
 from .repair import repaired
@@ -163,7 +163,8 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, pairs: Landmarks | None,
                        parts: PersonParts | None) -> Judgement:
     """What the registration of one scan is worth: by the limits of a set of scans, and whether it is of a person."""
-    problem = registration_problem(template, scan, fit, pairs is not None)
+    problem = registration_problem(template, scan, fit, pairs is not None) or (
+        exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
     doubts = limb_doubts(template, parts, fit.mesh.vertices) if parts else ()
     verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
                      len(template.faces), doubts={name: doubts}, usual=UNSEEN)[0]
