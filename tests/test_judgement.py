@@ -302,7 +302,9 @@ def test_a_skeleton_of_one_part_means_nothing():
 
 @pytest.mark.parametrize(("far", "seen", "off", "stretch", "words"), [
     (0.15, 0.8, 0.001, 1.0, None), (0.15, 0.7, 0.03, 2.5, ["left and right exchanged"]),
-    (0.0, 0.9, 0.3, 1.0, ["left and right exchanged"]), (0.9, 0.005, 0.001, 1.0, ["something else"])])
+    (0.0, 0.9, 0.3, 1.0, ["left and right exchanged"]), (0.9, 0.005, 0.001, 1.0, ["something else"]),
+    (0.42, 0.87, 0.001, 1.0, None), (0.0, 0.3, 0.001, 1.0, None), (0.0, 0.15, 0.001, 1.0, ["part of the body only"]),
+    (0.32, 0.28, 0.001, 1.0, ["32% of the scan lies off"])])
 def test_registrations_by_their_figures(far, seen, off, stretch, words):
     """Limbs in a wrong place alone need a look; with a tenth of the surface stretched too it is the sides."""
     body = worm_with_prior().template

@@ -194,7 +194,7 @@ def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits
         + ("a second person, or clutter?" if f.missed > CROWDED else "an uncovered limb, or clutter"):
             f.missed / limits.missed,
         f"{1000 * f.distance:.1f} mm from the scan on average": f.distance / (limits.distance * size),
-        f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here":
+        f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here: a part of the body, or one view?":
             (1 - f.seen - usual) / limits.unseen,
         f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half":
             f.stretch / limits.stretch,
