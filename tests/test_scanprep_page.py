@@ -187,7 +187,9 @@ def test_stretches_of_a_known_map(template):
     moved = template.with_vertices(template.vertices @ R.T)
     np.testing.assert_allclose(np.concatenate(principal_stretches(template, moved)), 1, atol=1e-9)
     assert stretched_share(template, moved) == 0
-    assert stretched_share(template, template.with_vertices(2.1 * template.vertices)) == pytest.approx(1)
+    assert stretched_share(template, template.with_vertices(0.4 * template.vertices)) == 0         # somebody small
+    half = np.where(template.vertices[:, :1] > np.median(template.vertices[:, 0]) + 0.2, [2.5, 1, 1], 1)
+    assert 0.05 < stretched_share(template, template.with_vertices(half * template.vertices)) < 0.5
 
 
 def test_missed_points(template):

@@ -262,9 +262,15 @@ def uncovered_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, sampl
 
 
 def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
-    """Share of the template's area that is longer by `factor`, or shorter, in some direction than the template."""
+    """Share of the template's area that is longer by `factor`, or shorter, in some direction than most of the body is.
+
+    Somebody smaller or slimmer than the template is nowhere stretched: one right registration had 0.058 that were half
+    as long as on the template, 0.007 that were half as long as usual in it.
+    """
     long, short = principal_stretches(template, registered)
-    return float(template.face_areas @ ((long > factor) | (short < 1 / factor)) / template.face_areas.sum())
+    usual = float(np.median(np.concatenate([long, short])))
+    stretched = (long > factor * usual) | (short < usual / factor)
+    return float(template.face_areas @ stretched / template.face_areas.sum())
 
 
 def principal_stretches(template: Mesh, registered: Mesh) -> tuple[np.ndarray, np.ndarray]:
