@@ -46,8 +46,11 @@ DOUBTFUL = 0.06                      # metres that a part is expected to be off,
 PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
 MONSTROUS = np.radians(75)           # from any known way to hold a joint; a chair has 58, sides exchanged 133
+PARTIAL = 0.25                       # share of the body with data; shins and feet 0.23, one view 0.26 to 0.46
 LEFT_OVER = 0.03                     # share of a scan without a body near; of long hair 0.05, of clothes 0.04 to 0.31
-LOST = 0.5                           # share of a scan explained below which a completion means nothing
+# share of a scan explained below which a completion means nothing: of two people 0.58; landmarks of other places end at
+# 0.18 to 0.54, a horse at 0.08
+LOST = 0.5
 # the same where hardly half of the body has data; a cylinder ends at 0.60 and 0.37, a chair at 0.57 and 0.30, one view
 # of a dressed person with raised arms at 0.59 and 0.29 or 0.38
 CROWDED = 0.7
@@ -179,7 +182,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
     problems = [problem for problem in (completion_problem(done, given.cloud.points, config.free_scale),
-                                        contorted(fit, solved.x)) if problem]
+                                        contorted(fit, solved.x, float(seen.mean()), len(off) > 0)) if problem]
     found = doubts(fit, solved.x, error, seen) + left_over(fit, done.explained) + ambiguous(fit, solved.x, rival)
     judgement = Judgement.of(problems, found)
     if isinstance(body, BodyModel):
@@ -187,14 +190,19 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     return replace(done, judgement=judgement)
 
 
-def contorted(fit: ScanFit, x: np.ndarray) -> str | None:
-    """Why the pose of unknowns (P,) is none that a body takes; None where it may be."""
+def contorted(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> str | None:
+    """Why the pose of unknowns (P,) is none that a body takes; None where it may be.
+
+    `seen` is the share of the body with data, `marked` whether there were landmarks.
+    """
     names, away = fit.body.skeleton.names, fit.body.joints_from_known(fit.body.split(x)[0])
     worst = int(away.argmax())
     if away[worst] <= MONSTROUS:
         return None
+    cause = (f"a part of a body only, {100 * seen:.0f}% of it has data" if seen < PARTIAL else
+             "landmarks of other places, left and right exchanged" if marked else "a pose that needs landmarks")
     return (f"the {joint_in_words(names[worst])} is {np.degrees(away[worst]):.0f} degrees from any way that it is "
-            "known to be held: landmarks of other places, left and right exchanged, or something else than a person?")
+            f"known to be held: {cause}, or something else than a person?")
 
 
 def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
