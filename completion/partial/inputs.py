@@ -68,5 +68,5 @@ def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) ->
     extent, whole = (float(np.ptp(p, axis=0).max()) for p in (points, template.vertices))
     if not whole / 100 < extent < 5 * whole:
         raise ValueError(f"landmarks: they extend over {extent:.3g} m, the template over {whole:.3g} m; "
-                         "expected the scan in metres")
+                         "expected the scan in metres: the wrong unit? (--unit)")
     return vertices, points
