@@ -3,10 +3,10 @@
     python tests/benchmarks/wrong_inputs.py --folder WORK [-o FILE] [--only WORDS ...]
 
 Everything is made of the synthetic people, of seeds that chose no limit when they were run first; then registration's
-limits on parts of a body, exchanged sides and stretch were set by seeds 100 and 209, which test them no longer.
-Each case is a command of `scape` on files in a folder of its own; one that was run before is not run again. `mean_mm` and `part_mm` are how far the vertices of the
-body that was written are from where they belong, on average and for the worst part: a wrong input may be mended, and
-may then be called good.
+limits on parts of a body, exchanged sides and stretch were set by seeds 100 and 209, which test them no longer. Each
+case is a command of `scape` on files in a folder of its own; one that was run before is not run again. `mean_mm` and
+`part_mm` are how far the vertices of the body that was written are from where they belong, on average and for the worst
+part: a wrong input may be mended, and may then be called good.
 """
 from __future__ import annotations
 
