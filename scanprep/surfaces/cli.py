@@ -34,7 +34,7 @@ from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_
 from ..geometry.mesh import Mesh, template_problem
 from ..judgement import Judgement
 from ..ranges import Faces
-from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
+from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
 from ..repair.manifold import repair
 from .cloud import read_surface
 from .template import carry_landmarks, make_template, template_of_scan, views_without_cameras
@@ -259,12 +259,13 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
             report = fill_report(before, config, progress, seen)
             after, holes = report.mesh, report.holes
     write_mesh(output, after)
-    left_open = [f"{len(after.boundary_loops)} holes are still open"] if len(after.boundary_loops) else []
+    still_open = [f"{len(after.boundary_loops)} holes are still open"] if len(after.boundary_loops) else []
     return Outcome(output, [
         Metric("holes before", len(before.boundary_loops)),
         *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
         Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
-        *about_mesh(after)], {"fill": config}, judgement=Judgement.of(check=left_open))
+        *about_mesh(after)], {"fill": config},
+        judgement=filling_judgement(holes, len(after.faces) - len(before.faces)).joined(Judgement.of(check=still_open)))
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
