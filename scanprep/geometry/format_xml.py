@@ -114,7 +114,7 @@ def _instances(node: ElementTree.Element, matrix: np.ndarray, ids: dict[str, Ele
                 bound = inner.find("bind_shape_matrix")
                 place = np.eye(4) if bound is None else _numbers(bound.text).reshape(4, 4)
                 shown = _linked(ids, inner, "source")
-            yield shown, node.get("name") or shown.get("name") or shown.get("id", ""), place
+            yield shown, str(node.get("name") or shown.get("name") or shown.get("id")), place
 
 
 def _matrix(element: ElementTree.Element) -> np.ndarray:

@@ -162,7 +162,7 @@ def filling_judgement(holes: Sequence[FilledHole], triangles: int) -> Judgement:
     """What patches of so many triangles are worth: those of views that lie over each other run through the others."""
     crossing = sum(hole.intersections for hole in holes)
     reason = (f"the patches have {triangles} triangles and run through others {crossing} times: views that overlap "
-              "are to be merged before their holes are filled (scape prep merge)")
+              "are to be made one surface first (scape prep merge, scape prep template)")
     if crossing > CROSSED * triangles:
         return Judgement.of(reason)
     return Judgement.of(check=[reason] if crossing > TOUCHED * triangles else [])
