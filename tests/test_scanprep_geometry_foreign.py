@@ -257,8 +257,8 @@ ONE = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitiv
 
 
 def test_gltf_of_points_alone_is_a_cloud(tmp_path):
-    tree, _ = gltf(ONE, [CORNERS, LINE])
-    tree["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}, "mode": 0}]
+    cloud = {"attributes": {"POSITION": 0}, "mode": 0}
+    tree, _ = gltf({**ONE, "meshes": [{"primitives": [cloud]}]}, [CORNERS, LINE])
     (tmp_path / "a.gltf").write_text(json.dumps(tree))
     np.testing.assert_allclose(read_points(tmp_path / "a.gltf").points, TETRAHEDRON.vertices, atol=1e-6)
     refused(tmp_path / "a.gltf", "found 4 vertices and no faces")
