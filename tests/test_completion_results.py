@@ -7,7 +7,14 @@ import pytest
 from completion_bodies import worm_with_prior
 
 from completion.bodies import FixedBody
-from completion.partial.completion import Completion, doubts, left_over, load_completion, save_completion
+from completion.partial.completion import (
+    Completion,
+    beyond_closed,
+    doubts,
+    left_over,
+    load_completion,
+    save_completion,
+)
 from completion.partial.confidence import expected_error
 from completion.partial.fit import ScanFit
 from completion.partial.rounds import Solved, solve_jointly
@@ -15,6 +22,7 @@ from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
+from scanprep.synthetic.people import Person
 
 MODEL = replace(worm_with_prior(), skeleton=replace(worm_with_prior().skeleton,
                                                     names=("trunk", "upper_arm_left", "forearm_left", "head")))
@@ -151,3 +159,14 @@ def test_a_limbs_worth_of_scan_without_a_body_is_told(explained, told):
     fit = ScanFit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
                   np.zeros((0, 3)), CompletionConfig())
     assert left_over(fit, explained) == (["5.0% of the scan has no body near: clutter, or a limb elsewhere"] * told)
+
+
+def test_a_body_that_goes_on_where_the_scan_is_closed_is_doubted():
+    """As one whose ankles were taken for the feet, 16 cm longer than the scan."""
+    scan = Person().mesh
+    middle = scan.vertices.mean(axis=0)
+    longer = scan.with_vertices(middle + (scan.vertices - middle) * [1, 1, 1.2])
+    assert beyond_closed(scan, scan) == []
+    assert "is outside of the scan, which is closed there" in beyond_closed(scan, longer)[0]
+    cut = scan.submesh(scan.corners[:, :, 2].mean(axis=1) > scan.vertices[:, 2].min() + 0.3)[0]
+    assert beyond_closed(cut, scan) == []            # what lies beyond a border is missing in the scan

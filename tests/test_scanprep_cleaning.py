@@ -178,6 +178,14 @@ def test_views_side_by_side_are_one_piece():
     assert clean.kept.all() and clean.mesh.face_areas.sum() == pytest.approx(one.face_areas.sum(), rel=1e-12)
 
 
+def test_pieces_are_those_of_the_scan_wherever_it_stands():
+    """The cells began at the origin of the file: three metres away other points stood for them."""
+    points = np.random.default_rng(0).random((300, 3)) * [1, 1, 0.02]
+    there = [pieces(Mesh(points + offset, np.zeros((0, 3), dtype=int)), np.arange(300), 0.05)
+             for offset in ([0, 0, 0], [3, -3.015625, 3.0078125])]
+    np.testing.assert_array_equal(*there)
+
+
 def test_a_fitted_plane_is_the_true_one():
     rng = np.random.default_rng(3)
     R = rotations.exp(rng.normal(size=3))

@@ -62,7 +62,7 @@ STL = "solid\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendlo
 @pytest.mark.parametrize(("name", "text", "words"), [
     ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 7\n3 0 1 2\n", ["face 0", "vertex 7", "0..4"]),
     ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 -1\n3 0 1 2\n", ["face 0", "vertex -1"]),
-    ("a.ply", PLY_HEADER + PLY_ROWS + "2 0 1\n3 0 1 2\n", ["face 0", "2 corners", "at least 3"]),
+    ("a.ply", PLY_HEADER + PLY_ROWS + "2 0 1\n2 1 2\n", ["face 0", "2 corners", "at least 3"]),
     ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n", ["truncated", "2 rows of element face", "found 1"]),
     ("a.ply", PLY_HEADER + PLY_ROWS + "3 0 1 2\n3 0 1 2\n3 0 1 2\n", ["5 vertex, 2 face", "1 more lines"]),
     ("a.ply", PLY_HEADER + PLY_ROWS.replace("0.5 0.5 1", "0.5 half 1") + "3 0 1 2\n3 0 1 2\n", ["line 15", "half"]),

@@ -3,6 +3,7 @@ import base64
 import json
 import struct
 import warnings
+import zipfile
 
 import numpy as np
 import pytest
@@ -57,9 +58,40 @@ def test_a_binary_body_that_begins_with_the_byte_of_a_line_end(tmp_path):
 
 
 def test_strips_of_a_ply(tmp_path):
-    text = PLY.format("ascii", XYZ, "tristrips", 1, "int") + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n8 0 1 2 3 -1 0 2 1\n"
-    (tmp_path / "a.ply").write_text(text)
-    assert read_mesh(tmp_path / "a.ply").faces.tolist() == [[0, 1, 2], [2, 1, 3], [0, 2, 1]]
+    text = PLY.format("ascii", XYZ, "tristrips", 3, "int") + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
+    (tmp_path / "a.ply").write_text(text + "9 0 1 2 3 -1 0 2 1 1\n2 0 1\n3 3 2 1\n")
+    assert read_mesh(tmp_path / "a.ply").faces.tolist() == [[0, 1, 2], [2, 1, 3], [0, 2, 1], [3, 2, 1]]
+
+
+@pytest.mark.parametrize("coding", ["utf-8-sig", "utf-16", "utf-16-be"])
+@pytest.mark.parametrize("name", ["a.obj", "a.off", "a.xyz"])
+def test_a_mark_of_the_encoding_is_no_part_of_the_first_line(tmp_path, name, coding):
+    """It hid the first vertex of an OBJ file, and every face was one vertex off."""
+    rows = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
+    text = {"a.obj": "v " + rows[:-1].replace("\n", "\nv ") + "\nf 1 2 3\n", "a.off": f"OFF\n4 1 0\n{rows}3 0 1 2\n",
+            "a.xyz": rows}[name]
+    data = b"\xfe\xff" * (coding == "utf-16-be") + text.encode(coding)
+    (tmp_path / name).write_bytes(data)
+    np.testing.assert_array_equal(read_points(tmp_path / name).points, SQUARE)
+    if name != "a.xyz":
+        assert read_mesh(tmp_path / name).faces.tolist() == [[0, 1, 2]]
+
+
+def test_faces_of_an_off_file_may_go_on_over_lines(tmp_path):
+    rows = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
+    (tmp_path / "a.off").write_text(f"OFF\n4 2 0\n{rows}3 0\n1\n2 3\n2 1 3\n")
+    assert read_mesh(tmp_path / "a.off").faces.tolist() == [[0, 1, 2], [2, 1, 3]]
+    (tmp_path / "a.off").write_text(f"OFF\n4 2 0\n{rows}3 0\n1\n2 3\n2 1 3 9\n")
+    refused(tmp_path / "a.off", "expected 2 faces after 4 vertices, found 4 lines")
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1// 2//\nf\nf 1// 2// 3//\n"),
+    ("a.ply", PLY.format("ascii", XYZ, "face", 3, "uchar") + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n2 0 1\n0\n3 0 1 2\n")])
+def test_faces_with_less_than_three_corners_are_left_out(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.warns(UserWarning, match="has 2 corners, expected at least 3; 2 such faces were left out"):
+        assert read_mesh(tmp_path / name).faces.tolist() == [[0, 1, 2]]
 
 
 def test_a_range_grid_is_joined_where_neighbours_are_near(tmp_path):
@@ -224,6 +256,17 @@ PRIMITIVE = {"attributes": {"POSITION": 0}, "indices": 1}
 ONE = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [PRIMITIVE]}]}
 
 
+def test_gltf_of_points_alone_is_a_cloud(tmp_path):
+    cloud = {"attributes": {"POSITION": 0}, "mode": 0}
+    tree, _ = gltf({**ONE, "meshes": [{"primitives": [cloud]}]}, [CORNERS, LINE])
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    np.testing.assert_allclose(read_points(tmp_path / "a.gltf").points, TETRAHEDRON.vertices, atol=1e-6)
+    refused(tmp_path / "a.gltf", "found 4 vertices and no faces")
+    tree["meshes"][0]["primitives"].append(PRIMITIVE)
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    same(read_mesh(tmp_path / "a.gltf"), TETRAHEDRON)
+
+
 def test_gltf_with_its_numbers_inside_or_beside(tmp_path):
     tree, data = gltf(ONE, [CORNERS, LINE])
     (tmp_path / "a.gltf").write_text(json.dumps(tree))
@@ -326,19 +369,124 @@ def test_without_dracos_library_the_extra_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.gl
-@pytest.mark.parametrize("ending", [".dae"])
-def test_other_formats_are_read_through_meshlab(tmp_path, ending):
+def test_other_formats_are_read_through_meshlab(tmp_path):
     pymeshlab = pytest.importorskip("pymeshlab")
     mesh, meshes = body(np.random.default_rng(4)), pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
-    meshes.save_current_mesh(str(tmp_path / f"a{ending}"))
+    meshes.save_current_mesh(str(tmp_path / "a.3ds"))
     with pytest.warns(UserWarning, match="read through MeshLab; the order"):
-        back = read_mesh(tmp_path / f"a{ending}")
+        back = read_mesh(tmp_path / "a.3ds")
     np.testing.assert_allclose(np.sort(back.face_areas), np.sort(mesh.face_areas), atol=1e-5)
-    assert [path.name for path in list_meshes(tmp_path)] == [f"a{ending}"]
+    assert [path.name for path in list_meshes(tmp_path)] == ["a.3ds"]
     assert [task.name for task in find_scans(tmp_path)] == ["a"]
-    (tmp_path / f"b{ending}").write_bytes(b"nothing of the kind")
-    refused(tmp_path / f"b{ending}", "MeshLab cannot read it")
+    (tmp_path / "b.3ds").write_bytes(b"nothing of the kind")
+    refused(tmp_path / "b.3ds", "MeshLab cannot read it")
+
+
+# ---- COLLADA, 3MF
+
+def collada(faces, nodes, library="", unit="0.01"):
+    """A square of four vertices with a colour each, how its triangles are told, and the nodes of the scene."""
+    def source(name, rows):
+        numbers = " ".join(f"{x:g}" for x in rows.ravel())
+        return (f'<source id="{name}"><float_array id="{name}-array">{numbers}</float_array><technique_common>'
+                f'<accessor source="#{name}-array" count="{len(rows)}" stride="3"/></technique_common></source>')
+    return (f'<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
+            f'<asset><unit meter="{unit}"/></asset><library_geometries><geometry id="g"><mesh>'
+            f'{source("p", SQUARE)}{source("c", SQUARE / 2)}<vertices id="v"><input semantic="POSITION" source="#p"/>'
+            f'</vertices>{faces}</mesh></geometry></library_geometries>{library}<library_visual_scenes>'
+            f'<visual_scene id="s">{nodes}</visual_scene></library_visual_scenes><scene>'
+            f'<instance_visual_scene url="#s"/></scene></COLLADA>')
+
+
+INPUTS = '<input semantic="VERTEX" source="#v" offset="0"/><input semantic="COLOR" source="#c" offset="1"/>'
+SHOWN = '<node id="n" name="square">{}<instance_geometry url="#g"/></node>'
+TWO = [[0, 1, 2], [2, 1, 3]]
+
+
+@pytest.mark.parametrize(("faces", "right"), [
+    (f'<triangles count="2">{INPUTS}<p>0 0 1 1 2 2 2 2 1 1 3 3</p></triangles>', TWO),
+    (f'<tristrips count="1">{INPUTS}<p>0 0 1 1 2 2 3 3</p></tristrips>', TWO),
+    (f'<trifans count="1">{INPUTS}<p>1 1 3 3 2 2 0 0</p></trifans>', [[1, 3, 2], [1, 2, 0]]),
+    (f'<polylist count="1">{INPUTS}<vcount>4</vcount><p>0 0 1 1 3 3 2 2</p></polylist>', [[0, 1, 3], [0, 3, 2]]),
+    (f'<polygons count="1">{INPUTS}<p>0 0 1 1 3 3 2 2</p></polygons>', [[0, 1, 3], [0, 3, 2]])])
+def test_collada_has_triangles_in_five_ways(tmp_path, faces, right):
+    (tmp_path / "a.dae").write_text(collada(faces, SHOWN.format("")))
+    with pytest.warns(UserWarning, match=r"says that its unit is 0\.01 m"):
+        mesh = read_mesh(tmp_path / "a.dae")
+    assert mesh.faces.tolist() == right
+    np.testing.assert_allclose(mesh.vertices, 0.01 * SQUARE)
+    np.testing.assert_allclose(mesh.colors, SQUARE / 2)
+    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.dae", "m").vertices, SQUARE)
+
+
+@pytest.mark.parametrize(("place", "right"), [
+    ("<scale>2 2 2</scale>", 2 * SQUARE),
+    ("<translate>10 0 0</translate><scale>2 2 2</scale><translate>1 0 0</translate>", 2 * SQUARE + [12, 0, 0]),
+    ("<translate>0,5 0 0</translate><rotate>0 0 2 90</rotate>", SQUARE[:, [1, 0, 2]] * [-1, 1, 1] + [0.5, 0, 0]),
+    ("<matrix>2 0 0 7 0 2 0 0 0 0 2 0 0 0 0 1</matrix>", 2 * SQUARE + [7, 0, 0])])
+def test_transforms_of_collada_follow_one_another(tmp_path, place, right):
+    """MeshLab's reader drops scales and all but the last translation."""
+    faces = f'<triangles count="2">{INPUTS}<p>0 0 1 1 2 2 2 2 1 1 3 3</p></triangles>'
+    (tmp_path / "a.dae").write_text(collada(faces, SHOWN.format(place)))
+    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.dae", "m").vertices, right, atol=1e-12)
+
+
+def test_nodes_of_collada_may_be_shown_again_but_not_without_end(tmp_path):
+    faces = f'<triangles count="2">{INPUTS}<p>0 0 1 1 2 2 2 2 1 1 3 3</p></triangles>'
+    shelf = f"<library_nodes>{SHOWN.format('')}</library_nodes>"
+    twice = '<node><translate>5 0 0</translate><instance_node url="#n"/></node><node><instance_node url="#n"/></node>'
+    (tmp_path / "a.dae").write_text(collada(faces, twice, shelf))
+    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.dae", "m").vertices, np.r_[SQUARE + [5, 0, 0], SQUARE])
+    (tmp_path / "a.dae").write_text(collada(faces, '<node id="n"><instance_node url="#n"/></node>'))
+    refused(tmp_path / "a.dae", "without end")
+    (tmp_path / "a.dae").write_text('<!DOCTYPE a [<!ENTITY b "c">]><COLLADA/>')
+    refused(tmp_path / "a.dae", "a whole COLLADA file", "entities")
+
+
+def build_3mf(path, objects, items, unit=' unit="centimeter"', **others):
+    def model(inside, build):
+        return ('<?xml version="1.0"?><model xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02" '
+                f'xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06"{unit}>'
+                f"<resources>{inside}</resources><build>{build}</build></model>")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("_rels/.rels", '<Relationships><Relationship Type="http://x/3dmodel" Target="/3D/a.model"/>'
+                                        "</Relationships>")
+        archive.writestr("3D/a.model", model(objects, items))
+        for name, inside in others.items():
+            archive.writestr(f"3D/{name}.model", model(inside, ""))
+
+
+def object_3mf(number, kind="model"):
+    vertices = "".join(f'<vertex x="{x:g}" y="{y:g}" z="{z:g}"/>' for x, y, z in SQUARE)
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in TWO)
+    return (f'<object id="{number}" type="{kind}"><mesh><vertices>{vertices}</vertices><triangles>{triangles}'
+            f"</triangles></mesh></object>")
+
+
+def test_3mf_is_built_of_components_in_its_unit(tmp_path):
+    whole = ('<object id="7"><components><component objectid="1" transform="0 1 0 -1 0 0 0 0 1 3 0 0"/>'
+             '<component p:path="/3D/other.model" objectid="1"/></components></object>')
+    build_3mf(tmp_path / "a.3mf", object_3mf(1) + object_3mf(2, "support") + whole,
+              '<item objectid="7" transform="2 0 0 0 2 0 0 0 2 0 0 0"/><item objectid="2"/>', other=object_3mf(1))
+    mesh = quiet(read_mesh, tmp_path / "a.3mf")
+    turned = SQUARE[:, [1, 0, 2]] * [-1, 1, 1] + [3, 0, 0]
+    np.testing.assert_allclose(mesh.vertices, 0.01 * 2 * np.r_[turned, SQUARE])
+    assert mesh.faces.tolist() == [*TWO, *(np.array(TWO) + 4).tolist()]
+    build_3mf(tmp_path / "a.3mf", object_3mf(1), '<item objectid="1"/>', unit="")
+    np.testing.assert_allclose(quiet(read_mesh, tmp_path / "a.3mf").vertices, 0.001 * SQUARE)
+
+
+def test_3mf_that_holds_no_mesh_or_itself_is_refused(tmp_path):
+    build_3mf(tmp_path / "a.3mf", '<object id="1"><components><component objectid="1"/></components></object>',
+              '<item objectid="1"/>')
+    refused(tmp_path / "a.3mf", "without end")
+    build_3mf(tmp_path / "a.3mf", object_3mf(1), "")
+    refused(tmp_path / "a.3mf", "found no triangles")
+    (tmp_path / "a.3mf").write_bytes(b"nothing of the kind")
+    refused(tmp_path / "a.3mf", "a whole 3MF file")
+    build_3mf(tmp_path / "a.3mf", " " * 2**25, "")
+    refused(tmp_path / "a.3mf", "unpack to far more")
 
 
 # ---- textures

@@ -7,7 +7,7 @@ from scanned_shapes import ball, bumpy
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
+from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report, filling_judgement
 from scanprep.repair.intersections import intersecting_faces
 from scanprep.repair.loops import group_loops, joined_polygon, triangulate_loop
 from scanprep.repair.manifold import repair
@@ -302,6 +302,17 @@ def test_reports_of_ragged_holes_count_what_crosses(seed):
     assert report.mesh.is_closed and report.mesh.is_edge_manifold
     assert sum(hole.intersections for hole in report.holes) == len(intersecting_faces(report.mesh)) < 20
     assert np.array_equal(report.mesh.vertices[:len(holed.vertices)], holed.vertices)
+
+
+def test_patches_of_sheets_that_lie_over_each_other_are_no_good():
+    """Views side by side, not merged: each is closed across the others."""
+    shell = pierced(ball(3), [[0, 0, 0.1]], 0.09)
+    turned = Mesh(shell.vertices @ rotations.exp(np.array([np.pi, 0, 0])).T, shell.faces)
+    both = Mesh(np.r_[shell.vertices, turned.vertices], np.r_[shell.faces, turned.faces + len(shell.vertices)])
+    for mesh, verdict in ((shell, "good"), (both, "failed")):
+        report = fill_report(mesh, FillConfig(join=False))
+        judged = filling_judgement(report.holes, len(report.mesh.faces) - len(mesh.faces))
+        assert judged.verdict == verdict and (verdict == "good" or "scape prep merge" in judged.why)
 
 
 def test_reports_are_of_methods_that_keep_the_mesh():

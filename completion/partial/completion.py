@@ -15,6 +15,7 @@ from model.priors import CRUDE
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
 from scanprep.registration.ground import foot_of_vertex, grounded
 from scanprep.skeleton.roles import in_words, joint_in_words
@@ -55,6 +56,9 @@ LOST = 0.5
 # of a dressed person with raised arms at 0.59 and 0.29 or 0.38
 CROWDED = 0.7
 COVERED = 0.5                        # share of the body with data; of one of two people it is 0.94, at 0.58 explained
+# of a body, by area, outside of a scan whose edges are borders at most so often: a man in shoes whose feet were taken
+# for ankles has 0.08; four right ones have 0, two of them with fists where the body has fingers
+OUTSIDE, NEARLY_CLOSED = 0.02, 0.01
 UNJUDGED = Judgement.of(check=["no judgement was made"])
 ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
 
@@ -184,6 +188,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     problems = [problem for problem in (completion_problem(done, given.cloud.points, config.free_scale),
                                         contorted(fit, solved.x, float(seen.mean()), len(off) > 0)) if problem]
     found = doubts(fit, solved.x, error, seen) + left_over(fit, done.explained) + ambiguous(fit, solved.x, rival)
+    found += beyond_closed(scan, completed) if isinstance(scan, Mesh) and not config.free_scale else []
     judgement = Judgement.of(problems, found)
     if isinstance(body, BodyModel):
         judgement = judgement.joined(person_judgement(body, betas))
@@ -233,6 +238,19 @@ def left_over(fit: ScanFit, explained: float) -> list[str]:
         return []
     cause = "a second person, or clutter?" if explained < CROWDED else "clutter, or a limb elsewhere"
     return [f"{100 * (1 - explained):.1f}% of the scan has no body near: {cause}"]
+
+
+def beyond_closed(scan: Mesh, body: Mesh) -> list[str]:
+    """How much of a body is outside of a scan that is closed there, so that nothing can be missing; metres."""
+    border = scan.edge_use == 1
+    if not len(scan.faces) or border.mean() > NEARLY_CLOSED:
+        return []
+    there = Surface(scan).closest(body.vertices)
+    ahead = np.einsum("nd,nd->n", body.vertices - there.points, scan.face_normals[there.faces]) > 0
+    out = ahead & (there.distances > DOUBTFUL) & ~border[scan.face_edges[there.faces]].any(axis=1)
+    share = float(body.vertex_areas[out].sum() / body.vertex_areas.sum())
+    return [f"{100 * share:.1f}% of the body is outside of the scan, which is closed there: shoes, or a body that is "
+            "too large"] if share > OUTSIDE else []
 
 
 def ambiguous(fit: ScanFit, x: np.ndarray, rival: np.ndarray | None) -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry import rotations
+from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
 from ..geometry.surface import OrientedPoints, SeenSpace
@@ -106,7 +107,7 @@ def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Gener
 def _described(mesh: Mesh, extent: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 3) spread over a view, their normals, and a histogram (n, 33) for each."""
     even = smooth(mesh, 10)
-    rows = np.unique(np.floor(even.vertices / (extent / 120)).astype(np.int64), axis=0, return_index=True)[1]
+    rows = thin(even.vertices, extent / 120)
     p, n = even.vertices[rows], even.vertex_normals[rows]
     a, b = cKDTree(p).query_pairs(REACH * extent, output_type="ndarray").T
     a, b = np.r_[a, b], np.r_[b, a]

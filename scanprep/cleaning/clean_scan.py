@@ -182,8 +182,8 @@ def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
     sides = new[np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])]
     sides = sides[(sides >= 0).all(axis=1)]
     # One point of every small cell stands for all of it, so that dense scans do not take long.
-    _, first, cell = np.unique(np.floor(points / (link / 2)).astype(np.int64), axis=0, return_index=True,
-                               return_inverse=True)
+    place = np.floor((points - points.min(axis=0, initial=np.inf)) / (link / 2)).astype(np.int64)
+    _, first, cell = np.unique(place, axis=0, return_index=True, return_inverse=True)
     near = np.concatenate([cKDTree(points[first]).query_pairs(link, output_type="ndarray"),
                            _sparse_links(points[first], link, SPARSE * link)])
     a = np.concatenate([sides[:, 0], first[near[:, 0]], np.arange(len(points))])

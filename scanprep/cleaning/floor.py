@@ -117,8 +117,7 @@ def inside_outline(points: np.ndarray, outline: np.ndarray, bridge: float) -> np
 
 def _covered_area(flat: np.ndarray, cell: float) -> float:
     """Square metres of the cells, `cell` metres wide, that have one of the points (n, 2)."""
-    place = np.floor(flat / cell).astype(np.int64)
-    place -= place.min(axis=0, initial=0)
+    place = np.floor((flat - flat.min(axis=0, initial=np.inf)) / cell).astype(np.int64)
     return len(np.unique(place[:, 0] * (place[:, 1].max(initial=0) + 1) + place[:, 1])) * cell**2
 
 

@@ -17,7 +17,17 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..words import number_of
-from . import format_draco, format_foreign, format_glb, format_pcd, format_ply, format_stl, format_text, storage
+from . import (
+    format_draco,
+    format_foreign,
+    format_glb,
+    format_pcd,
+    format_ply,
+    format_stl,
+    format_text,
+    format_xml,
+    storage,
+)
 from .format_common import (
     UNITS,
     Contents,
@@ -77,6 +87,7 @@ _MESHES = {".ply": _Format(format_ply.read, format_ply.encode),
            ".off": _Format(format_text.read_off, format_text.encode_off),
            ".glb": _Format(format_glb.read, format_glb.encode), ".gltf": _Format(format_glb.read_gltf),
            ".drc": _Format(format_draco.read),
+           ".dae": _Format(format_xml.read_dae), ".3mf": _Format(format_xml.read_3mf),
            **{ending: _Format(format_foreign.read) for ending in format_foreign.MESHES}}
 _POINTS = {".pcd": _Format(format_pcd.read, format_pcd.encode), ".xyz": _ROWS, ".pts": _ROWS, ".txt": _ROWS,
            ".asc": _Format(format_text.read_xyz), ".csv": _Format(format_text.read_xyz),
@@ -100,11 +111,12 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     Parameters
     ----------
     path : str or Path
-        PLY, OBJ, STL, OFF, GLB, glTF or Draco (`.drc`), also packed as `.ply.gz`; through pymeshlab 3MF, DAE, 3DS, X3D,
-        WRL and others.
+        PLY, OBJ, STL, OFF, GLB, glTF, COLLADA (`.dae`), 3MF or Draco (`.drc`), also packed as `.ply.gz`; through
+        pymeshlab 3DS, X3D, WRL and CTM.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. When it is not given: the one other than metres in which the mesh is as large as a person,
-        with a UserWarning; else metres, with one where it would be larger than 10 m or smaller than 0.1 m.
+        Unit of the file. When it is not given: that which the file names, or the one other than metres in which the
+        mesh is as large as a person, with a UserWarning; else metres, with one where it would be larger than 10 m or
+        smaller than 0.1 m.
 
     Returns
     -------
@@ -143,7 +155,7 @@ def _mesh(path: Path, contents: Contents, unit: str | None) -> Mesh:
         told = ", ".join(f"{name} ({number_of(count, 'triangle')})" for name, count in contents.objects[:6])
         more = ", ..." if len(contents.objects) > 6 else ""
         warnings.warn(f"{path}: {len(contents.objects)} objects were taken for one mesh: {told}{more}", stacklevel=2)
-    scale = metres_per_unit(path, mesh.vertices, unit)
+    scale = metres_per_unit(path, mesh.vertices, unit, named=contents.metres)
     return mesh if scale == 1 else mesh.with_vertices(scale * mesh.vertices)
 
 
@@ -220,7 +232,7 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
 
 def _cloud(path: Path, contents: Contents, unit: str | None) -> PointCloud:
     """The points of a file in metres, with unit normals where the file has some or there are triangles."""
-    points = metres_per_unit(path, contents.vertices, unit) * contents.vertices
+    points = metres_per_unit(path, contents.vertices, unit, named=contents.metres) * contents.vertices
     normals = contents.normals
     if normals is not None:
         normals = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)

@@ -38,6 +38,7 @@ class Contents:
     colors: np.ndarray | None = None        # (N, 3) in [0, 1]
     objects: tuple[tuple[str, int], ...] = ()       # name and triangles of each, where the format has objects
     of_file: np.ndarray | None = None       # (M,) which vertex each of the file is here, -1 of one that was left out
+    metres: float = 1.0                     # of the unit that the file names
 
 
 def load_bytes(path: Path) -> bytes:
@@ -63,6 +64,14 @@ def _unpacked(path: Path, data: bytes) -> bytes:
     return out
 
 
+def as_utf8(data: bytes) -> bytes:
+    """Text that begins with a mark of its encoding as UTF-8 without it; anything else as it is."""
+    if data[:2] in storage.UTF_16:
+        with contextlib.suppress(UnicodeDecodeError):
+            return data.decode("utf-16").encode()
+    return data.removeprefix(b"\xef\xbb\xbf")
+
+
 def check_extent(path: Path, what: str, points: np.ndarray) -> None:
     """MeshFileError for coordinates that no scan has, and that have no squares, lengths and areas."""
     far = np.flatnonzero((np.abs(points) > FARTHEST).any(axis=1) & np.isfinite(points).all(axis=1))
@@ -77,17 +86,22 @@ def likely_unit(extent: float) -> str | None:
     return likely[0] if len(likely) == 1 else None
 
 
-def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
+def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1, named: float = 1.0
+                    ) -> float:
     """What to multiply the coordinates of a file with to have metres.
 
-    Where no unit is given and the points span as much as a person in one other than metres, it is that one. Else they
-    are metres, with a warning where they would span more than 10 m or less than `smallest`. Only how far the points
-    span counts, not how far from the origin they lie.
+    Where no unit is given it is that which the file names, `named` metres, with a warning. Where that is metres and the
+    points span as much as a person in another one, it is that one. Else they are metres, with a warning where they
+    would span more than 10 m or less than `smallest`. Only how far the points span counts, not how far from the origin
+    they lie.
     """
     if unit is not None:
         if unit not in UNITS:
             raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
         return UNITS[unit]
+    if named != 1:
+        warnings.warn(f"{path}: the file says that its unit is {named:g} m", stacklevel=3)
+        return named
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent > 10:                          # 65.535 m is what many a depth camera writes where it saw nothing
         inner = float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())
@@ -169,7 +183,7 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     tells how many polygons are so bent or hollow that they fold over where they are cut.
 
     `corners` are their vertices, of `count`, one polygon after the other; `numbers` the lines of the polygons.
-    MeshFileError for fewer than three corners, or a vertex out of range.
+    Polygons of fewer than three corners are left out, with a UserWarning; MeshFileError for a vertex out of range.
     """
     sizes, corners = np.asarray(sizes, dtype=np.int64), np.asarray(corners, dtype=np.int64)
     start = np.cumsum(sizes) - sizes
@@ -177,13 +191,18 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     def where(p: int) -> str:
         return f"{path}: " + (f"line {numbers[p]}: " if numbers is not None else "") + f"face {p}"
 
-    few = np.flatnonzero(sizes < 3)
-    if len(few):
-        raise MeshFileError(f"{where(few[0])} has {sizes[few[0]]} corners, expected at least 3")
     outside = np.flatnonzero((corners < 0) | (corners >= count))
     if len(outside):
         p = int(np.searchsorted(start, outside[0], side="right")) - 1
         raise MeshFileError(f"{where(p)} refers to vertex {corners[outside[0]]}, expected 0..{count - 1}")
+    few = np.flatnonzero(sizes < 3)
+    if len(few):
+        problem = f"{where(few[0])} has {sizes[few[0]]} corners, expected at least 3"
+        if len(few) == len(sizes):
+            raise MeshFileError(problem)
+        warnings.warn(f"{problem}; {len(few)} such faces were left out", stacklevel=4)
+        corners, sizes = corners[np.repeat(sizes >= 3, sizes)], sizes[sizes >= 3]
+        start = np.cumsum(sizes) - sizes
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
     first = _cuts_that_meet_nothing(sizes, corners, count)
@@ -198,10 +217,17 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     return faces
 
 
-def strip_triangles(strip: np.ndarray) -> np.ndarray:
-    """(F, 3) the triangles of a strip of vertices (n,), all turned the same way; those that repeat one are left out."""
-    faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
-    faces[1::2] = faces[1::2, [1, 0, 2]]
+def strip_triangles(corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """(F, 3) the triangles of strips, those of a strip turned the same way; those that repeat a corner are left out.
+
+    `corners` are the vertices of one strip after the other, `sizes` (S,) how many each has: scanners write them by the
+    ten thousand.
+    """
+    count = np.maximum(sizes - 2, 0)
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    at = np.repeat(np.cumsum(sizes) - sizes, count) + within
+    faces = np.stack([corners[at], corners[at + 1], corners[at + 2]], axis=1)
+    faces[within % 2 == 1] = faces[within % 2 == 1][:, [1, 0, 2]]
     return np.asarray(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
 
 

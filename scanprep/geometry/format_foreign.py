@@ -13,7 +13,7 @@ import numpy as np
 from . import storage
 from .format_common import Contents, MeshFileError, polygons
 
-MESHES = (".3mf", ".dae", ".3ds", ".x3d", ".x3dv", ".wrl", ".ctm", ".gts", ".qobj")
+MESHES = (".3ds", ".x3d", ".x3dv", ".wrl", ".ctm", ".qobj")
 POINTS = (".e57", ".ptx")
 
 # what nobody reads, and a program that writes something else of it

@@ -33,11 +33,12 @@ _DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
 # extensions that a file may require and that are read here, or that leave triangles as they are
 _KNOWN = (_DRACO, _INSTANCES, "KHR_mesh_quantization")
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_",
-             "KHR_animation_", "KHR_xmp")
+             "KHR_animation_", "KHR_xmp", "KHR_technique")
 
 
 def read(path: Path, data: bytes) -> Contents:
-    """The meshes of the scene of a GLB file one after the other, in scene coordinates; points and lines are left out.
+    """The meshes of the scene of a GLB file one after the other, in scene coordinates; lines are left out, and points
+    where there are triangles.
 
     The axes are those of the body where the file tells which of them was turned to y. A mesh that hangs on joints is
     where the joints of the scene carry it, which is what every program shows.
@@ -98,6 +99,8 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     start, most = 0, 10**6 + 4 * len(binary)    # many nodes may show one mesh, but not without end
     nodes = list(nodes_of(tree))
     places = {number: matrix for number, _, matrix in nodes}
+    kinds = {p.get("mode", 4) for mesh in tree.get("meshes", []) for p in mesh["primitives"]}
+    shown = {4, 5, 6} if kinds & {4, 5, 6} else {0}             # triangles, strips, fans; or a cloud of points
     for number, node, matrix in nodes:
         if "mesh" not in node:
             continue
@@ -107,7 +110,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             before = len(faces)
             placed: dict[tuple[int, Any], int] = {}                # primitives may share their vertices
             for primitive in tree["meshes"][node["mesh"]]["primitives"]:
-                if primitive.get("mode", 4) not in (4, 5, 6):             # triangles, a strip, a fan
+                if primitive.get("mode", 4) not in shown:
                     continue
                 primitive, own, data = _unpacked(path, tree, binary, primitive)
                 points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
@@ -120,7 +123,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
                         vertices.append(local @ instance[:3, :3].T + instance[:3, 3])
                     colors.append(_colors(own, data, primitive, len(local)))
                     start += len(local)
-                corners = triangles_of(own, data, primitive, len(local))
+                corners = triangles_of(own, data, primitive, len(local)) if 0 not in shown else np.zeros((0, 3), int)
                 if np.linalg.det((instance if joints is None else joints[0])[:3, :3]) < 0:
                     corners = corners[:, ::-1]
                 faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), len(local)) + placed[points])
@@ -129,8 +132,8 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
                     raise ValueError("it shows its meshes too often")
             if len(faces) > before:
                 objects.append((str(name), sum(map(len, faces[before:]))))
-    if not faces:
-        raise MeshFileError(f"{path}: expected a mesh, found a glTF file without triangles")
+    if not vertices:
+        raise MeshFileError(f"{path}: expected a mesh, found a glTF file without triangles and points")
     shades = [c for c in colors if c is not None]
     return Contents(np.concatenate(vertices) @ turn_up(up_of(tree)), np.concatenate(faces), None,
                     np.concatenate(shades) if len(shades) == len(colors) else None, tuple(objects))
@@ -352,7 +355,7 @@ def triangles_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any],
         return line[:len(line) // 3 * 3].reshape(-1, 3)
     if mode == 6:
         return np.stack([np.full(max(len(line) - 2, 0), line[0]), line[1:-1], line[2:]], axis=1)
-    return strip_triangles(line)
+    return strip_triangles(line, np.array([len(line)]))
 
 
 def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray | None:

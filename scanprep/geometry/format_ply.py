@@ -261,9 +261,9 @@ def _faces(path: Path, found: dict[str, dict[str, _Column]], vertices: np.ndarra
 
 def _strips(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(F, 3) triangles of strips; a strip ends with its list, or at a -1 in it."""
-    ends = np.sort(np.r_[np.cumsum(sizes), np.flatnonzero(corners < 0)])
-    strips = [strip[strip >= 0] for strip in np.split(corners.astype(np.int64), ends)]
-    return np.concatenate([strip_triangles(strip) for strip in strips if len(strip) > 2] or [np.zeros((0, 3), int)])
+    strip = np.repeat(np.arange(len(sizes)), sizes) + np.cumsum(corners < 0)
+    listed = corners >= 0
+    return strip_triangles(corners[listed].astype(np.int64), np.unique(strip[listed], return_counts=True)[1])
 
 
 # of the edges between neighbours of a range scan, against their median: what is longer spans a jump from one surface to

@@ -13,6 +13,7 @@ from .format_common import (
     MeshFileError,
     as_bytes,
     as_colors,
+    as_utf8,
     polygons,
     quote,
     text_rows,
@@ -23,7 +24,7 @@ from .format_ply import Element, Property, ascii_element
 
 def read_obj(path: Path, data: bytes) -> Contents:
     """The vertices, in their order, triangles and vertex colours of an OBJ file; everything else is skipped."""
-    lines = Lines(path, data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" "), comment=b"#")
+    lines = Lines(path, as_utf8(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" "), comment=b"#")
     starts = [line[:2] for line in map(bytes.lstrip, lines.text)]
     v_rows = [row for row, start in enumerate(starts) if start in (b"v ", b"v\t")]
     f_rows = [row for row, start in enumerate(starts) if start in (b"f ", b"f\t", b"f")]
@@ -107,7 +108,7 @@ def encode_obj(contents: Contents, double: bool) -> bytes:
 
 def read_off(path: Path, data: bytes) -> Contents:
     """The vertices, polygons as triangles, normals and vertex colours of an OFF file in ascii."""
-    lines = Lines(path, data, comment=b"#")
+    lines = Lines(path, as_utf8(data), comment=b"#")
     head = lines.text[0].split() if len(lines) else [b""]
     kind = re.match(rb"(ST)?(C)?(N)?OFF(?=\d|$)", head[0])
     if kind is None:
@@ -126,6 +127,8 @@ def read_off(path: Path, data: bytes) -> Contents:
     if kind[2] and table.shape[1] >= width + 3:
         colors = as_colors(table[:, width:width + 3])
     place += n
+    if place + f < len(lines):
+        _one_face_a_line(lines, place, f)
     if place + f != len(lines):
         found = len(lines) - place
         raise MeshFileError(f"{path}: {'truncated: ' if found < f else ''}expected {f} faces after {n} vertices, "
@@ -134,6 +137,19 @@ def read_off(path: Path, data: bytes) -> Contents:
     sizes, corners = ascii_element(lines, face, place)[0]["corners"]
     faces = polygons(path, sizes, corners, n, lines.numbers[place:place + f], table[:, :3])
     return Contents(table[:, :3], faces, table[:, 3:6] if kind[3] else None, colors)
+
+
+def _one_face_a_line(lines: Lines, place: int, count: int) -> None:
+    """Join the lines from `place` on where faces go on over several, if they are `count` faces and no more."""
+    words, faces, at = [word for line in lines.text[place:] for word in line.split()], list[bytes](), 0
+    for _ in range(count):
+        if at >= len(words) or not words[at].isdigit() or len(words[at]) > 9:
+            return
+        stop = at + 1 + int(words[at])
+        faces.append(b" ".join(words[at:stop]))
+        at = stop
+    if at == len(words):
+        lines.text[place:], lines.numbers = faces, [*lines.numbers[:place], *[lines.numbers[place]] * count]
 
 
 def encode_off(contents: Contents, double: bool) -> bytes:
@@ -161,6 +177,7 @@ def read_xyz(path: Path, data: bytes) -> Contents:
     every row of them has length one, colours when they are 0..255 or 0..1, else anything. In `.pts` an intensity may
     stand before the colours. A line of one number is a count of points.
     """
+    data = as_utf8(data)
     if b"\0" in data:
         raise MeshFileError(f"{path}: expected text with lines 'x y z', found a binary file")
     lines = Lines(path, data, comment=b"#")

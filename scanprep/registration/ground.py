@@ -178,7 +178,8 @@ def _supporting(points: np.ndarray, feet: np.ndarray, rest: np.ndarray) -> Plane
     plane = Plane(-face[:3], float(face[3]), FLAT)
     low = points[plane.height(points) < 2 * WALL]
     low = low[np.argsort(plane.height(low), kind="stable")]
-    low = low[np.unique(np.floor(plane.flat(low) / 0.01).astype(np.int64), axis=0, return_index=True)[1]]
+    flat = plane.flat(low - points[0])         # squares of the scan, not of the room
+    low = low[np.unique(np.floor(flat / 0.01).astype(np.int64), axis=0, return_index=True)[1]]
     if len(low) < ENDS:
         return None
     a, b, c = low[np.random.default_rng(0).integers(len(low), size=(3, TRIED))]

@@ -34,7 +34,7 @@ from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_
 from ..geometry.mesh import Mesh, template_problem
 from ..judgement import Judgement
 from ..ranges import Faces
-from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
+from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
 from ..repair.manifold import repair
 from ..words import number_of
 from .cloud import read_surface
@@ -261,12 +261,13 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
             after, holes = report.mesh, report.holes
     write_mesh(output, after)
     loops = len(after.boundary_loops)
-    left_open = [f"{number_of(loops, 'hole is', 'holes are')} still open"] if loops else []
+    still_open = [f"{number_of(loops, 'hole is', 'holes are')} still open"] if loops else []
     return Outcome(output, [
         Metric("holes before", len(before.boundary_loops)),
         *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
         Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
-        *about_mesh(after)], {"fill": config}, judgement=Judgement.of(check=left_open))
+        *about_mesh(after)], {"fill": config},
+        judgement=filling_judgement(holes, len(after.faces) - len(before.faces)).joined(Judgement.of(check=still_open)))
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
