@@ -90,15 +90,15 @@ class _Settings:
         early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         early.add_argument("--config", type=Path)
         early.add_argument("--preset", default="default")
-        self.presets = hasattr(values.get("config"), "published")     # of the command's own method
+        self.presets = hasattr(next(iter(values.values()), None), "published")       # of the command's own method
         self.values = values
         if not values or {"-h", "--help"} & {*argv}:
             return
         with contextlib.suppress(argparse.ArgumentError):               # said by the parser of the whole line
             given = early.parse_known_args(argv)[0]
             if self.presets and given.preset == "published":
-                self.values = {name: getattr(value, "published", lambda value=value: value)()
-                               for name, value in values.items()}
+                self.values = {name: value.published() if hasattr(value, "published") and value == type(value)()
+                               else value for name, value in values.items()}
             if given.config is not None:
                 self.values = config_files.read(given.config, self.values)
 

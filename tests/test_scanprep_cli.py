@@ -24,6 +24,7 @@ from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import cli as registration_cli
 from scanprep.registration.nonrigid import register
+from scanprep.registration.schedule import RegistrationConfig
 
 ROOT = Path(__file__).parents[1]
 
@@ -105,6 +106,16 @@ def test_run(place, tmp_path, capsys, quick):
     assert figures["  broken"] == "failed"
     page = (tmp_path / "set" / "report.html").read_text()
     assert page.index("scan-broken") and page.count("<figure data-scene=") == 3
+
+
+def test_the_published_preset_registers_a_folder(place, tmp_path, monkeypatch):
+    """With a tenth of its nodes and rounds."""
+    paper = RegistrationConfig.published()
+    few = replace(paper, graph=tuple(replace(s, nodes=s.nodes // 10, rounds=2) for s in paper.graph))
+    monkeypatch.setattr(RegistrationConfig, "published", lambda: few)
+    words = "run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set"
+    assert run(*words, "--preset", "published") == 0
+    assert report(tmp_path / "set" / "report.json")["distance to the scan, mean"] < 5
 
 
 def test_page_with_other_limits(place, capsys):

@@ -229,7 +229,7 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
             told += write_glb(folder / "exaggerated.glb", soft.motion, body,
-                              partial(soft.on, body, factor=factor))
+                              partial(soft.vertices, take.model, factor=factor, subject=body))
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
                   take.source.who, take.unit,
