@@ -282,7 +282,7 @@ def test_where_the_body_is_at_fault_no_marker_is_moved():
     order = np.random.default_rng(0).permutation(26)
     markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)
     found = find_worn(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
-    assert not found.changes and len(found.too_many) > 7 and "the wrong layout" in found.doubts()[0]
+    assert not found.changes and len(found.too_many) > 7 and "the wrong layout" in found.doubts(LABELS)[0]
 
 
 def test_markers_in_their_places_are_let_be():
