@@ -88,8 +88,13 @@ class MoshConfig(Settings):
 
     @classmethod
     def published(cls) -> MoshConfig:
-        """The weights of [MoSh], every marker believed alike, nothing repaired and nothing smoothed beyond them."""
-        poses = replace(PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6)
+        """The weights of [MoSh], every marker believed alike, nothing repaired, shrunk or smoothed beyond them.
+
+        Not as in the paper: covariances of poses have at least (0.05 radians)² along every direction, and the first
+        frame is found by a search.
+        """
+        poses = replace(PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6,
+                        prior_shrinkage=0.0)
         return cls(PersonConfig.published(), poses, SoftTissueConfig.published(), repair=False)
 
 

@@ -61,6 +61,9 @@ class PersonConfig(Settings):
         Factors on the last three weights, one stage each.
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight; the paper weighs all alike.
+    loose : bool
+        Look along their limb for markers that the layout calls loose, and hold them there by 20 cm; the paper holds
+        all alike.
     seed : int
         Of the frames drawn at random.
     """
@@ -76,12 +79,13 @@ class PersonConfig(Settings):
     pose: float = 0.25
     annealing: tuple[Positive, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
     outlier: Positive = 0.06
+    loose: bool = True
     seed: Seed = 0
 
     @classmethod
     def published(cls) -> PersonConfig:
-        """Weights, twelve random frames and six stages of [MoSh]."""
-        return cls(choice="random", surface=100.0, initial=0.25, shape=1.0, outlier=1000.0)
+        """Weights, twelve random frames and six stages of [MoSh], all markers alike."""
+        return cls(choice="random", surface=100.0, initial=0.25, shape=1.0, outlier=1000.0, loose=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +212,7 @@ class LatentFit:
         self.latent = LatentPoints(model.vertices(rest, np.zeros(self.n_betas)),
                                    model.shape_jacobian(rest)[..., :self.n_betas])
         self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
-        self.distances, self.loose = np.asarray(layout.distances), np.isin(layout.labels, layout.loose)
+        self.distances, self.loose = np.asarray(layout.distances), np.isin(layout.labels, layout.loose) & config.loose
         # weight of the usual place of a marker that the layout calls loose: 20 cm
         self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
         self.pool = PointPool(model, self.n_betas)
@@ -224,7 +228,7 @@ class LatentFit:
 
     def hung_anew(self, state: State, look: bool) -> State:
         """The same places on the triangles that are nearest now; to `look` finds loose markers along their limbs."""
-        if not look or not self.layout.loose:
+        if not look or not self.loose.any():
             return self._hung(state.x, state.betas, state.places, state.layout, state.looked)
         vertices = self.model.subject(state.betas).vertices(*self.split(state.x))
         layout = self.layout.moved(find_loose(self.model, vertices, self.layout, self.targets))
