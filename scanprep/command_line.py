@@ -93,14 +93,15 @@ class _Settings:
         early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         early.add_argument("--config", type=Path)
         early.add_argument("--preset", default="default")
-        self.presets = hasattr(next(iter(values.values()), None), "published")       # of the command's own method
+        published = getattr(next(iter(values.values()), None), "published", None)       # of the command's own method
+        self.presets = published is not None
         self.values, self.about = values, ""
         if not values or {"-h", "--help"} & {*argv}:
             return
         with contextlib.suppress(argparse.ArgumentError):               # said by the parser of the whole line
             given = early.parse_known_args(argv)[0]
             if self.presets and given.preset == "published":
-                self.about = config_files.comment(inspect.getdoc(next(iter(values.values())).published) or "")
+                self.about = config_files.comment(inspect.getdoc(published) or "")
                 self.values = {name: value.published() if hasattr(value, "published") and value == type(value)()
                                else value for name, value in values.items()}
             if given.config is not None:

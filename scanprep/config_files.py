@@ -93,7 +93,8 @@ def _hints(cls: type) -> dict[str, Any]:
 
 def comment(text: str) -> str:
     """Paragraphs as comment lines of a file, with an empty line after them; nothing for no text."""
-    parts = [textwrap.fill(part, 102, initial_indent="# ", subsequent_indent="# ") for part in text.split("\n\n") if part]
+    parts = [textwrap.fill(part, 102, initial_indent="# ", subsequent_indent="# ")
+             for part in text.split("\n\n") if part]
     return "\n#\n".join(parts) + "\n\n" * bool(parts)
 
 
