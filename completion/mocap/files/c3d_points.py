@@ -9,7 +9,7 @@ import numpy as np
 
 from scanprep.geometry.format_common import UNITS
 
-from .c3d import BLOCK, PointTable, file_parameters, point_table
+from .c3d import BLOCK, PointTable, as_floats, file_parameters, holds, parameter_records, point_table
 from .text import MarkerFileError
 
 _MOST = 255                          # values along one dimension of a parameter, and blocks of all parameters
@@ -29,9 +29,8 @@ def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Seq
     points = np.zeros((*positions.shape[:2], 4))
     points[..., :3] = positions / UNITS[unit or table.unit] / (1.0 if table.kind == "f4" else table.scale)
     points[np.isnan(points).any(axis=2)] = [0, 0, 0, -1]
-    if table.kind == "i2" and np.abs(points).max(initial=0) > 32767:
-        raise MarkerFileError(f"{path}: expected places within {32767 * abs(table.scale):g} {table.unit}, which its "
-                              f"whole numbers reach, got {np.abs(positions).max():g} m")
+    if table.kind == "i2" and not holds(points):
+        return add_points(path, as_floats(path, data), labels, descriptions, positions, unit)
     begin = (data[0] - 1) * BLOCK
     described = [str(text) for text in file_parameters(data, table.numbers).get(("POINT", "DESCRIPTIONS"), [])]
     described = (described + [""] * len(table.labels))[:len(table.labels)]
@@ -59,7 +58,7 @@ def _frames(data: bytes, table: PointTable, points: np.ndarray) -> bytes:
 def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: list[str], descriptions: list[str]
              ) -> bytes:
     """The parameters, all but those that tell of the points as they stand there."""
-    records = list(_records(data, begin + 4, table))
+    records = list(_records(data, table))
     group = next(-number for number, name, _ in records if number < 0 and name == "POINT")
     kept = [record for number, name, record in records if not (
         number == group and (name in ("USED", "DATA_START") or name.startswith(("LABELS", "DESCRIPTIONS"))))]
@@ -92,17 +91,11 @@ def _linked(record: bytes, order: str, last: bool) -> bytes:
     return record[:name] + struct.pack(f"{order}H", 0 if last else len(record) - name + 2) + record[name:]
 
 
-def _records(data: bytes, place: int, table: PointTable) -> Iterator[tuple[int, str, bytes]]:
+def _records(data: bytes, table: PointTable) -> Iterator[tuple[int, str, bytes]]:
     """Group, negative for that of a group itself, name, and the bytes of every record without its link."""
-    while place + 2 < len(data) and data[place]:
-        length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
-        link = place + 2 + length
-        step = struct.unpack_from(f"{table.numbers.order}H", data, link)[0]
-        end = link + (step or _last(data, link + 2, group) - link)
-        yield group, data[place + 2:link].decode("latin-1").upper(), data[place:link] + data[link + 2:end]
-        if not step:
-            return
-        place = end
+    for group, name, place, link, step in parameter_records(data, table.numbers):
+        end = link + step if step else _last(data, link + 2, group)
+        yield group, name, data[place:link] + data[link + 2:end]
 
 
 def _last(data: bytes, place: int, group: int) -> int:
