@@ -158,9 +158,9 @@ def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]
             if len(above) > _DEEPEST:
                 raise words.wrong(f"at most {_DEEPEST} joints below each other", "more")
     if words.look("MOTION").lower() == "root":
-        more = [line.split(None, 1)[1] for line in words.lines[words.line - 1:] if re.match(r"\s*ROOT\s+\S", line, re.I)]
-        raise StorageError(f"{words.path}, line {words.line}: expected the skeleton of one person, found a ROOT each of "
-                           f"several: {', '.join([joints[0].name, *more])[:80]}; export each to a file of its own")
+        more = [line.split()[1] for line in words.lines[words.line - 1:] if re.match(r"\s*root\s+\S", line, re.I)]
+        raise StorageError(f"{words.path}, line {words.line}: expected the skeleton of one person, found several: "
+                           f"{', '.join([joints[0].name, *more])[:80]}; export each to a file of its own")
     return joints, ends
 
 
@@ -226,7 +226,8 @@ def _steps(joints: list[_Joint], values: list[np.ndarray]) -> np.ndarray:
         carriers.add(next(j for j, joint in enumerate(joints) if joint.parent == max(carriers)))
     length = np.linalg.norm([joint.offset for joint in joints], axis=1)
     off = [np.abs(np.linalg.norm(steps, axis=2) - length).mean(axis=0) for steps in (instead, added)]
-    bones = [j for j, joint in enumerate(joints) if j not in carriers and any(k == "position" for k, _ in joint.channels)]
+    bones = [j for j, joint in enumerate(joints)
+             if j not in carriers and any(kind == "position" for kind, _ in joint.channels)]
     votes = sum(np.sign(off[1][bones] - off[0][bones])) if bones else 0
     out = np.asarray(added if votes < 0 else instead)
     for j in carriers if votes >= 0 else ():
@@ -243,8 +244,8 @@ def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tup
     time = words.said("Frame Time", "the seconds of a frame")
     if rate is None and not 1e-6 < time < 1e6:
         rate = USUAL_RATE
-        warnings.warn(f"{words.path}: its Frame Time is {time:g}: {USUAL_RATE:g} frames a second are assumed; say rate=",
-                      stacklevel=2)
+        warnings.warn(f"{words.path}: its Frame Time is {time:g}: {USUAL_RATE:g} frames a second are assumed; "
+                      "say rate=", stacklevel=2)
     wanted = sum(len(joint.channels) for joint in joints)
     if not wanted:
         raise StorageError(f"{words.path}: expected joints with channels, found {len(joints)} joints without")
@@ -253,6 +254,9 @@ def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tup
     rows = [(number, row if len(row) >= wanted else _GLUED.sub(" ", " ".join(row)).split()) for number, row in rows]
     flat = [word for _, row in rows for word in row]
     frames = len(flat) // wanted
+    if frames * len(joints) > 10**6 + 4 * sum(map(len, words.lines)):
+        raise StorageError(f"{words.path}: expected frames of joints with channels, found {frames} frames of "
+                           f"{len(joints)} joints with {wanted} channels")
     if len(flat) != frames * wanted:                             # a frame may be broken into several lines
         odd = [(number, row) for number, row in rows if len(row) != wanted]
         if 0 < len(odd) < len(rows) / 2:

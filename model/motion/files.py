@@ -137,8 +137,8 @@ def _frame_rate(path: Path, a: dict[str, np.ndarray]) -> float:
     """Frames a second as the file says, or as most programs assume."""
     name = next((name for name in RATES if name in a), None)
     if name is None:
-        warnings.warn(f"{path}: it does not say its frames a second ({RATES[0]}), {USUAL_RATE:g} are assumed; say rate=",
-                      stacklevel=4)
+        warnings.warn(f"{path}: it does not say its frames a second ({RATES[0]}), {USUAL_RATE:g} are assumed; "
+                      "say rate=", stacklevel=4)
         return USUAL_RATE
     if np.size(a[name]) != 1:
         raise ValueError(f"{name}: expected one number, found shape {np.shape(a[name])}")

@@ -95,8 +95,8 @@ def table_rows(path: str | Path, data: bytes, error: type[StorageError] = Storag
 
 
 # How programs print a number that there is none of, in small letters.
-_NONE = {"", "nan", "-nan", "nan(ind)", "-nan(ind)", "nan(snan)", "-nan(snan)", "1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind",
-         "1.#snan", "null", "none", "na", "n/a", "-", "--", "#n/a"}
+_NONE = {"", "nan", "-nan", "nan(ind)", "-nan(ind)", "nan(snan)", "-nan(snan)", "1.#qnan", "-1.#qnan", "1.#ind",
+         "-1.#ind", "1.#snan", "null", "none", "na", "n/a", "-", "--", "#n/a"}
 
 
 def number_cells(cells: Sequence[str], decimal_commas: bool = False) -> list[float]:

@@ -139,7 +139,8 @@ def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> 
 
 
 def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | Path | None = None,
-                  subject_prefix: str | None = None, unit: str | None = None, joints: MarkerSequence | None = None) -> None:
+                  subject_prefix: str | None = None, unit: str | None = None, joints: MarkerSequence | None = None
+                  ) -> None:
     """Write the markers of a sequence with all gaps filled, whole or not at all.
 
     In a C3D file, points that were computed have residual 0 and no cameras, as the format says, and measured ones a
@@ -181,11 +182,13 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
             _add_joints(source or path, beside, joints, subject_prefix, None if source is None else unit)
 
 
-def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject_prefix: str | None, unit: str | None) -> None:
+def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject_prefix: str | None, unit: str | None
+                ) -> None:
     """Joint centres into a C3D file, under the name of the subject, if labels have one."""
     data = file.read_bytes()
     taken = point_table(name, data).labels
-    who = (subject_prefix or "").split(",")[0] or next((label.rpartition(":")[0] for label in taken if ":" in label), "")
+    who = (subject_prefix or "").split(",")[0]
+    who = who or next((label.rpartition(":")[0] for label in taken if ":" in label), "")
     labels: list[str] = []
     for label in joints.labels:
         label = f"{who}:{label}" if who else label

@@ -180,7 +180,7 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
     count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
     width = (4 * count + analog) * size
     if frames > MOST_FRAMES and frames == (end - start) // width:      # not those that only fill the last block
-        while frames * width + BLOCK > end - start and not any(data[start + (frames - 1) * width:start + frames * width]):
+        while end - start - frames * width < BLOCK and not any(data[start + (frames - 1) * width:][:width]):
             frames -= 1
     labels = _labels(parameters, count)
     computed = {label for key in _COMPUTED for label in parameters.get(("POINT", key), ())}
@@ -224,7 +224,7 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
         raise _Damaged(f"truncated: expected {frames} frames in {wanted} bytes, found {len(data)} bytes")
     count, analog, frames, size = (exact or usual)[0]
     told = [(header_count, count, "points"), (header_analog, analog, "analog values a frame")]
-    told += [(last - first + 1, frames, "frames")] if last < MOST_FRAMES else []
+    told += [(max(last - first + 1, 0), frames, "frames")] if last < MOST_FRAMES else []
     notes = [f"the header says {said} {what}; by the size of the file and its parameters there are {taken}"
              for said, taken, what in told if said != taken]
     if size != sizes[0]:
@@ -262,7 +262,8 @@ def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[i
     if all(len(end) == 2 for end in ends):
         low, high = ((int(end[0]) & 0xFFFF) + 65536 * (int(end[1]) & 0xFFFF) for end in ends)
         said.append(high - low + 1)
-    said += [int(value) for value in parameters.get(("POINT", "LONG_FRAMES"), ())[:1] if isinstance(value, float | int) and 0 < value < 2**31]
+    long = parameters.get(("POINT", "LONG_FRAMES"), ())[:1]
+    said += [int(value) for value in long if isinstance(value, float | int) and 0 < value < 2**31]
     counted = max(last - first + 1, 0)
     if last < MOST_FRAMES:
         return [counted, *_whole(parameters, "POINT", "FRAMES"), *said]

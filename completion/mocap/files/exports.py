@@ -71,8 +71,8 @@ def _qualisys(path: Path, rows: Rows) -> RawMarkers:
     names = [name for name in said.get("MARKER_NAMES", ()) if name]
     kind = " ".join(said.get("DATA_INCLUDED", ["3D"]))
     if not names or kind != "3D":
-        raise MarkerFileError(f"{path}: expected a TSV of 3D data from Qualisys Track Manager, with MARKER_NAMES, found "
-                              f"{kind} data; export 3D data, or C3D")
+        raise MarkerFileError(f"{path}: expected a TSV of 3D data from Qualisys Track Manager, with MARKER_NAMES, "
+                              f"found {kind} data; export 3D data, or C3D")
     if start == len(rows):
         raise MarkerFileError(f"{path}: expected frames below the names of the markers, found none")
     clock = 2 if rows[start - 1][1][0] == "Frame" else 0

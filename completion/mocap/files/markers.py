@@ -99,7 +99,7 @@ class MarkerSequence:
 
 
 def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str | None = None,
-                 rate: float | None = None) -> MarkerSequence:
+                 rate: float | None = None, usual_rate: float | None = None) -> MarkerSequence:
     """Read a marker sequence.
 
     What a file says wrongly of itself and what was done about it is told in a UserWarning each: another number of
@@ -118,6 +118,8 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
         one person.
     rate : float, optional
         Frames per second, where the file does not say or says it wrongly.
+    usual_rate : float, optional
+        Frames per second to assume, with a warning, where the file does not say; without it such a file is refused.
 
     Returns
     -------
@@ -141,18 +143,21 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
     own_unit = unit or unit_named(raw.unit)
     if own_unit is None:
         raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{raw.unit}'; say unit=")
+    notes = list(raw.notes)
     if rate is None and raw.rate is None:
-        raise MarkerFileError(f"{path}: expected the frames per second, it does not say them; say rate=")
+        if usual_rate is None:
+            raise MarkerFileError(f"{path}: expected the frames per second, it does not say them; say rate=")
+        notes.append(f"it does not say its frames per second, {usual_rate:g} are assumed")
     columns, labels = subject_columns(path, raw.labels, subject_prefix)
     places, filled = _without_fill(raw.positions[:, columns])
-    for note in (*raw.notes, *filled):
+    for note in (*notes, *filled):
         warnings.warn(f"{path}: {note}", stacklevel=2)
     positions = UNITS[own_unit] * places
     if (np.abs(positions) > FARTHEST).any():
         raise MarkerFileError(f"{path}: expected positions that are finite and below {FARTHEST:g} m, found "
                               f"{np.nanmax(np.abs(positions)):.3g}")
     try:
-        return MarkerSequence(positions, labels, rate or raw.rate or 0.0)
+        return MarkerSequence(positions, labels, rate or raw.rate or usual_rate or 0.0)
     except ValueError as error:
         raise MarkerFileError(f"{path}: {error}") from None
 

@@ -71,7 +71,8 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     rows = [(number, cells if len(cells) > 1 else cells[0].split()) for number, cells in split]
     if len(rows) < 4 or not rows[0][1][0].startswith("PathFileType"):
         raise MarkerFileError(f"{path}: expected a TRC file that begins with 'PathFileType' and has five lines "
-                              f"of header, found {len(rows)} lines, first {' '.join(rows[0][1])[:30] if rows else ''!r}")
+                              f"of header, found {len(rows)} lines, first "
+                              f"{' '.join(rows[0][1])[:30] if rows else ''!r}")
     said = dict(zip((key.lower() for key in rows[1][1]), rows[2][1], strict=False))
     rate, frames, count = (_header_number(path, rows[2], said, key) for key in ("DataRate", "NumFrames", "NumMarkers"))
     named = next((k for k, (_, cells) in enumerate(rows) if cells[0].lower().startswith("frame")), 3)
@@ -168,7 +169,7 @@ def csv_markers(path: Path, separator: str, rows: Rows) -> RawMarkers:
 
 
 def table_numbers(path: Path, rows: Rows, width: int, separator: str, fill: bool = False) -> np.ndarray:
-    """The numbers (T, width) of some lines, NaN for an empty cell and, to `fill`, for those that a line ends without."""
+    """The numbers (T, width) of some lines, NaN for an empty cell and, if `fill`, where a line ends before."""
     table = np.full((len(rows), width), np.nan)
     for place, (number, cells) in zip(table, rows, strict=True):
         if len(cells) > width or (len(cells) < width and not fill):
@@ -200,8 +201,8 @@ def _rate(path: Path, times: np.ndarray, numbers: Sequence[int]) -> float | None
         typical = (times[-1] - times[0]) / (len(times) - 1)
         off = np.flatnonzero(~(np.abs(np.diff(times) - typical) <= 0.5 * typical))
         k = int(off[0]) if len(off) else 0
-        raise MarkerFileError(f"{path}: line {numbers[k + 1] if len(off) else numbers[0]}: expected times in even steps "
-                              f"of {typical:.4g} s, found {times[k + 1]:.6g} s after {times[k]:.6g} s")
+        raise MarkerFileError(f"{path}: line {numbers[k + 1] if len(off) else numbers[0]}: expected times in even "
+                              f"steps of {typical:.4g} s, found {times[k + 1]:.6g} s after {times[k]:.6g} s")
     return rate
 
 
