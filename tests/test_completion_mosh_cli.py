@@ -11,7 +11,7 @@ from mosh_folders import FRAMES, run, small_pictures, write_people
 from scene_reader import scenes_of
 
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
-from completion.mocap.mosh.recordings import Grouping, find_actors
+from completion.mocap.mosh.recordings import Grouping, find_actors, write_table
 from completion.mocap.mosh.takes import held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion_pictures import played
@@ -191,8 +191,15 @@ def test_who_is_who(tmp_path):
         "Adam": ["dance"], "zoe": ["1.csv", "1.trc", "day_1"]}
     who = {a.name: [r.who for r in a.recordings] for a in find_actors([tmp_path], Grouping())}
     assert who["Adam"] == ["Adam"] and who["Eve"] == ["Eve", None]
-    assert set(names(find_actors([tmp_path], Grouping("name")))) == {"85", "7", "a", "walk", "dance", "1"}
+    assert set(names(find_actors([tmp_path], Grouping("name")))) == {"85", "7", "a", "walk", "Eve", "Adam",
+                                                                           "1"}
     assert [a.name for a in find_actors([tmp_path / "zoe"], Grouping("all"))] == ["zoe"]
+    one = {"Eve": ["dance"], "Adam": ["dance"]}                             # a file by itself as in a folder
+    assert names(find_actors([tmp_path / "dance.c3d"], Grouping())) == one
+    assert [a.name for a in find_actors([tmp_path / "dance.c3d"], Grouping.of("auto", "Eve"))] == ["Eve"]
+    write_table(tmp_path / "subjects.csv", find_actors([tmp_path / "dance.c3d"], Grouping()))
+    mended = find_actors([tmp_path / "dance.c3d"], Grouping.of(str(tmp_path / "subjects.csv")))
+    assert names(mended) == one and [a.recordings[0].who for a in mended] == ["Adam", "Eve"]
     files = [tmp_path / "85_02.csv", tmp_path / "a.csv"]
     assert names(find_actors(files, Grouping())) == {"85": ["85_02", "a"]}
     assert names(find_actors(files, Grouping("each"))) == {"85_02": ["85_02"], "a": ["a"]}
