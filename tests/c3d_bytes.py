@@ -35,7 +35,8 @@ def c3d_bytes(places, labels, rate=100.0, unit="mm", scale=-1.0, analog=None, mo
     values = np.zeros((T, L, 4))
     values[..., :3] = np.where(missing[..., None], 0, places / (1 if scale < 0 else scale))
     values[..., 3] = np.where(missing, -1, 0)
-    rows = np.concatenate([values.reshape(T, -1), np.zeros((T, 0)) if analog is None else analog.reshape(T, -1)], axis=1)
+    more_values = np.zeros((T, 0)) if analog is None else analog.reshape(T, -1)
+    rows = np.concatenate([values.reshape(T, -1), more_values], axis=1)
     body = rows.astype("<f4").tobytes() if scale < 0 else np.rint(rows).astype("<i2").tobytes()
     return head + section + body + bytes(-len(body) % BLOCK)
 

@@ -198,6 +198,7 @@ def test_a_unit_that_is_spelled_out_is_read_and_written_back(tmp_path):
     lambda text: text.replace("walk.trc", "walk").replace(".", ","),
     lambda text: text.replace("C7\t\t\tLKNE", "C7   LKNE"),
     lambda text: text.replace("X1\tY1\tZ1", "X5\tY5\tZ5"),
+    lambda text: text.replace("50.00\t", "  50.0\t\t").replace("12\t4\t", "12\t\t   4\t\t "),
     lambda text: text.replace("\n\n", "\n"),                       # without the empty line
     lambda text: text.replace("\n", "\r\n"),
     lambda text: text.replace("walk.trc", "C:/a,b,c,d,e/walk.trc"),

@@ -197,8 +197,10 @@ def test_who_is_who(tmp_path):
     one = {"Eve": ["dance"], "Adam": ["dance"]}                             # a file by itself as in a folder
     assert names(find_actors([tmp_path / "dance.c3d"], Grouping())) == one
     assert [a.name for a in find_actors([tmp_path / "dance.c3d"], Grouping.of("auto", "Eve"))] == ["Eve"]
-    write_table(tmp_path / "subjects.csv", find_actors([tmp_path / "dance.c3d"], Grouping()))
-    mended = find_actors([tmp_path / "dance.c3d"], Grouping.of(str(tmp_path / "subjects.csv")))
+    table = tmp_path / "who.csv"
+    write_table(table, find_actors([tmp_path / "dance.c3d"], Grouping()))
+    mended = find_actors([tmp_path / "dance.c3d"], Grouping.of(str(table)))
+    table.unlink()
     assert names(mended) == one and [a.recordings[0].who for a in mended] == ["Adam", "Eve"]
     files = [tmp_path / "85_02.csv", tmp_path / "a.csv"]
     assert names(find_actors(files, Grouping())) == {"85": ["85_02", "a"]}

@@ -73,7 +73,9 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
         raise MarkerFileError(f"{path}: expected a TRC file that begins with 'PathFileType' and has five lines "
                               f"of header, found {len(rows)} lines, first "
                               f"{' '.join(rows[0][1])[:30] if rows else ''!r}")
-    said = dict(zip((key.lower() for key in rows[1][1]), rows[2][1], strict=False))
+    keys, values = ([cell for cell in rows[k][1] if cell] for k in (1, 2))
+    # cells without anything separate here, and there stand for a value that is not said
+    said = dict(zip(map(str.lower, keys), values if len(values) == len(keys) else rows[2][1], strict=False))
     rate, frames, count = (_header_number(path, rows[2], said, key) for key in ("DataRate", "NumFrames", "NumMarkers"))
     named = next((k for k, (_, cells) in enumerate(rows) if cells[0].lower().startswith("frame")), 3)
     body = rows[named + 1:]
