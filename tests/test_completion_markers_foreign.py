@@ -7,7 +7,8 @@ from c3d_bytes import BLOCK, c3d_bytes
 from marker_files import refused
 
 from completion.mocap.artefacts.results import MarkerArtefacts, write_virtual
-from completion.mocap.files.c3d import point_table
+from completion.mocap.files.c3d import file_parameters, point_table, rotations_start
+from completion.mocap.files.c3d_points import add_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, marker_subjects, people_of, read_markers
 from scanprep.geometry.format_common import unit_named
 
@@ -172,6 +173,19 @@ def test_joint_centres_beyond_the_whole_numbers_of_a_file_make_it_a_floating_poi
     rows = np.frombuffer(data[table.start:table.start + 12 * table.width], "<f4").reshape(12, -1)
     np.testing.assert_array_equal(rows[:, 4 * 5:].reshape(24, 2), analog)
     np.testing.assert_array_equal(np.frombuffer(data[12:16], "<f4"), -np.float32(0.1))
+
+
+def test_rotations_stay_behind_the_points_that_are_added(tmp_path):
+    turns = np.arange(17 * 12, dtype="<f4").tobytes()
+    data = c3d_bytes(PLACES, LABELS, RATE, more=[("ROTATION", "USED", 1), ("ROTATION", "DATA_START", 0)])
+    place = len(data) // BLOCK + 1
+    data = c3d_bytes(PLACES, LABELS, RATE, more=[("ROTATION", "USED", 1), ("ROTATION", "DATA_START", place)]) + turns
+    out = add_points(tmp_path / "a.c3d", data, ["D1", "D2"], ["", ""], np.ones((12, 2, 3)))
+    table = point_table(tmp_path / "a.c3d", out)
+    start = rotations_start(file_parameters(out, table.numbers), table.start, len(out))
+    assert out[start:] == turns and table.labels == (*LABELS, "D1", "D2")
+    (tmp_path / "a.c3d").write_bytes(out)
+    np.testing.assert_allclose(read_markers(tmp_path / "a.c3d").positions[:, :4], PLACES / 1000, atol=1e-6)
 
 
 # units

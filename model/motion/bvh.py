@@ -26,8 +26,8 @@ def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSk
 
     Turns are taken in the order of the channels, each about axes that turn with the part; channels of scale are left
     out. Position channels of some programs hold the change of the offset, of others the offset itself, changed: what
-    comes nearer to bones of constant length is taken for all joints, and the latter where no bone tells. What the file
-    says wrongly of itself, and what was done about it, is told in a UserWarning each.
+    comes nearer to bones of constant length is taken. Those of the root are its place, unless bones hold changes. What
+    the file says wrongly of itself, and what was done about it, is told in a UserWarning each.
 
     Parameters
     ----------
@@ -209,9 +209,9 @@ def _posed(joints: list[_Joint], table: np.ndarray, metre: float) -> tuple[np.nd
 def _steps(joints: list[_Joint], values: list[np.ndarray]) -> np.ndarray:
     """(T, J, 3) from the parent to each joint, in the unit of the file, some axes of whose place may have channels.
 
-    All channels of a file mean the same, the offset itself or its change. Bones tell which: their length is that of
-    the offset. The joints that carry the body through the room are none, and say nothing: the root, and the first
-    that has several below it. A channel there that is always 0 is no place.
+    They are the offset itself or its change. Bones tell which: their length is that of the offset. The joints that
+    carry the body through the room, the root and those to the first with several below it, are no bones: theirs mean
+    what those of most bones do, the place itself where no bone has any. A channel there that is always 0 is no place.
     """
     T = len(values[0])
     added = np.tile(np.array([joint.offset for joint in joints], dtype=float), (T, 1, 1))
@@ -228,13 +228,12 @@ def _steps(joints: list[_Joint], values: list[np.ndarray]) -> np.ndarray:
     off = [np.abs(np.linalg.norm(steps, axis=2) - length).mean(axis=0) for steps in (instead, added)]
     bones = [j for j, joint in enumerate(joints)
              if j not in carriers and any(kind == "position" for kind, _ in joint.channels)]
-    votes = sum(np.sign(off[1][bones] - off[0][bones])) if bones else 0
-    out = np.asarray(added if votes < 0 else instead)
-    for j in carriers if votes >= 0 else ():
+    changes = off[1] < off[0]                                     # of each joint by itself
+    most = 2 * changes[bones].sum() > len(bones)
+    for j in carriers:
         places = [k for k, (kind, _) in enumerate(joints[j].channels) if kind == "position"]
-        if not values[j][:, places].any():
-            out[:, j] = added[:, j]
-    return out
+        changes[j] = most or not values[j][:, places].any()
+    return np.where(changes[:, None], added, instead)
 
 
 def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tuple[np.ndarray, float]:

@@ -174,10 +174,12 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
     scale = float(numbers.floats(data[12:16])[0])
     if start < BLOCK or not np.isfinite(scale):
         raise _Damaged(f"damaged: the header says that the points begin at byte {start}, their scale is {scale}")
-    # points end where rotations begin, or else with the file
-    rotations = (int(parameters.get(("ROTATION", "DATA_START"), [0])[0]) & 0xFFFF) - 1
-    end = BLOCK * rotations if start < BLOCK * rotations < len(data) else len(data)
-    count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
+    end = rotations_start(parameters, start, len(data)) or len(data)
+    try:
+        count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
+    except _Damaged:                     # perhaps it is the place of the rotations that is wrong
+        end = len(data)
+        count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
     width = (4 * count + analog) * size
     if frames > MOST_FRAMES and frames == (end - start) // width:      # not those that only fill the last block
         while end - start - frames * width < BLOCK and not any(data[start + (frames - 1) * width:][:width]):
@@ -230,6 +232,13 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
     if size != sizes[0]:
         notes.append("the scale in the header has the wrong sign for the size of the file")
     return count, analog, frames, size, tuple(notes)
+
+
+def rotations_start(parameters: _Parameters, start: int, size: int) -> int:
+    """Byte of the rotations behind the points, which begin at `start`; 0 where there are none."""
+    place = BLOCK * (sum(_whole(parameters, "ROTATION", "DATA_START")) - 1)
+    used = _whole(parameters, "ROTATION", "USED") or [len(parameters.get(("ROTATION", "LABELS"), ()))]
+    return place if used[0] and start < place < size else 0
 
 
 def _nothing(parameters: _Parameters, frames: int) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from scanprep.geometry.format_common import UNITS
 
-from .c3d import BLOCK, PointTable, as_floats, file_parameters, holds, parameter_records, point_table
+from .c3d import BLOCK, PointTable, as_floats, file_parameters, holds, parameter_records, point_table, rotations_start
 from .text import MarkerFileError
 
 _MOST = 255                          # values along one dimension of a parameter, and blocks of all parameters
@@ -32,17 +32,21 @@ def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Seq
     if table.kind == "i2" and not holds(points):
         return add_points(path, as_floats(path, data), labels, descriptions, positions, unit)
     begin = (data[0] - 1) * BLOCK
-    described = [str(text) for text in file_parameters(data, table.numbers).get(("POINT", "DESCRIPTIONS"), [])]
+    parameters = file_parameters(data, table.numbers)
+    described = [str(text) for text in parameters.get(("POINT", "DESCRIPTIONS"), [])]
+    body, behind = _padded(_frames(data, table, points)), rotations_start(parameters, table.start, len(data))
+    behind = behind if behind >= table.start + table.frames * table.width else 0
     described = (described + [""] * len(table.labels))[:len(table.labels)]
     try:
-        section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions])
+        section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions],
+                           len(body) // BLOCK if behind else 0)
     except (struct.error, IndexError, ValueError, OverflowError, StopIteration) as error:
         raise MarkerFileError(f"{path}: expected C3D parameters with a group POINT that can take more points "
                               f"({type(error).__name__} {error})") from None
     head = bytearray(data[:begin])
     struct.pack_into(f"{table.numbers.order}H", head, 2, len(table.labels) + len(labels))
     struct.pack_into(f"{table.numbers.order}H", head, 16, (begin + len(section)) // BLOCK + 1)
-    return bytes(head) + section + _padded(_frames(data, table, points))
+    return bytes(head) + section + body + (data[behind:] if behind else b"")
 
 
 def _frames(data: bytes, table: PointTable, points: np.ndarray) -> bytes:
@@ -55,13 +59,18 @@ def _frames(data: bytes, table: PointTable, points: np.ndarray) -> bytes:
     return np.concatenate([rows[:, :own], added, rows[:, own:]], axis=1).tobytes()
 
 
-def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: list[str], descriptions: list[str]
-             ) -> bytes:
-    """The parameters, all but those that tell of the points as they stand there."""
+def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: list[str], descriptions: list[str],
+             before_rotations: int) -> bytes:
+    """The parameters, all but those that tell of the points as they stand there.
+
+    `before_rotations` is the number of blocks of points where rotations follow, else 0.
+    """
     records = list(_records(data, table))
     group = next(-number for number, name, _ in records if number < 0 and name == "POINT")
+    turned = next((-number for number, name, _ in records if number < 0 and name == "ROTATION"), 0)
     kept = [record for number, name, record in records if not (
-        number == group and (name in ("USED", "DATA_START") or name.startswith(("LABELS", "DESCRIPTIONS"))))]
+        number == group and (name in ("USED", "DATA_START") or name.startswith(("LABELS", "DESCRIPTIONS"))))
+        and not (before_rotations and (number, name) == (turned, "DATA_START"))]
     order = table.numbers.order
     kept.append(_parameter(group, "USED", b"\x02\x00" + struct.pack(f"{order}H", len(labels))))
     for name, texts in (("LABELS", labels), ("DESCRIPTIONS", descriptions)):
@@ -71,11 +80,14 @@ def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: lis
             cells = b"".join(text.encode("latin-1", "replace")[:width].ljust(width) for text in some)
             kept.append(_parameter(group, name + (str(part) if part > 1 else ""),
                                    bytes([255, 2, width, len(some)]) + cells))
-    start = _parameter(group, "DATA_START", b"\x02\x00\x00\x00")
-    blocks = -(-(4 + sum(map(len, kept)) + 2 * len(kept) + len(start) + 2) // BLOCK)
+    starts = [_parameter(group, "DATA_START", b"\x02\x00\x00\x00")]
+    starts += [_parameter(turned, "DATA_START", b"\x02\x00\x00\x00")] if before_rotations else []
+    blocks = -(-(4 + sum(len(record) + 2 for record in [*kept, *starts])) // BLOCK)
     if blocks > _MOST:
         raise MarkerFileError(f"{path}: expected room for more points, the C3D parameters are full")
-    kept.append(start[:-3] + struct.pack(f"{order}H", begin // BLOCK + blocks + 1) + start[-1:])
+    first = begin // BLOCK + blocks + 1
+    kept += [start[:-3] + struct.pack(f"{order}H", place) + start[-1:]
+             for start, place in zip(starts, (first, first + before_rotations), strict=False)]
     linked = [_linked(record, order, last=i == len(kept) - 1) for i, record in enumerate(kept)]
     return _padded(data[begin:begin + 2] + bytes([blocks, table.numbers.processor]) + b"".join(linked))
 
