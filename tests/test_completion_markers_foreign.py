@@ -63,7 +63,7 @@ def test_a_file_of_more_frames_than_the_header_counts(tmp_path, rotations):
     places = np.tile(np.array([0.0, 0.0, 900.0]), (T, 1, 1)) + np.arange(T)[:, None, None]
     blocks = T * 16 // BLOCK
     start = int.from_bytes(c3d_bytes(places[:1], ["A"], more=[("ROTATION", "DATA_START", 1)])[16:18], "little")
-    more = [("ROTATION", "DATA_START", start + blocks)] if rotations else []
+    more = [("ROTATION", "USED", 1), ("ROTATION", "DATA_START", start + blocks)] if rotations else []
     path = c3d(tmp_path, places, ["A"], header={"last": 65535}, more=more)
     if rotations:
         path.write_bytes(path.read_bytes() + np.ones(17 * T // 10, "<f4").tobytes())
@@ -122,9 +122,9 @@ def test_a_place_with_three_equal_numbers_among_others_is_a_place(tmp_path):
 def test_a_label_that_comes_twice_gets_a_name_of_its_own(tmp_path):
     twice = ("LKNE", "C7", "LKNE", "LKNE")
     path = c3d(tmp_path, labels=twice, more=[("POINT", "DESCRIPTIONS", ["L.Knee", "C7", "L.Knee.Medial", ""])])
-    with pytest.warns(UserWarning, match="LKNE comes again; that marker is called L.Knee.Medial"):
+    with pytest.warns(UserWarning, match="labels come again: LKNE now L.Knee.Medial, LKNE now LKNE_2"):
         same(read_markers(path), labels=("LKNE", "C7", "L.Knee.Medial", "LKNE_2"))
-    with pytest.warns(UserWarning, match="that marker is called LKNE_2"):
+    with pytest.warns(UserWarning, match="labels come again: LKNE now LKNE_2"):
         found = read_markers(trc(tmp_path, lambda text: text.replace("RKNE", "LKNE")))
     same(found, labels=("LFHD", "C7", "LKNE", "LKNE_2"))
 

@@ -18,6 +18,7 @@ from scanprep.geometry.storage import StorageError
 from scanprep.words import number_of
 
 Rows = Sequence[tuple[int, Sequence[str]]]           # number and cells of each line of a table
+MOST_TOLD = 6                        # labels in one note
 OTHER_RATE = 0.02                    # share by which a rate and its times differ where one of them is wrong
 
 
@@ -37,7 +38,7 @@ class RawMarkers:
 
 
 def distinct_labels(labels: Sequence[str], descriptions: Sequence[str] = ()) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Labels of which none comes twice, and a note for each that was changed.
+    """Labels of which none comes twice, and a note where some were changed.
 
     A label that was there before becomes its description, as programs that cut labels to four letters keep the whole
     name there, or else LABEL_2, LABEL_3, ...
@@ -47,18 +48,24 @@ def distinct_labels(labels: Sequence[str], descriptions: Sequence[str] = ()) -> 
     >>> distinct_labels(["LKNE", "LKNE", "C7"])[0]
     ('LKNE', 'LKNE_2', 'C7')
     """
-    taken, out, notes = set(labels), list[str](), list[str]()
+    taken, times, out, changed = set(labels), dict[str, int](), list[str](), list[str]()
     for i, label in enumerate(labels):
-        if label in out:
+        name = label
+        if label in times:
             who, colon, _ = label.rpartition(":")
             said = descriptions[i].strip() if i < len(descriptions) else ""
-            names = [f"{who}{colon}{said}"] if said and ":" not in said else []
-            names += [f"{label}_{k}" for k in range(2, len(labels) + 2)]
-            label = next(name for name in names if name not in taken)
-            notes.append(f"the label {labels[i]} comes again; that marker is called {label}")
-            taken.add(label)
-        out.append(label)
-    return tuple(out), tuple(notes)
+            name = f"{who}{colon}{said}" if said and ":" not in said else label
+            while name in taken:
+                times[label] += 1
+                name = f"{label}_{times[label]}"
+            taken.add(name)
+            changed.append(f"{label} now {name}")
+        times.setdefault(label, 1)
+        out.append(name)
+    if not changed:
+        return tuple(out), ()
+    more = f" and {len(changed) - MOST_TOLD} more" if len(changed) > MOST_TOLD else ""
+    return tuple(out), (f"labels come again: {', '.join(changed[:MOST_TOLD])}{more}",)
 
 
 def read_trc(path: Path, data: bytes) -> RawMarkers:
