@@ -169,6 +169,14 @@ def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
     assert [p.name for p in out.glob(".*")] == [".scapekit"]
 
 
+def test_a_recording_without_a_rate_asks_for_the_flag(place, tmp_path, capsys):
+    text = (place / "people" / "ann" / "walk.csv").read_text().splitlines()
+    rows = [f"{t}{line[line.index(','):]}" for t, line in enumerate(text[1:])]
+    (tmp_path / "walk.csv").write_text("\n".join(["frame" + text[0][4:], *rows]))
+    assert run(place, tmp_path / "walk.csv", "-o", tmp_path / "out") == 1
+    assert "expected the frames per second, it does not say them; say --rate" in capsys.readouterr().err
+
+
 def names(actors):
     return {actor.name: [r.name for r in actor.recordings] for actor in actors}
 

@@ -220,6 +220,12 @@ def test_smpl_as_the_library_has_it(tmp_path):
     np.testing.assert_array_equal(read_motion_file(tmp_path / "m.npz").poses, POSES[:, :24])
 
 
+def test_a_motion_of_another_program_says_what_to_export(tmp_path):
+    (tmp_path / "walk.fbx").write_bytes(b"Kaydara FBX Binary")
+    with pytest.raises(StorageError, match=r"walk\.fbx: expected a motion \(\.npz\), found FBX: .* export BVH"):
+        read_motion_file(tmp_path / "walk.fbx")
+
+
 def test_betas_of_every_frame(tmp_path):
     betas = np.arange(10) / 10.0
     found = stored(tmp_path, poses=FLAT, fps=20, betas=np.tile(betas, (T, 1)))

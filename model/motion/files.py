@@ -24,6 +24,14 @@ _PIECES = ({"root_orient": 3, "global_orient": 3}, {"pose_body": 63, "body_pose"
            {"pose_jaw": 3, "jaw_pose": 3}, {"pose_eye": 6, "leye_pose": 3}, {"reye_pose": 3},
            {"pose_hand": 90, "left_hand_pose": 45}, {"right_hand_pose": 45})
 _PLACES = ("trans", "transl")
+# What a motion of another program is, by its ending, and what to export there in its place.
+_ROTATIONS = "holds rotations of segments and no markers; export BVH in its place, for scape animate"
+OTHER_MOTIONS = {
+    ".fbx": "FBX: open it in Blender or MotionBuilder and export BVH, for scape animate",
+    ".asf": "the skeleton of an ASF/AMC pair: amc2bvh or Blender makes BVH of both, for scape animate",
+    ".amc": "the motion of an ASF/AMC pair: amc2bvh or Blender makes BVH of both, for scape animate",
+    ".mvnx": f"a file of Xsens MVN, which {_ROTATIONS}", ".htr": f"HTR of Motion Analysis, which {_ROTATIONS}",
+    ".gtr": f"GTR of Motion Analysis, which {_ROTATIONS}"}
 _TEXTS = ("gender", "surface_model_type")            # of which some files hold objects; then they are left out
 
 
@@ -73,6 +81,8 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
     if path.suffix.lower() == ".bvh":
         raise StorageError(f"{path}: expected a motion (.npz), found BVH; scape animate {path.name} -m MODEL -o OUT "
                            "puts it on a model")
+    if path.suffix.lower() in OTHER_MOTIONS:
+        raise StorageError(f"{path}: expected a motion (.npz), found {OTHER_MOTIONS[path.suffix.lower()]}")
     what, wanted = "a motion (.npz)", (
         "poses", *_PLACES, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
     a = storage.load_arrays(path, what, wanted)

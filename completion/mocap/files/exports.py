@@ -6,19 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from model.motion.files import OTHER_MOTIONS
 from scanprep.geometry import tables
 
 from .text import MarkerFileError, RawMarkers, Rows, csv_markers, distinct_labels, even_rate, table_numbers
 
 # What a file of another program is, by its ending, and what to export there in its place.
-_ROTATIONS = "holds rotations of segments and no markers; export BVH in its place, for scape animate"
-OTHERS = {".fbx": "FBX: open it in Blender or MotionBuilder and export BVH, for scape animate",
-          ".asf": "the skeleton of an ASF/AMC pair: amc2bvh or Blender makes BVH of both, for scape animate",
-          ".amc": "the motion of an ASF/AMC pair: amc2bvh or Blender makes BVH of both, for scape animate",
-          ".mvnx": f"a file of Xsens MVN, which {_ROTATIONS}",
-          ".htr": f"HTR of Motion Analysis, which {_ROTATIONS}",
-          ".gtr": f"GTR of Motion Analysis, which {_ROTATIONS}",
-          ".qtm": "a project file of Qualisys Track Manager: export C3D or TSV there",
+OTHERS = {**OTHER_MOTIONS, ".qtm": "a project file of Qualisys Track Manager: export C3D or TSV there",
           ".tak": "a take of Motive: export C3D or CSV there"}
 
 
