@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from c3d_bytes import BLOCK, c3d_bytes
 from marker_files import refused
-from people_bodies import small_people
 
 from completion.mocap.artefacts.results import MarkerArtefacts, write_virtual
 from completion.mocap.files.c3d import file_parameters, point_table, rotations_start
@@ -15,6 +14,7 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.robust import motion_problem
 from completion.motion import Motion
 from scanprep.geometry.format_common import unit_named
+from scanprep.geometry.mesh import Mesh
 
 LABELS = ("LFHD", "C7", "LKNE", "RKNE")
 RNG = np.random.default_rng(0)
@@ -317,11 +317,12 @@ def test_a_table_of_nexus_asks_for_c3d(tmp_path):
 
 def test_a_ghost_of_a_few_frames_does_not_make_a_recording_too_large():
     """The box that tells the unit is that of the usual frame, not of the largest."""
-    body, some = small_people().template, np.linspace(0, 99, 6).astype(int)
-    layout = MarkerLayout(tuple("ABCDEF"), some)
+    body = Mesh(np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.3, 0], [0, 0, 1.7]]),
+                np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
+    layout = MarkerLayout(LABELS, np.arange(4))
     places = np.tile(layout.place(body), (200, 1, 1))
     places[[17, 60], 3] += [0, 0, 50.0]
-    motion = Motion(np.zeros((200, 1, 3)), np.zeros((200, 3)), None, 100.0, np.full((200, 6), 0.005), layout.labels,
-                    trusted=np.ones((200, 6), dtype=bool))
-    assert motion_problem(motion, body, layout, MarkerSequence(places, layout.labels, 100.0)) is None
-    assert "wrong unit" in motion_problem(motion, body, layout, MarkerSequence(10 * places, layout.labels, 100.0))
+    motion = Motion(np.zeros((200, 1, 3)), np.zeros((200, 3)), None, 100.0, np.full((200, 4), 0.005), LABELS,
+                    trusted=np.ones((200, 4), dtype=bool))
+    assert motion_problem(motion, body, layout, MarkerSequence(places, LABELS, 100.0)) is None
+    assert "wrong unit" in motion_problem(motion, body, layout, MarkerSequence(10 * places, LABELS, 100.0))
