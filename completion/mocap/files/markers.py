@@ -149,6 +149,10 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
             raise MarkerFileError(f"{path}: expected the frames per second, it does not say them; say rate=")
         notes.append(f"it does not say its frames per second, {usual_rate:g} are assumed")
     columns, labels = subject_columns(path, raw.labels, subject_prefix)
+    together = people_of(raw.labels)
+    if subject_prefix is None and together and len(together[0]) > 1:
+        notes.append(f"the labels of {', '.join(together[0])} are taken as those of one person; take some with "
+                     f"subject_prefix={','.join(together[0][:2])}")
     places, filled = _without_fill(raw.positions[:, columns])
     for note in (*notes, *filled):
         warnings.warn(f"{path}: {note}", stacklevel=2)
