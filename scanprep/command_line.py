@@ -19,7 +19,7 @@ from typing import Any
 from . import config_files, ranges
 from .arguments import Argument, UsageError, make_parser, near, read_line, sentences
 from .config_files import Flag
-from .console import JUDGEMENT, Metric, Outcome, say, show, write_report
+from .console import JUDGEMENT, OUR_MODULES, Metric, Outcome, say, show, write_report
 from .interrupts import tidy_up
 from .threads import one_thread
 
@@ -248,7 +248,7 @@ def _notes(prog: str) -> Iterator[list[Callable[[str], str]]]:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=UserWarning, module=r"(scanprep|model|completion)(\.|$)")
+        warnings.filterwarnings("always", category=UserWarning, module=OUR_MODULES)
         warnings.showwarning = tell
         yield spelled
 
