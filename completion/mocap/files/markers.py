@@ -151,8 +151,9 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
     columns, labels = subject_columns(path, raw.labels, subject_prefix)
     together = people_of(raw.labels)
     if subject_prefix is None and together and len(together[0]) > 1:
-        notes.append(f"the labels of {', '.join(together[0])} are taken as those of one person; take some with "
-                     f"subject_prefix={','.join(together[0][:2])}")
+        most = Counter(label.rpartition(":")[0] for label in raw.labels if ":" in label).most_common(1)[0][0]
+        notes.append(f"the labels of {', '.join(together[0])} are taken as those of one person; those of one only are "
+                     f"taken with subject_prefix={most}")
     places, filled = _without_fill(raw.positions[:, columns])
     for note in (*notes, *filled):
         warnings.warn(f"{path}: {note}", stacklevel=2)
