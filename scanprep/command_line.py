@@ -19,7 +19,7 @@ from typing import Any
 from . import config_files, ranges
 from .arguments import Argument, UsageError, make_parser, near, read_line, sentences
 from .config_files import Flag
-from .console import JUDGEMENT, Metric, Outcome, say, show, write_report
+from .console import JUDGEMENT, OUR_MODULES, Metric, Outcome, say, show, write_report
 from .interrupts import tidy_up
 from .threads import one_thread
 
@@ -37,12 +37,13 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     interrupted. All others write to a folder of their own, from which the output takes its place when it is whole.
     """
     start, wrong, call = time.perf_counter(), 2, None
-    with _notes(prog), one_thread():
+    with _notes(prog) as notes, one_thread():
         try:
             if (text := settings_file(function, argv)) is not None:
                 sys.stdout.write(text + "\n")
                 return 0
             call = _Call(function, prog, argv)
+            notes.append(call.arguments.as_flags)
             wrong = 1
             tidy_up()
             outcome, report = call.carried_out(start)
@@ -55,7 +56,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             if os.environ.get(TRACEBACK):
                 raise
             for failure in getattr(error, "failures", ()):
-                say(call.real(f"{prog}: failed: {failure}") if call else failure)
+                say(call.real(f"{prog}: failed: {call.arguments.as_flags(failure)}") if call else failure)
             told = _told(error)
             say(f"{prog}: {told if call is None else call.real(call.arguments.as_flags(told))}")
             return 2 if isinstance(error, UsageError) else wrong
@@ -72,7 +73,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     if outcome.following and not failed:
         say(f"next: {call.real(outcome.following)}")
     for failure in outcome.failures:
-        say(call.real(f"{prog}: failed: {failure}"))
+        say(call.real(f"{prog}: failed: {call.arguments.as_flags(failure)}"))
     return 1 if outcome.failures or failed else 0
 
 
@@ -240,18 +241,21 @@ def _paths(values: Iterable[Any]) -> list[Path]:
 
 
 @contextlib.contextmanager
-def _notes(prog: str) -> Iterator[None]:
-    """Our own warnings as one line each; those of libraries are for their users, not for ours."""
+def _notes(prog: str) -> Iterator[list[Callable[[str], str]]]:
+    """Our own warnings as one line each, spelled by what is in the list; those of libraries are for their users."""
+    spelled: list[Callable[[str], str]] = []
+
+    def tell(message: Warning | str, *_rest: Any, **_named: Any) -> None:
+        text = " ".join(str(message).split())
+        for spell in spelled:
+            text = spell(text)
+        say(f"{prog}: note: {text}")
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=UserWarning, module=r"(scanprep|model|completion)(\.|$)")
-        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {_as_flags(str(message))}")
-        yield
-
-
-def _as_flags(text: str) -> str:
-    """A message of the library on one line, with its argument for units as the flag of the command line."""
-    return re.sub(r"\bunit='(\w+)'", r"--unit \1", " ".join(text.split()))
+        warnings.filterwarnings("always", category=UserWarning, module=OUR_MODULES)
+        warnings.showwarning = tell
+        yield spelled
 
 
 def _told(error: Exception) -> str:

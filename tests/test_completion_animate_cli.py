@@ -151,4 +151,4 @@ def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):
 
 def test_an_empty_folder_is_refused(place, tmp_path, capsys):
     assert run(place, tmp_path, "-o", tmp_path / "out") == 1
-    assert "expected files ending in .c3d, .trc, .csv, found none" in capsys.readouterr().err
+    assert "expected files ending in .c3d, .trc, .csv, .tsv, found none" in capsys.readouterr().err

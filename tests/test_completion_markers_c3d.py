@@ -71,26 +71,22 @@ def test_c3d_labels_lose_their_subject(tmp_path):
     path = c3d_file(tmp_path / "one.c3d", ["Ann:C7", "Ann:T10", "*3", "Ann:RKNE"], points)
     assert read_markers(path).labels == ("C7", "T10", "*3", "RKNE")
     path = c3d_file(tmp_path / "two.c3d", ["Ann:C7", "Bob:C7", "Ann:T10", "Bob:T10"], points)
-    with pytest.raises(MarkerFileError, match=r"two\.c3d: expected one subject, found Ann, Bob; say subject="):
+    with pytest.raises(MarkerFileError, match=r"expected one subject, found Ann, Bob; say subject_prefix=Ann"):
         read_markers(path)
-    bob = read_markers(path, subject="Bob")
+    bob = read_markers(path, subject_prefix="Bob")
     assert bob.labels == ("C7", "T10")
     np.testing.assert_allclose(bob.positions, 1e-3 * points.transpose(2, 1, 0)[:, [1, 3]])
     with pytest.raises(MarkerFileError, match=r"two\.c3d: expected the subject 'Cid', found Ann, Bob"):
-        read_markers(path, subject="Cid")
+        read_markers(path, subject_prefix="Cid")
 
 
 @pytest.mark.parametrize(("labels", "groups", "kept"), [
     (["C7", "LKneeAngles", "T10", "LKneeMoment"], {"ANGLES": ["LKneeAngles"], "MOMENTS": ["LKneeMoment"]},
      ("C7", "T10")),                                                 # computed quantities are no markers
-    (["C7", "", "T10"], {}, ("C7", "point1", "T10")), (["C7", "T10", "C7"], {}, None)])
+    (["C7", "", "T10"], {}, ("C7", "point1", "T10"))])
 def test_c3d_labels_of_all_kinds(tmp_path, labels, groups, kept):
     path = c3d_file(tmp_path / "a.c3d", labels, np.ones((3, len(labels), 2)), **groups)
-    if kept is None:
-        with pytest.raises(MarkerFileError, match=r"a\.c3d: labels: .* C7 comes more often"):
-            read_markers(path)
-    else:
-        assert read_markers(path).labels == kept
+    assert read_markers(path).labels == kept
 
 
 @pytest.mark.parametrize("part", [0.001, 0.05, 0.3, 0.6, 0.9])

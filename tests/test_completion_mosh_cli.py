@@ -13,7 +13,7 @@ from scene_reader import scenes_of
 
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
 from completion.__main__ import main
-from completion.mocap.mosh.recordings import Grouping, find_actors
+from completion.mocap.mosh.recordings import Grouping, find_actors, write_table
 from completion.mocap.mosh.takes import held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion_pictures import played
@@ -183,6 +183,14 @@ def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
     assert [p.name for p in out.glob(".*")] == [".scapekit"]
 
 
+def test_a_recording_without_a_rate_asks_for_the_flag(place, tmp_path, capsys):
+    text = (place / "people" / "ann" / "walk.csv").read_text().splitlines()
+    rows = [f"{t}{line[line.index(','):]}" for t, line in enumerate(text[1:])]
+    (tmp_path / "walk.csv").write_text("\n".join(["frame" + text[0][4:], *rows]))
+    assert run(place, tmp_path / "walk.csv", "-o", tmp_path / "out") == 1
+    assert "expected the frames per second, it does not say them; say --rate" in capsys.readouterr().err
+
+
 def names(actors):
     return {actor.name: [r.name for r in actor.recordings] for actor in actors}
 
@@ -205,8 +213,17 @@ def test_who_is_who(tmp_path):
         "Adam": ["dance"], "zoe": ["1.csv", "1.trc", "day_1"]}
     who = {a.name: [r.who for r in a.recordings] for a in find_actors([tmp_path], Grouping())}
     assert who["Adam"] == ["Adam"] and who["Eve"] == ["Eve", None]
-    assert set(names(find_actors([tmp_path], Grouping("name")))) == {"85", "7", "a", "walk", "dance", "1"}
+    assert set(names(find_actors([tmp_path], Grouping("name")))) == {"85", "7", "a", "walk", "Eve", "Adam",
+                                                                           "1"}
     assert [a.name for a in find_actors([tmp_path / "zoe"], Grouping("all"))] == ["zoe"]
+    one = {"Eve": ["dance"], "Adam": ["dance"]}                             # a file by itself as in a folder
+    assert names(find_actors([tmp_path / "dance.c3d"], Grouping())) == one
+    assert [a.name for a in find_actors([tmp_path / "dance.c3d"], Grouping.of("auto", "Eve"))] == ["Eve"]
+    table = tmp_path / "who.csv"
+    write_table(table, find_actors([tmp_path / "dance.c3d"], Grouping()))
+    mended = find_actors([tmp_path / "dance.c3d"], Grouping.of(str(table)))
+    table.unlink()
+    assert names(mended) == one and [a.recordings[0].who for a in mended] == ["Adam", "Eve"]
     files = [tmp_path / "85_02.csv", tmp_path / "a.csv"]
     assert names(find_actors(files, Grouping())) == {"85": ["85_02", "a"]}
     assert names(find_actors(files, Grouping("each"))) == {"85_02": ["85_02"], "a": ["a"]}

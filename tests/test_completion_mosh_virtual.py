@@ -70,8 +70,8 @@ def test_a_copy_of_the_file_with_other_points(tmp_path, original):
     a, b = original.read_bytes(), (tmp_path / "v.c3d").read_bytes()
     table = point_table(original, a)
     assert len(a) == len(b) and a[:table.start] == b[:table.start]
-    with pytest.raises(MarkerFileError, match="LFHD, RFHD, C7, Free not among"):
-        write_virtual(tmp_path / "w.c3d", faults, original, subject="Eve")
+    with pytest.raises(MarkerFileError, match="expected the subject 'Eve', found Bob"):
+        write_virtual(tmp_path / "w.c3d", faults, original, subject_prefix="Eve")
     assert not (tmp_path / "w.c3d").exists()
 
 
@@ -114,9 +114,12 @@ def test_whole_numbers_are_rounded_or_do_not_reach(tmp_path, original):
     np.testing.assert_array_equal(out[:, 2, :3], steps[:, 2] + 200)
     np.testing.assert_array_equal(out[:, :4, 3], np.tile([257, 257, 0, 257], (T, 1)))
     np.testing.assert_array_equal(out[:, 4], rows[:, 4])
-    with pytest.raises(MarkerFileError, match=r"within 16383\.5 mm, which its whole numbers reach, got 20 m"):
-        replace_points(original, whole, np.arange(4), 0 * positions + 20.0, 0 * source - 1)
-    assert len(sequence.labels) == 4
+    with pytest.warns(UserWarning, match=r"floating-point numbers, its whole ones reach only 16383\.5 mm"):
+        far = replace_points(original, whole, np.arange(4), 0 * positions + 20.0, 0 * source - 1)
+    (tmp_path / "far.c3d").write_bytes(far)
+    assert (read_markers(tmp_path / "far.c3d").positions == 20).all() and len(sequence.labels) == 4
+    words = point_table(original, far).words(far)
+    np.testing.assert_array_equal(words[:, 4], rows[:, 4] * [0.5, 0.5, 0.5, 1])      # the computed point stays
 
 
 @pytest.mark.parametrize("processor", [84, 85, 86])

@@ -71,26 +71,22 @@ def test_bvh_of_other_programs(tmp_path, end):
     turned = [root, root @ about(0, 70), root @ about(2, 80) @ about(1, 90), root]
     assert np.abs(bvh.rotations[0] - turned).max() < 1e-12
     assert np.abs(bvh.rotations[1, 1] - about(0, -70)).max() < 1e-12
-    # b writes its offset itself, c the change of it; the root's place is added to its offset
+    # b writes its offset itself, c the change of it; the root's place has its offset in it
     steps = np.array([[0, 10, 0], [4.5, 0, 0], [4.5, 0, 0]]) / 100
-    start = np.array([11, 22, 33]) / 100
+    start = np.array([10, 20, 30]) / 100
     assert np.abs(bvh.places[0] - np.vstack([start, start + steps @ root.T])).max() < 1e-12
     assert np.array_equal(bvh.ends[1], [0, 0.01, 0])
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    (("Frames : 3", "Frames : 4"), "a.bvh: expected 4 frames of 15 numbers, found 3 lines with 45 numbers"),
     (("0.5 0 0\n30\t", "0.5 0\n30 "), "a.bvh, line 17: expected the 15 numbers of a frame, found 14"),
     (("-70", "nan"), "a.bvh, line 18: expected finite numbers, found 'nan'"),
     (("-70", "x7"), "a.bvh, line 18: expected finite numbers, found 'x7'"),
     (("OFFSET 0 10 0", "OFFSET 0 10"), "a.bvh, line 8: expected a number of the OFFSET, found 'CHANNELS'"),
     (("CHANNELS 1 X", "CHANNELS 2 X"), "a.bvh, line 9: expected a channel as Xposition or Zrotation, found 'End'"),
-    (("JOINT c", "JOINT b"), "a.bvh, line 11: expected joints with names that differ, found 'b'"),
-    (("0.05", "0"), "a.bvh, line 15: expected the seconds of a frame, found '0'"),
-    (("Frames : 3", "Frames : 900000000"), "expected frames of joints with channels, found 900000000"),
     (("MOTION", ""), "expected MOTION, found 'Frames'"),
     ((MIXED, "HIERARCHY"), "expected ROOT, the file ends at line 1"),
-    ((MIXED, "\x00\xff"), "expected HIERARCHY")])
+    ((MIXED, "\x00\xff"), "expected a BVH file, .*not text"), ((MIXED, "solid"), "expected HIERARCHY")])
 def test_damaged_bvh_is_refused(tmp_path, change, words):
     assert change[0] in MIXED
     with pytest.raises(StorageError, match=r"a\.bvh: no such file; expected a BVH file"):

@@ -1,6 +1,7 @@
 """The command line: help that reads well, errors in one line before anything is done, completion in the shell."""
 import re
 import subprocess
+import warnings
 
 import pytest
 
@@ -107,6 +108,22 @@ def test_messages_of_python_name_flags(capsys, tmp_path):
     work.__annotations__ = {"times": int}
     assert command_line.run(work, "scape work", []) == 1
     assert capsys.readouterr().err == "scape work: a.c3d: in which unit is it? say --times mm\n"
+
+
+def test_notes_and_failures_name_flags_too(capsys):
+    def work(times: int = 2) -> Outcome:
+        warnings.warn("a.bvh: 30 are assumed; say times=", stacklevel=1)
+        return Outcome(None, [], failures=["b.c3d: which of the two? say times=3"], judgement=None)
+
+    work.__annotations__, work.__module__ = {"times": int}, "scanprep.tried"
+    work.__globals__["__name__"], before = "scanprep.tried", work.__globals__["__name__"]
+    try:
+        command_line.run(work, "scape work", [])
+    finally:
+        work.__globals__["__name__"] = before
+    said = capsys.readouterr().err
+    assert "scape work: note: a.bvh: 30 are assumed; say --times\n" in said
+    assert "scape work: failed: b.c3d: which of the two? say --times 3\n" in said
 
 
 def test_too_little_memory_is_one_line(capsys):

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,8 @@ class Copy:
         text = given.read_text()
         if "bad" in text:
             raise ValueError(f"{given}: bad")
+        if "told" in text:
+            warnings.warn_explicit(text, UserWarning, str(given), 1, "scanprep.told")
         length = room.step("length", given, lambda: len(text))
         (room.folder / "copy.txt").write_text(text.upper() + self.ending)
         return length
@@ -141,10 +144,14 @@ def test_only_what_depends_on_a_change_is_done_anew(tmp_path, texts):
 
 
 def test_processes_change_nothing(tmp_path, texts):
-    copied(tmp_path, texts)
+    texts[0].write_text("told: a")
+    with pytest.warns(UserWarning, match="told: a"):
+        copied(tmp_path, texts)
     one = tree(tmp_path / "out")
     shutil.rmtree(tmp_path / "out")
-    assert copied(tmp_path, texts, workers=2)[0].values == {"a": 9, "b": 9, "c": 9}
+    with pytest.warns(UserWarning, match="told: a") as caught:                # by processes as by this one
+        assert copied(tmp_path, texts, workers=2)[0].values == {"a": 7, "b": 9, "c": 9}
+    assert len(caught) == 1
     assert tree(tmp_path / "out") == one
 
 

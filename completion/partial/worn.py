@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from model.motion.bvh import USUAL_RATE
 from scanprep.cli import MM
 from scanprep.console import Metric
 
@@ -44,5 +45,5 @@ def is_recording(path: Path) -> bool:
 def labels_of(given: str | Path) -> tuple[str, ...]:
     """The labels of a recording, or of a marker set that comes along; none of anything else."""
     if isinstance(given, Path):
-        return read_markers(given).labels if is_recording(given) else ()
+        return read_markers(given, usual_rate=USUAL_RATE).labels if is_recording(given) else ()
     return set_labels(given) if given in layout_names() else ()

@@ -20,19 +20,19 @@ from scanprep.pictures.shading import Dots
 from scanprep.viewer.clicked import read_surface
 from scanprep.viewer.dropped import with_camera
 
-from ..mocap.files.markers import MarkerSequence, read_markers
+from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion
 from ..partial.completion import load_completion
 from .contents import MARKER, Content, from_camera, of_completion, of_mesh, of_model, told
 from .kinds import kind_of, layout_places, reported_model, worst_first
-from .motions import of_markers, of_motion
+from .motions import of_markers, of_motion, read_recording
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import is_statue, read_statue, statue_folder
 
 PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
 SHOWN = ("surface", "picture", "model", "motion", "markers")
-TABLES = (".csv", ".txt", ".bvh")    # not shown of folders: they may hold anything, or be of any body
+TABLES = (".csv", ".tsv", ".txt", ".bvh")    # not shown of folders: they may hold anything, or be of any body
 ENOUGH = 3                           # labels that a recording and a motion have in common
 DEEP = 3                             # folders inside folders that are looked into
 
@@ -144,7 +144,7 @@ class Files:
             "model": lambda: of_model(name, self.read_model(path)),
             "motion": lambda: told(lambda: self._motion(path, name)),
             "completion": lambda: of_completion(name, load_completion(path.parent)),
-            "markers": lambda: told(lambda: of_markers(name, read_markers(path, self.unit))),
+            "markers": lambda: told(lambda: of_markers(name, read_recording(path, self.unit))),
             "surface": lambda: told(lambda: self._surface(path, name)),
             "picture": lambda: from_camera(self._surface(path, name))}
         if kind not in loads:
@@ -258,7 +258,7 @@ class Files:
         virtual = path.with_name("virtual.c3d")
         tried = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
         for file, unit in [*tried, *((one, self.unit) for one in self._recordings if self.over)]:
-            markers = read_markers(file, unit)
+            markers = read_recording(file, unit)
             if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= ENOUGH:
                 return markers
         return None

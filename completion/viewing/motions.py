@@ -2,17 +2,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from model.linear import Subject
+from model.motion.bvh import USUAL_RATE
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import heat
 from scanprep.pictures.low_rank import low_rank
 from scanprep.pictures.shading import CLAY, Dots, Moving
 from scanprep.words import number_of
 
-from ..mocap.files.markers import MarkerSequence
+from ..mocap.files.markers import MarkerSequence, marker_subjects, read_markers
 from ..motion import Motion, spread_frames
 from .contents import MARKER, SHOWN_OFF, Content, MarkersTold, Stance, body_shades
 
@@ -70,6 +72,18 @@ def with_markers(content: Content, motion: Motion, markers: MarkerSequence) -> C
 def marker_dots(markers: MarkerSequence) -> Dots:
     """The markers of the first frame that has any."""
     return Dots(markers.positions[0], MARKER, 0.013, name="markers")
+
+
+def read_recording(path: Path, unit: str | None) -> MarkerSequence:
+    """The markers of all people in a file, labels with the name of each where there are several; played with a usual
+    rate where the file does not say its own.
+    """
+    people = marker_subjects(path)
+    if len(people) < 2:
+        return read_markers(path, unit, usual_rate=USUAL_RATE)
+    each = [read_markers(path, unit, who, usual_rate=USUAL_RATE) for who in people]
+    labels = [f"{who}:{label}" for who, one in zip(people, each, strict=True) for label in one.labels]
+    return MarkerSequence(np.concatenate([one.positions for one in each], axis=1), tuple(labels), each[0].rate)
 
 
 def of_markers(name: str, markers: MarkerSequence) -> Content:

@@ -2,53 +2,65 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scanprep.geometry.storage import LARGEST, LARGEST_TEXT, StorageError, read_bytes
+from scanprep.geometry import tables
+from scanprep.geometry.storage import LARGEST, StorageError, read_bytes, taking_apart
 
 from ..export.bvh import UNITS
 from .moving import MovingSkeleton
 
 _DEEPEST = 500                       # joints below each other: more is no skeleton
+USUAL_RATE = 30.0                    # frames a second of a file that does not say: what most programs play it with
+# numbers of a line between which a program left no blank, the later one of each pair negative
+_GLUED = re.compile(r"(?<=[\d.])(?=-)")
 
 
-def read_bvh(path: str | Path, unit: str) -> MovingSkeleton:
-    """Read a BVH file.
+def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSkeleton:
+    """Read a BVH file as programs write it.
 
-    Turns are taken in the order of the channels, each about axes that turn with the part. Position channels of the
-    root are added to its offset. Of the other joints some programs write the change of the offset, others the offset
-    itself, changed: what comes nearer to bones of constant length is taken.
+    Turns are taken in the order of the channels, each about axes that turn with the part; channels of scale are left
+    out. Position channels of some programs hold the change of the offset, of others the offset itself, changed: what
+    comes nearer to bones of constant length is taken. Those of the root are its place, unless bones hold changes. What
+    the file says wrongly of itself, and what was done about it, is told in a UserWarning each.
 
     Parameters
     ----------
     path : str or Path
     unit : "m", "cm", "mm" or "in"
         Of the lengths, which the file does not say.
+    rate : float, optional
+        Frames a second, where the file does not say or says it wrongly.
 
     Raises
     ------
     StorageError
-        Missing, or damaged: the error names the line.
+        Missing, or damaged: the error names the line; a file with the skeletons of several people.
     ValueError
         An unknown unit.
+
+    Examples
+    --------
+    >>> read_bvh("walk.bvh", "cm").names[0]
+    'Hips'
     """
     if unit not in UNITS:
         raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
     data = read_bytes(path, "a BVH file")
-    if len(data) > LARGEST_TEXT:
-        raise StorageError(f"{path}: expected a BVH file of at most {LARGEST_TEXT} bytes, found {len(data)}")
-    lines = data.decode("utf-8-sig", "replace").splitlines()
+    with taking_apart(path, "a BVH file"):
+        lines = tables.decoded(data).splitlines()
     words, metre = _Words(path, lines), 1 / UNITS[unit]
     joints, ends = _read_hierarchy(words)
-    table, rate = _read_motion(words, joints)
+    table, own_rate = _read_motion(words, joints, rate)
     R, places = _posed(joints, table, metre)
     names, parents, offsets, _ = zip(*joints, strict=True)
     return MovingSkeleton(names, np.array(parents), metre * np.array(offsets),
-                     {j: metre * np.array(end) for j, end in ends.items()}, R, places, rate)
+                          {j: metre * np.array(end) for j, end in ends.items()}, R, places, own_rate)
 
 
 class _Words:
@@ -58,12 +70,17 @@ class _Words:
         self.path, self.lines, self.line = path, lines, 0
         self._row: list[str] = []
 
-    def take(self, expected: str) -> str:
+    def look(self, expected: str) -> str:
+        """The next word, which stays."""
         while not self._row:
             if self.line == len(self.lines):
                 raise StorageError(f"{self.path}: expected {expected}, the file ends at line {self.line}")
             self._row = self.lines[self.line].replace("{", " { ").replace("}", " } ").split()[::-1]
             self.line += 1
+        return self._row[-1]
+
+    def take(self, expected: str) -> str:
+        self.look(expected)
         return self._row.pop()
 
     def wrong(self, expected: str, found: str) -> StorageError:
@@ -78,19 +95,25 @@ class _Words:
 
     def number(self, expected: str) -> float:
         word = self.take(expected)
-        try:
-            value = float(word)
-        except ValueError:
-            raise self.wrong(expected, word) from None
-        if not abs(value) <= LARGEST:
+        if not _is_number(word):
             raise self.wrong(expected, word)
-        return value
+        return float(word.replace(",", "."))
 
     def whole(self, expected: str, least: int, most: int) -> int:
         value = self.number(expected)
         if value != int(value) or not least <= value <= most:
             raise self.wrong(expected, f"{value:g}")
         return int(value)
+
+    def said(self, key: str, expected: str) -> float:
+        """The number behind a key of words, with a colon and blanks between or not."""
+        self.look(f"{key}:")
+        text = " ".join(self._row[::-1])
+        found = re.match(key.replace(" ", r"\s*") + r"\s*:?\s*", text, re.IGNORECASE)
+        if not found:
+            raise self.wrong(f"{key}:", text)
+        self._row = text[found.end():].split()[::-1]
+        return self.number(expected)
 
     def name(self) -> str:
         """All words up to the opening brace."""
@@ -107,12 +130,12 @@ class _Words:
 
 
 class _Joint(NamedTuple):
-    """A joint as the file has it: its offset in the unit of the file, its channels as (is a rotation, axis)."""
+    """A joint as the file has it: its offset in the unit of the file, its channels as (kind, axis)."""
 
     name: str
     parent: int
     offset: list[float]
-    channels: list[tuple[bool, int]]
+    channels: list[tuple[str, int]]
 
 
 def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]]:
@@ -134,22 +157,30 @@ def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]
             above.append(len(joints) - 1)
             if len(above) > _DEEPEST:
                 raise words.wrong(f"at most {_DEEPEST} joints below each other", "more")
+    if words.look("MOTION").lower() == "root":
+        more = [line.split()[1] for line in words.lines[words.line - 1:] if re.match(r"\s*root\s+\S", line, re.I)]
+        raise StorageError(f"{words.path}, line {words.line}: expected the skeleton of one person, found several: "
+                           f"{', '.join([joints[0].name, *more])[:80]}; export each to a file of its own")
     return joints, ends
 
 
 def _read_joint(words: _Words, parent: int, names: set[str]) -> _Joint:
     line, name = words.line, words.name()
-    if not name or name in names:
-        raise StorageError(f"{words.path}, line {line}: expected joints with names that differ, found {name[:40]!r}")
+    if not name:
+        raise StorageError(f"{words.path}, line {line}: expected the name of a joint, found none")
+    if name in names:
+        twice, name = name, next(new for k in range(2, len(names) + 3) if (new := f"{name}_{k}") not in names)
+        warnings.warn(f"{words.path}, line {line}: the joint {twice} comes again; it is called {name}", stacklevel=2)
     names.add(name)
     offset, channels = words.offset(), []
-    words.keyword("CHANNELS")
-    for _ in range(words.whole("the number of channels, 0 to 6", 0, 6)):
-        word = words.take("a channel")
-        found = re.fullmatch("([xyz])(position|rotation)", word.lower())
-        if not found:
-            raise words.wrong("a channel as Xposition or Zrotation", word)
-        channels.append((found[2] == "rotation", "xyz".index(found[1])))
+    if words.look("CHANNELS").lower() == "channels":
+        words.take("CHANNELS")
+        for _ in range(words.whole("the number of channels, 0 to 9", 0, 9)):
+            word = words.take("a channel")
+            found = re.fullmatch("([xyz])(position|rotation|scale)", word.lower())
+            if not found:
+                raise words.wrong("a channel as Xposition or Zrotation", word)
+            channels.append((found[2], "xyz".index(found[1])))
     if len(set(channels)) != len(channels):
         raise words.wrong("channels that differ", " ".join("xyz"[axis] for _, axis in channels))
     return _Joint(name, parent, offset, channels)
@@ -159,77 +190,99 @@ def _posed(joints: list[_Joint], table: np.ndarray, metre: float) -> tuple[np.nd
     """World rotations (T, J, 3, 3) and places (T, J, 3), metres, of the joints by their channels (T, C)."""
     T, J = len(table), len(joints)
     R, y = np.empty((T, J, 3, 3)), np.empty((T, J, 3))
-    start = 0
-    for j, (_, p, offset, channels) in enumerate(joints):
-        values = table[:, start:start + len(channels)]
-        start += len(channels)
-        turned = [k for k, (is_turn, _) in enumerate(channels) if is_turn]
+    values, start = [], 0
+    for joint in joints:
+        values.append(table[:, start:start + len(joint.channels)])
+        start += len(joint.channels)
+    steps = metre * _steps(joints, values)
+    for j, (_, p, _, channels) in enumerate(joints):
+        turned = [k for k, (kind, _) in enumerate(channels) if kind == "rotation"]
         mine = np.broadcast_to(np.eye(3), (T, 3, 3))
         if turned:
             order = "".join("XYZ"[channels[k][1]] for k in turned)
-            mine = Rotation.from_euler(order, values[:, turned], degrees=True).as_matrix().reshape(T, 3, 3)
-        shifted = {axis: metre * values[:, k] for k, (is_turn, axis) in enumerate(channels) if not is_turn}
-        step = _stepped(metre * np.array(offset), shifted, j == 0, T)
+            mine = Rotation.from_euler(order, values[j][:, turned], degrees=True).as_matrix().reshape(T, 3, 3)
         R[:, j] = mine if p < 0 else R[:, p] @ mine
-        y[:, j] = step if p < 0 else y[:, p] + np.einsum("tab,tb->ta", R[:, p], step)
+        y[:, j] = steps[:, j] if p < 0 else y[:, p] + np.einsum("tab,tb->ta", R[:, p], steps[:, j])
     return R, y
 
 
-def _stepped(offset: np.ndarray, moved: dict[int, np.ndarray], root: bool, frames: int) -> np.ndarray:
-    """(T, 3) from the parent to a joint, some axes of whose place may have channels."""
-    added, instead = np.tile(offset, (frames, 1)), np.tile(offset, (frames, 1))
-    for axis, values in moved.items():
-        added[:, axis] += values
-        instead[:, axis] = values
-    if root or not moved:
-        return added
-    long = np.linalg.norm(offset)
-    off = [np.abs(np.linalg.norm(step, axis=1) - long).mean() for step in (instead, added)]
-    return instead if off[0] <= off[1] else added
+def _steps(joints: list[_Joint], values: list[np.ndarray]) -> np.ndarray:
+    """(T, J, 3) from the parent to each joint, in the unit of the file, some axes of whose place may have channels.
+
+    They are the offset itself or its change. Bones tell which: their length is that of the offset. The joints that
+    carry the body through the room, the root and those to the first with several below it, are no bones: theirs mean
+    what those of most bones do, the place itself where no bone has any. A channel there that is always 0 is no place.
+    """
+    T = len(values[0])
+    added = np.tile(np.array([joint.offset for joint in joints], dtype=float), (T, 1, 1))
+    instead = added.copy()
+    for j, joint in enumerate(joints):
+        for k, (kind, axis) in enumerate(joint.channels):
+            if kind == "position":
+                added[:, j, axis] += values[j][:, k]
+                instead[:, j, axis] = values[j][:, k]
+    carriers = {0}
+    while sum(joint.parent == max(carriers) for joint in joints) == 1:
+        carriers.add(next(j for j, joint in enumerate(joints) if joint.parent == max(carriers)))
+    length = np.linalg.norm([joint.offset for joint in joints], axis=1)
+    off = [np.abs(np.linalg.norm(steps, axis=2) - length).mean(axis=0) for steps in (instead, added)]
+    bones = [j for j, joint in enumerate(joints)
+             if j not in carriers and any(kind == "position" for kind, _ in joint.channels)]
+    changes = off[1] < off[0]                                     # of each joint by itself
+    most = 2 * changes[bones].sum() > len(bones)
+    for j in carriers:
+        places = [k for k, (kind, _) in enumerate(joints[j].channels) if kind == "position"]
+        changes[j] = most or not values[j][:, places].any()
+    return np.where(changes[:, None], added, instead)
 
 
-def _read_motion(words: _Words, joints: list[_Joint]) -> tuple[np.ndarray, float]:
+def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tuple[np.ndarray, float]:
     """The table (T, C) of MOTION and the frames a second."""
     words.keyword("MOTION")
-    if words.keyword("Frames:", "Frames") == "frames":
-        words.keyword(":")
-    count = words.whole("the number of frames", 0, 10**9)
-    words.keyword("Frame")
-    if words.keyword("Time:", "Time") == "time":
-        words.keyword(":")
-    time = words.number("the seconds of a frame")
-    if not 1e-6 < time < 1e6:
-        raise words.wrong("the seconds of a frame", f"{time:g}")
+    count = words.said("Frames", "the number of frames")
+    time = words.said("Frame Time", "the seconds of a frame")
+    if rate is None and not 1e-6 < time < 1e6:
+        rate = USUAL_RATE
+        warnings.warn(f"{words.path}: its Frame Time is {time:g}: {USUAL_RATE:g} frames a second are assumed; "
+                      "say rate=", stacklevel=2)
     wanted = sum(len(joint.channels) for joint in joints)
-    size = sum(map(len, words.lines))
-    if not wanted or count * len(joints) > 10**6 + 4 * size:          # joints of all frames
-        raise StorageError(f"{words.path}: expected frames of joints with channels, found {count} frames of "
-                           f"{len(joints)} joints with {wanted} channels in {size} bytes")
+    if not wanted:
+        raise StorageError(f"{words.path}: expected joints with channels, found {len(joints)} joints without")
     first = words.line                                           # numbers begin on a line of their own
     rows = [(first + k + 1, line.split()) for k, line in enumerate(words.lines[first:]) if line.strip()]
+    rows = [(number, row if len(row) >= wanted else _GLUED.sub(" ", " ".join(row)).split()) for number, row in rows]
     flat = [word for _, row in rows for word in row]
-    if len(flat) != count * wanted:                              # a frame may be broken into several lines
+    frames = len(flat) // wanted
+    if frames * len(joints) > 10**6 + 4 * sum(map(len, words.lines)):
+        raise StorageError(f"{words.path}: expected frames of joints with channels, found {frames} frames of "
+                           f"{len(joints)} joints with {wanted} channels")
+    if len(flat) != frames * wanted:                             # a frame may be broken into several lines
         odd = [(number, row) for number, row in rows if len(row) != wanted]
         if 0 < len(odd) < len(rows) / 2:
             raise StorageError(f"{words.path}, line {odd[0][0]}: expected the {wanted} numbers of a frame, "
                                f"found {len(odd[0][1])}")
-        raise StorageError(f"{words.path}: expected {count} frames of {wanted} numbers, found {len(rows)} lines with "
+        raise StorageError(f"{words.path}: expected {count:g} frames of {wanted} numbers, found {len(rows)} lines with "
                            f"{len(flat)} numbers")
+    if not frames:
+        raise StorageError(f"{words.path}: expected at least one frame, found none")
     try:
         table = np.array(flat, dtype=float)
         good = bool((np.abs(table) <= LARGEST).all())
     except ValueError:
         good = False
     if not good:
-        number, word = next((n, w) for n, row in rows for w in row if not _is_number(w))
-        raise StorageError(f"{words.path}, line {number}: expected finite numbers, found {word[:40]!r}")
-    if not count:
-        raise StorageError(f"{words.path}: expected at least one frame, found none")
-    return table.reshape(count, wanted), 1 / time
+        wrong = next(((n, w) for n, row in rows for w in row if not _is_number(w)), None)
+        if wrong is not None:
+            raise StorageError(f"{words.path}, line {wrong[0]}: expected finite numbers, found {wrong[1][:40]!r}")
+        table = np.array([float(word.replace(",", ".")) for word in flat])
+    if count != frames:
+        warnings.warn(f"{words.path}: Frames says {count:g}, there are {frames}", stacklevel=2)
+    return table.reshape(frames, wanted), rate or 1 / time
 
 
 def _is_number(word: str) -> bool:
+    """Whether a word is a finite number, perhaps with a decimal comma."""
     try:
-        return abs(float(word)) <= LARGEST
+        return abs(float(word.replace(",", "."))) <= LARGEST
     except ValueError:
         return False

@@ -1,6 +1,7 @@
 """Motion files (`.npz`), ours and those of AMASS: the one place that reads them."""
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +13,25 @@ from scanprep.geometry.storage import StorageError
 from scanprep.ranges import BETAS, TINY, TURNS, Range
 
 from ..body import BodyModel
+from .bvh import USUAL_RATE
 
 OURS = ("scape", "blendscape", "skinning")           # what files of our models say they are made for
 FAMILY = ("smpl", "star", "supr")                    # how the names of the models begin whose motions AMASS holds
 JOINTS = (22, 24, 52, 55)                            # joints of these models: the body, with hands, fingers, face
-RATES = ("mocap_frame_rate", "mocap_framerate")
-_PIECES = ("root_orient", "pose_body", "pose_jaw", "pose_eye", "pose_hand")   # of poses, in their order
+RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate", "framerate")
+# Pieces of poses, in their order, as AMASS names them and as the smplx library does, each with the numbers it has.
+_PIECES = ({"root_orient": 3, "global_orient": 3}, {"pose_body": 63, "body_pose": 63},
+           {"pose_jaw": 3, "jaw_pose": 3}, {"pose_eye": 6, "leye_pose": 3}, {"reye_pose": 3},
+           {"pose_hand": 90, "left_hand_pose": 45}, {"right_hand_pose": 45})
+_PLACES = ("trans", "transl")
+# What a motion of another program is, by its ending, and what to export there in its place.
+_ROTATIONS = "holds rotations of segments and no markers; export BVH in its place, for scape animate"
+OTHER_MOTIONS = {
+    ".fbx": "FBX: open it in Blender or MotionBuilder and export BVH, for scape animate",
+    ".asf": "the skeleton of an ASF/AMC pair: amc2bvh or Blender makes BVH of both, for scape animate",
+    ".amc": "the motion of an ASF/AMC pair: amc2bvh or Blender makes BVH of both, for scape animate",
+    ".mvnx": f"a file of Xsens MVN, which {_ROTATIONS}", ".htr": f"HTR of Motion Analysis, which {_ROTATIONS}",
+    ".gtr": f"GTR of Motion Analysis, which {_ROTATIONS}"}
 _TEXTS = ("gender", "surface_model_type")            # of which some files hold objects; then they are left out
 
 
@@ -42,13 +56,21 @@ class StoredMotion:
 def is_motion(path: Path) -> bool:
     """Whether an `.npz` file holds a motion."""
     names = storage.names_in(path, "a motion (.npz)")
-    return "poses" in names or {"root_orient", "pose_body"} <= set(names)
+    return "poses" in names or _whole_body(names)
 
 
-def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | None = None) -> StoredMotion:
-    """A motion file: `poses` or `root_orient` and `pose_body`, `trans`, `mocap_frame_rate`, and `betas` if it has some.
+def _whole_body(names: Collection[str]) -> bool:
+    """Whether there are the pieces of a pose that every body has."""
+    return all(any(name in names for name in piece) for piece in _PIECES[:2])
 
-    `more` are further arrays to read, `parts` how many a model has, for the words of errors.
+
+def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | None = None,
+                     rate: float | None = None) -> StoredMotion:
+    """A motion file: `poses`, `trans`, `mocap_frame_rate`, and `betas` if it has some.
+
+    The names may be those of AMASS or of the smplx library (`global_orient`, `body_pose`, `transl`, `fps`). Without a
+    rate, 30 frames a second are assumed, with a warning. `more` are further arrays to read, `parts` how many a model
+    has, for the words of errors, `rate` frames a second where the file does not say or says it wrongly.
 
     Raises
     ------
@@ -59,47 +81,79 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
     if path.suffix.lower() == ".bvh":
         raise StorageError(f"{path}: expected a motion (.npz), found BVH; scape animate {path.name} -m MODEL -o OUT "
                            "puts it on a model")
-    what, wanted = "a motion (.npz)", ("poses", "trans", "betas", *RATES, *_PIECES, *more)
+    if path.suffix.lower() in OTHER_MOTIONS:
+        raise StorageError(f"{path}: expected a motion (.npz), found {OTHER_MOTIONS[path.suffix.lower()]}")
+    what, wanted = "a motion (.npz)", (
+        "poses", *_PLACES, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
     a = storage.load_arrays(path, what, wanted)
     for name in _TEXTS:
         try:
             a |= storage.load_arrays(path, what, (name,))
         except StorageError:
             continue
-    if "poses" not in a and {"root_orient", "pose_body"} <= set(a):
+    if "poses" not in a and _whole_body(a):
         with storage.taking_apart(path, "a whole motion"):
-            a["poses"] = np.concatenate([a[name].reshape(len(a["trans"]), -1) for name in _PIECES if name in a], axis=1)
-    lacking = [name for name in ("poses", "trans") if name not in a]
+            a["poses"] = _joined(a)
+    places = [a[name] for name in _PLACES if name in a]
+    lacking = [name for name, found in (("poses", "poses" in a), ("trans", places)) if not found]
     if lacking:
         raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
+    a["trans"] = places[0]
     with storage.taking_apart(path, "a whole motion"):
-        return _restored(path, a, more, parts)
+        return _restored(path, a, more, parts, rate)
 
 
-def _restored(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts: int | None) -> StoredMotion:
+def _joined(a: dict[str, np.ndarray]) -> np.ndarray:
+    """(T, 3J) poses of their pieces: the body, and the face and hands where all of these are there as rotations.
+
+    Hands as a few components of a hand model, which only that model can expand, are left out.
+    """
+    root = next(a[name] for name in _PIECES[0] if name in a)
+    T = root.size // 3
+    found = [(a[name].reshape(T, -1), size) for piece in _PIECES for name, size in piece.items() if name in a]
+    body = found[1][0]
+    if body.shape[1] == 69:                              # SMPL: the hands are two joints of the body
+        return np.concatenate([found[0][0], body], axis=1)
+    flat = np.concatenate([values for values, size in found if values.shape[1] == size], axis=1)
+    return flat if flat.shape[1] // 3 in JOINTS else np.concatenate([found[0][0], body], axis=1)
+
+
+def _restored(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts: int | None,
+              rate: float | None) -> StoredMotion:
     made_for = storage.text(a, "surface_model_type", "")
     if not made_for.lower().startswith((*OURS, *FAMILY)) and made_for:
         raise StorageError(f"{path}: expected surface_model_type '{OURS[0]}', found '{made_for}'")
-    rate = next((a[name] for name in RATES if name in a), None)
-    if rate is None:
-        raise StorageError(f"{path}: expected {' or '.join(RATES)}, the frames a second; it has neither")
-    if not np.size(rate) == 1:
-        raise ValueError(f"{RATES[0]}: expected one number, found shape {np.shape(rate)}")
-    Range(TINY).check(float(rate.item()), RATES[0])
+    rate = _frame_rate(path, a) if rate is None else rate
     T, shape = len(np.atleast_1d(a["poses"])), a["poses"].shape[1:]
     poses = storage.numbers(a, "poses", T, *shape)
     if not T or poses[0].size % 3 or not poses[0].size:
         whose = "parts" if parts is None else f"the model's {parts} parts"
         raise StorageError(f"{path}: expected frames of {whose}, three numbers each, found shape {poses.shape}")
     poses = poses.astype(np.float64).reshape(T, -1, 3)
-    betas = a.get("betas", np.zeros(0))
-    betas = betas[0] if betas.shape[:-1] == (1,) else betas                        # some files have them as a row
-    betas = storage.numbers({"betas": betas}, "betas", None).astype(np.float64)
+    betas = storage.numbers(a, "betas", *a["betas"].shape).astype(np.float64) if "betas" in a else np.zeros(0)
+    if betas.ndim == 2 and len(betas) in (1, T):                                   # some files have them as rows
+        if np.ptp(betas, axis=0).max(initial=0) > 1e-3:
+            warnings.warn(f"{path}: its betas change from frame to frame; their median is taken", stacklevel=3)
+        betas = np.median(betas, axis=0)
+    betas = storage.numbers({"betas": betas}, "betas", None)
     BETAS.check(betas, "betas")
     TURNS.check(poses, "poses")
     return StoredMotion(poses, storage.numbers(a, "trans", T, 3).astype(np.float64), betas if betas.size else None,
-                        float(rate.item()), storage.text(a, "gender", "neutral"),
+                        rate, storage.text(a, "gender", "neutral"),
                         made_for, {name: a[name] for name in more if name in a})
+
+
+def _frame_rate(path: Path, a: dict[str, np.ndarray]) -> float:
+    """Frames a second as the file says, or as most programs assume."""
+    name = next((name for name in RATES if name in a), None)
+    if name is None:
+        warnings.warn(f"{path}: it does not say its frames a second ({RATES[0]}), {USUAL_RATE:g} are assumed; "
+                      "say rate=", stacklevel=4)
+        return USUAL_RATE
+    if np.size(a[name]) != 1:
+        raise ValueError(f"{name}: expected one number, found shape {np.shape(a[name])}")
+    Range(TINY).check(float(a[name].item()), name)
+    return float(a[name].item())
 
 
 def check_ours(path: str | Path, stored: StoredMotion, where: str = "") -> None:

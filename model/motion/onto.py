@@ -60,8 +60,8 @@ class BodyMotion:
                 *([Metric("rest of its skeleton", self.rest)] if self.rest else [])]
 
 
-def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None
-                ) -> BodyMotion:
+def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = None, unit: str | None = None,
+                rate: float | None = None) -> BodyMotion:
     """A motion file for a model: its own (`.npz`), AMASS (`.npz`) or BVH.
 
     A motion of the model's parts is taken as it is; one of its skeleton, or of a model of its family, is copied; of
@@ -75,6 +75,8 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
         The body that moves; else that of the file's betas, and for motions of other skeletons the mean person.
     unit : str, optional
         Of the lengths in a BVH file, else centimetres. Travel is as long as the legs are, so it matters little.
+    rate : float, optional
+        Frames a second, where the file does not say or says it wrongly.
 
     Raises
     ------
@@ -83,9 +85,9 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
     """
     path = Path(path)
     if path.suffix.lower() == ".bvh":
-        return _onto(path, read_bvh(path, unit or "cm"), subject or _mean_person(model), "")
+        return _onto(path, read_bvh(path, unit or "cm", rate), subject or _mean_person(model), "")
     J = len(model.skeleton.parents)
-    stored = read_motion_file(path, parts=J)
+    stored = read_motion_file(path, parts=J, rate=rate)
     family = bool(model.info.get("family"))
     if stored.of_family and (stored.made_for or stored.poses.shape[1] != J or family):
         if family:

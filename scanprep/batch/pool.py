@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Generic, TypeVar, cast
 
+from ..console import OUR_MODULES
 from ..ranges import FLAG, Processes, Settings
 from ..threads import begin_worker, helpers
 from .room import Failure, Job, Progress, attempt
@@ -132,7 +133,10 @@ def _in_parallel(work: Any, jobs: Sequence[Job], count: int) -> Generator[tuple[
     try:
         job_of = {pool.submit(_do, job): job for job in jobs}
         for future in as_completed(job_of):
-            yield job_of[future], future.result()
+            outcome, notes = future.result()
+            for note in notes:
+                warnings.warn(note, stacklevel=2)
+            yield job_of[future], outcome
     except BrokenProcessPool as error:
         raise _Died(" ".join(str(error).split())) from None
     finally:
@@ -157,8 +161,13 @@ def _watch(parent: int) -> None:
     os.kill(os.getpid(), 9)
 
 
-def _do(job: Job) -> Any:
-    return attempt(_work, job)
+def _do(job: Job) -> tuple[Any, list[str]]:
+    """What the work returned, and our warnings, which the process that wants it tells."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module=OUR_MODULES)
+        outcome = attempt(_work, job)
+    return outcome, [str(warning.message) for warning in caught]
 
 
 def _call(item: Any) -> Any:

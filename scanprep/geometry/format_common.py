@@ -17,6 +17,9 @@ from . import storage
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
 MOST_INSIDE = 0.1                     # of the extent: where nine points in ten span less, the others are no body
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+_SPELLED = {"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm", "centimetres": "cm",
+            "centimeters": "cm", "inches": "in"}
+_SHORTEST = 4                        # letters that tell a word: some programs keep no more of each
 PERSON = 1.3, 2.3                    # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
 
 
@@ -78,6 +81,19 @@ def check_extent(path: Path, what: str, points: np.ndarray) -> None:
     if len(far):
         raise MeshFileError(f"{path}: {what} {far[0]} lies at {points[far[0]].tolist()}, "
                             f"expected coordinates below {FARTHEST:g}")
+
+
+def unit_named(text: str) -> str | None:
+    """The key of `UNITS` that a file means, which may spell it out, cut it short or end it with a dot; or None.
+
+    Examples
+    --------
+    >>> unit_named("Millimeters"), unit_named("mete"), unit_named("furlong")
+    ('mm', 'm', None)
+    """
+    word = text.strip(" .[]()\0").lower()
+    whole = (unit for full, unit in _SPELLED.items() if len(word) >= _SHORTEST and full.startswith(word))
+    return word if word in UNITS else next(whole, None)
 
 
 def likely_unit(extent: float) -> str | None:

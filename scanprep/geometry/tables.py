@@ -73,18 +73,17 @@ def number_table(header: Sequence[str], rows: np.ndarray, number: str = "%.6g") 
     return "\n".join([text.getvalue()[:-1], *number_lines(rows, number), ""])
 
 
-def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError
+def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError, separators: str = ",;\t"
                ) -> tuple[str, list[tuple[int, list[str]]]]:
     """The separator of a CSV table, and the number and cells of each line that is not empty.
 
-    UTF-8 with or without a mark, UTF-16 with one, or the Windows alphabet of western Europe; commas, semicolons or
-    tabs. Empty cells beyond the end of the first line are left out.
+    UTF-8 with or without a mark, UTF-16 with one, or the Windows alphabet of western Europe. The separator is the one
+    of `separators` that comes most often in the first line, the earlier one of two. Empty cells beyond the end of the
+    first line are left out.
     """
     with taking_apart(path, "a CSV table", error):
-        if len(data) > LARGEST_TEXT:
-            raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
-        text = _text(data)
-        separator = max(",;\t", key=text.split("\n", 1)[0].count)
+        text = decoded(data)
+        separator = max(separators, key=text.split("\n", 1)[0].count)
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         rows = [(reader.line_num, [_of_cell(cell.strip()) for cell in cells]) for cells in reader]
     width = 0
@@ -95,7 +94,27 @@ def table_rows(path: str | Path, data: bytes, error: type[StorageError] = Storag
     return separator, [(line, cells) for line, cells in rows if any(cells)]
 
 
-def _text(data: bytes) -> str:
+# How programs print a number that there is none of, in small letters.
+_NONE = {"", "nan", "-nan", "nan(ind)", "-nan(ind)", "nan(snan)", "-nan(snan)", "1.#qnan", "-1.#qnan", "1.#ind",
+         "-1.#ind", "1.#snan", "null", "none", "na", "n/a", "-", "--", "#n/a"}
+
+
+def number_cells(cells: Sequence[str], decimal_commas: bool = False) -> list[float]:
+    """The numbers of some cells, NaN for an empty one and for what programs print there; ValueError for other text."""
+    out = []
+    for cell in cells:
+        try:
+            out.append(float(cell))
+        except ValueError:
+            word = cell.strip().lower()
+            out.append(np.nan if word in _NONE else float(word.replace(",", ".") if decimal_commas else word))
+    return out
+
+
+def decoded(data: bytes) -> str:
+    """Text of a file as programs save it, without a mark of its encoding; ValueError for what is none, or too long."""
+    if len(data) > LARGEST_TEXT:
+        raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
     if data[:2] in UTF_16:
         return data.decode("utf-16")
     if b"\0" in data:

@@ -77,6 +77,9 @@ def find_roles(names: Sequence[str]) -> dict[str, int]:
         letters = re.sub(r"[^a-z0-9]", "", name.rsplit(":", 1)[-1].lower())
         letters = re.sub(r"^(mixamorig|bip|jbipc?|def|character)\d*", "", letters)
         plain.setdefault(re.sub(r"(jnt|bone)$", "", letters), j)
+    # limbs that are cut into numbered pieces: the first is where the joint is
+    for name, j in list(plain.items()):
+        plain.setdefault(re.sub(r"0?1(left|right|[lr])$", r"\1", name), j)
     forms = {name: role.words for name, role in ROLES.items()}
     for name, role in SIDED_ROLES.items():
         for side, spelt in (("l", ("left", "l")), ("r", ("right", "r"))):

@@ -17,7 +17,7 @@ from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, judgement_of_many
 from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page, link_to
-from scanprep.ranges import BETAS
+from scanprep.ranges import BETAS, Positive
 from scanprep.words import number_of
 
 from ...cli import ModelOrNone, read_model
@@ -32,7 +32,8 @@ MarkersArg = Annotated[Path, Place("MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
-                    subject: str | None = None, unit: Unit | None = None, subject_prefix: str | None = None,
+                    subject: str | None = None, unit: Unit | None = None, rate: Positive | None = None,
+                    subject_prefix: str | None = None,
                     retarget_to: Path | None = None, betas_to: Path | None = None,
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
                     person: PersonConfig = PersonConfig(),                                         # noqa: B008
@@ -53,7 +54,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     subject.json and layout.json, with loose markers where they are on this person.
 
     Args:
-        markers: C3D, TRC or CSV of markers, BVH or .npz of a motion, or a folder of these.
+        markers: C3D, TRC, CSV or TSV of markers, BVH or .npz of a motion, or a folder of these.
         output: Folder to write to.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         layout: Where the markers sit: cmu41, plugingait39, biomech57, helenhayes29, or a JSON file {"markersets":
@@ -62,7 +63,9 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             from, betas in JSON or .npz, or a mesh in the model's triangles. Without it "markers" where the model has
             betas.
         unit: Unit of the markers, where the file cannot tell; of a BVH, else cm.
-        subject_prefix: Whose markers, in a C3D file with several people: what stands before the colon of their labels.
+        rate: Frames a second, where the file does not say or says it wrongly.
+        subject_prefix: Whose markers, in a file with several people: what stands before the colon of their labels.
+            Several, as Head,Trunk, are of one person.
         retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
             {"0": [...], "2.5": [...]}: morph.glb.
@@ -76,8 +79,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
                 None if retarget_to is None else read_subject(loaded, retarget_to, unit),
-                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix, config,
-                person)
+                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix, rate,
+                config, person)
     settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         with bar("following the markers") as following:

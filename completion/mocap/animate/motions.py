@@ -40,10 +40,10 @@ def motion_among(path: Path) -> bool:
         return False
 
 
-def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, room: Room
-          ) -> tuple[list[Metric], Motion, Subject, Page]:
+def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, rate: float | None,
+          room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
     """Bring a motion onto a body and write it into the folder of a room; the figures, and the page to be written."""
-    found = read_motion(path, model, subject, unit)
+    found = read_motion(path, model, subject, unit, rate)
     body = subject if subject is not None else model.subject(found.betas)
     motion = Motion.of(found)
     metrics = [judgement_row(judged(found.fit)), Metric("model", name), *figures(found)]

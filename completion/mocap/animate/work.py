@@ -57,6 +57,7 @@ class Work:
     betas_to: BetasTo | None             # how the body changes in the motion
     unit: str | None                     # as `read_markers` takes it, and whose markers
     who: str | None
+    rate: float | None                   # frames a second, where a file does not say
     animate: AnimateConfig
     person: PersonConfig
 
@@ -65,7 +66,8 @@ class Work:
         and return the figures; the first says what the motion is worth.
         """
         if is_motion(path):
-            metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, room)
+            metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, self.rate,
+                                                room)
         else:
             metrics, motion, body, page = self._followed(path, room)
         if self.retarget_to is not None:
@@ -77,7 +79,7 @@ class Work:
 
     def _followed(self, path: Path, room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
         """The motion of the markers of a file."""
-        sequence = read_markers(path, self.unit, self.who)
+        sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
         body, found, worn = self.subject, None, Worn()

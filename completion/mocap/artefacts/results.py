@@ -13,7 +13,7 @@ from scanprep.ranges import Settings
 
 from ..files.c3d import point_table, replace_points, write_c3d
 from ..files.c3d_points import add_points
-from ..files.markers import MarkerSequence, write_markers
+from ..files.markers import MarkerSequence, subject_columns, write_markers
 from ..files.text import MarkerFileError
 
 
@@ -139,7 +139,8 @@ def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> 
 
 
 def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | Path | None = None,
-                  subject: str | None = None, unit: str | None = None, joints: MarkerSequence | None = None) -> None:
+                  subject_prefix: str | None = None, unit: str | None = None, joints: MarkerSequence | None = None
+                  ) -> None:
     """Write the markers of a sequence with all gaps filled, whole or not at all.
 
     In a C3D file, points that were computed have residual 0 and no cameras, as the format says, and measured ones a
@@ -153,7 +154,7 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
     artefacts : MarkerArtefacts
     original : str or Path, optional
         The C3D file that the sequence was read from.
-    subject, unit : str, optional
+    subject_prefix, unit : str, optional
         As `read_markers` was given them for the original.
     joints : MarkerSequence, optional
         Joint centres, which a C3D file gets as further points, computed and described as such.
@@ -174,18 +175,20 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
         if source is None or data is None:
             write_c3d(beside, sequence.positions, sequence.labels, sequence.rate, filled)
         else:
-            columns = _columns(source, data, sequence.labels, subject)
+            columns = _columns(source, data, sequence.labels, subject_prefix)
             beside.write_bytes(replace_points(source, data, columns, sequence.positions,
                                               np.where(filled, -1, artefacts.order), unit))
         if joints is not None:
-            _add_joints(source or path, beside, joints, subject, None if source is None else unit)
+            _add_joints(source or path, beside, joints, subject_prefix, None if source is None else unit)
 
 
-def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject: str | None, unit: str | None) -> None:
+def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject_prefix: str | None, unit: str | None
+                ) -> None:
     """Joint centres into a C3D file, under the name of the subject, if labels have one."""
     data = file.read_bytes()
     taken = point_table(name, data).labels
-    who = subject or next((label.rpartition(":")[0] for label in taken if ":" in label), "")
+    who = (subject_prefix or "").split(",")[0]
+    who = who or next((label.rpartition(":")[0] for label in taken if ":" in label), "")
     labels: list[str] = []
     for label in joints.labels:
         label = f"{who}:{label}" if who else label
@@ -199,16 +202,15 @@ def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject: str | N
         say(f"virtual.c3d has no joint centres: {error}")
 
 
-def _columns(path: Path, data: bytes, labels: tuple[str, ...], subject: str | None) -> np.ndarray:
+def _columns(path: Path, data: bytes, labels: tuple[str, ...], subject_prefix: str | None) -> np.ndarray:
     """Where the labels (L,) of a sequence stand among the points of a file that have positions."""
     table = point_table(path, data)
-    names = [table.labels[i].rpartition(":") for i in table.kept]
-    bare = [label if subject is None or who == subject else "" for who, _, label in names]
+    columns, bare = subject_columns(path, [table.labels[i] for i in table.kept], subject_prefix)
     missing = [label for label in labels if label not in bare]
     if missing:
         raise MarkerFileError(f"{path}: expected the labels of the sequence, {', '.join(missing)} not among "
-                              f"{', '.join(name for name in bare if name)}")
-    return np.array([bare.index(label) for label in labels])
+                              f"{', '.join(bare)}")
+    return np.array([columns[bare.index(label)] for label in labels])
 
 
 def artefact_table(artefacts: MarkerArtefacts) -> dict[str, Any]:

@@ -5,21 +5,25 @@ does not know big-endian ones.
 """
 from __future__ import annotations
 
+import itertools
 import math
 import struct
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.format_common import UNITS
+from scanprep.geometry.format_common import UNITS, unit_named
 
-from .text import MarkerFileError, RawMarkers
+from .text import MarkerFileError, RawMarkers, distinct_labels
 
 BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
+MOST_FRAMES = 65535                  # that the header can count: it means so many or more
 RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
@@ -67,6 +71,7 @@ class PointTable:
     scale: float                     # of whole numbers; negative where the file holds floating-point numbers
     rate: float | None
     unit: str
+    notes: tuple[str, ...]           # what the file says wrongly, and what was done
 
     @property
     def kind(self) -> str:
@@ -107,32 +112,44 @@ def read_c3d(path: Path, data: bytes) -> RawMarkers:
     words = table.words(data)[:, list(table.kept)]
     positions = words[..., :3] * (1.0 if table.kind == "f4" else table.scale)
     positions[(words[..., 3] < 0) | np.isnan(words).any(axis=2)] = np.nan
-    return RawMarkers(positions, tuple(table.labels[i] for i in table.kept), table.rate, table.unit)
+    return RawMarkers(positions, tuple(table.labels[i] for i in table.kept), table.rate, table.unit, table.notes)
 
 
 def file_parameters(data: bytes, numbers: _Numbers) -> _Parameters:
     """All parameters; a group is known by its number, which may come after its parameters."""
-    place = (data[0] - 1) * BLOCK + 4
     groups: dict[int, str] = {}
-    room = len(data)                     # no byte belongs to two parameters
     found: list[tuple[int, str, list[Any]]] = []
-    while place + 2 < len(data) and data[place]:
-        length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
-        name = data[place + 2:place + 2 + length].decode("latin-1").upper()
-        link = place + 2 + length
-        step = int(numbers.words(data[link:link + 2], "u2")[0])
+    room = len(data)                     # no byte belongs to two parameters
+    for group, name, _, link, _ in parameter_records(data, numbers):
         if group < 0:
             groups[-group] = name
-        else:
-            values, size = _values(data, link + 2, numbers)
-            found.append((group, name, values))
-            room -= size
-            if room < 0:
-                raise _Damaged("damaged: the C3D parameters lie over each other")
-        if step == 0:
-            break
-        place = link + step
+            continue
+        values, size = _values(data, link + 2, numbers)
+        found.append((group, name, values))
+        room -= size
+        if room < 0:
+            raise _Damaged("damaged: the C3D parameters lie over each other")
     return {(groups.get(group, ""), name): values for group, name, values in found}
+
+
+def parameter_records(data: bytes, numbers: _Numbers) -> Iterator[tuple[int, str, int, int, int]]:
+    """Group, negative for that of a group itself, name, where it begins, its link and the step there, of every record.
+
+    They end where the third byte of the section says, or where the header has the points, whatever the last one links
+    to; its step is 0.
+    """
+    begin = (data[0] - 1) * BLOCK
+    place, points = begin + 4, (int(numbers.words(data[16:18], "u2")[0]) - 1) * BLOCK
+    end = min(max(begin + BLOCK * data[begin + 2], points), len(data))
+    while place + 2 < end and data[place]:
+        length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
+        link = place + 2 + length
+        step = int(numbers.words(data[link:link + 2], "u2")[0])
+        step = step if link + step <= end else 0
+        yield group, data[place + 2:link].decode("latin-1").upper(), place, link, step
+        if step == 0:
+            return
+        place = link + step
 
 
 def _values(data: bytes, place: int, numbers: _Numbers) -> tuple[list[Any], int]:
@@ -152,49 +169,130 @@ def _values(data: bytes, place: int, numbers: _Numbers) -> tuple[list[Any], int]
 
 
 def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTable:
-    """Where the points stand, by the header and the parameters."""
-    _, points, analog, first, last = (int(n) for n in numbers.words(data[:10], "u2"))
+    """Where the points stand, by the header, the parameters and the size of the file."""
     start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * BLOCK
     scale = float(numbers.floats(data[12:16])[0])
-    width = (4 * points + analog) * (4 if scale < 0 else 2)
-    frames = _frames(parameters, first, last, (len(data) - start) // width if width else 0)
-    if not points or frames <= 0:
-        raise _Damaged(f"expected points, the C3D file holds {points} points in {frames} frames")
     if start < BLOCK or not np.isfinite(scale):
         raise _Damaged(f"damaged: the header says that the points begin at byte {start}, their scale is {scale}")
-    if start + frames * width > len(data):
-        raise _Damaged(f"truncated: expected {frames} frames in {start + frames * width} bytes, "
-                       f"found {len(data)} bytes")
-    labels = _labels(parameters, points)
+    end = rotations_start(parameters, start, len(data)) or len(data)
+    try:
+        count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
+    except _Damaged:                     # perhaps it is the place of the rotations that is wrong
+        end = len(data)
+        count, analog, frames, size, notes = _counts(data, parameters, numbers, scale, end - start)
+    width = (4 * count + analog) * size
+    if frames > MOST_FRAMES and frames == (end - start) // width:      # not those that only fill the last block
+        while end - start - frames * width < BLOCK and not any(data[start + (frames - 1) * width:][:width]):
+            frames -= 1
+    labels = _labels(parameters, count)
     computed = {label for key in _COMPUTED for label in parameters.get(("POINT", key), ())}
-    rate = (parameters.get(("POINT", "RATE")) or numbers.floats(data[20:24]).tolist())[0]
-    return PointTable(numbers, tuple(labels), tuple(i for i, label in enumerate(labels) if label not in computed),
-                      start, width, frames, scale, float(rate) if isinstance(rate, float | int) and rate > 0 else None,
-                      str((parameters.get(("POINT", "UNITS")) or ["mm"])[0]).lower() or "mm")
+    kept = tuple(i for i, label in enumerate(labels) if label not in computed)
+    described = [str(text) for text in _lists(parameters, "DESCRIPTIONS")]
+    names, twice = distinct_labels(labels, described)
+    rates = [*parameters.get(("POINT", "RATE"), ()), *numbers.floats(data[20:24]).tolist()]
+    said = str((parameters.get(("POINT", "UNITS")) or ["mm"])[0]).lower() or "mm"
+    return PointTable(numbers, names, kept, start, width, frames, -abs(scale) if size == 4 else abs(scale),
+                      next((float(r) for r in rates if isinstance(r, float | int) and 0 < r < np.inf), None),
+                      unit_named(said) or said, (*notes, *twice))
 
 
-def _frames(parameters: _Parameters, first: int, last: int, room: int) -> int:
-    """How many frames there are: the header counts to 65535, longer files say it in parameters or not at all."""
-    counted = max(int(last) - int(first) + 1, 0)
-    if last < 65535:
-        return counted
+def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: float, room: int
+            ) -> tuple[int, int, int, int, tuple[str, ...]]:
+    """Points, analog values and frames, the bytes of a number, and what of it the header says otherwise.
+
+    Programs write some of these wrongly; the size of the file tells which. What the header says is taken where the
+    points end within a block of the end of the `room`, else the first of what else the file says that does, else what
+    the header says if there is room for it.
+    """
+    _, header_count, header_analog, first, last = (int(n) for n in numbers.words(data[:10], "u2"))
+    counts = list(dict.fromkeys([header_count, *_whole(parameters, "POINT", "USED")]))
+    analogs = list(dict.fromkeys([header_analog, *_analog(data, parameters, numbers)]))
+    own = float(next(iter(parameters.get(("POINT", "SCALE"), ())), scale))
+    sizes = list(dict.fromkeys([4 if scale < 0 else 2, 4 if own < 0 else 2]))
+    if not any(counts):
+        raise _Damaged(_nothing(parameters, max(last - first + 1, 0)))
+    fitting: list[tuple[int, int, int, int]] = []
+    for count, analog, size in itertools.product(filter(None, counts), analogs, sizes):
+        width = (4 * count + analog) * size
+        fitting += [(count, analog, frames, size) for frames in _frames(parameters, first, last, room // width)
+                    if 0 < frames * width <= room]
+    exact = [f for f in fitting if room - f[2] * (4 * f[0] + f[1]) * f[3] < BLOCK]
+    usual = [f for f in fitting if (f[0], f[1], f[3]) == (counts[0], analogs[0], sizes[0])]
+    if not exact and not usual:
+        frames = _frames(parameters, first, last, 0)[0]
+        if frames <= 0:
+            raise _Damaged(f"expected points, the C3D file holds {header_count} points in {frames} frames")
+        wanted = frames * (4 * counts[0] + analogs[0]) * sizes[0] + len(data) - room
+        raise _Damaged(f"truncated: expected {frames} frames in {wanted} bytes, found {len(data)} bytes")
+    count, analog, frames, size = (exact or usual)[0]
+    told = [(header_count, count, "points"), (header_analog, analog, "analog values a frame")]
+    told += [(max(last - first + 1, 0), frames, "frames")] if last < MOST_FRAMES else []
+    notes = [f"the header says {said} {what}; by the size of the file and its parameters there are {taken}"
+             for said, taken, what in told if said != taken]
+    if size != sizes[0]:
+        notes.append("the scale in the header has the wrong sign for the size of the file")
+    return count, analog, frames, size, tuple(notes)
+
+
+def rotations_start(parameters: _Parameters, start: int, size: int) -> int:
+    """Byte of the rotations behind the points, which begin at `start`; 0 where there are none."""
+    place = BLOCK * (sum(_whole(parameters, "ROTATION", "DATA_START")) - 1)
+    used = _whole(parameters, "ROTATION", "USED") or [len(parameters.get(("ROTATION", "LABELS"), ()))]
+    return place if used[0] and start < place < size else 0
+
+
+def _nothing(parameters: _Parameters, frames: int) -> str:
+    """Why there are no markers in a file without points."""
+    turned = len(parameters.get(("ROTATION", "LABELS"), ())) or sum(_whole(parameters, "ROTATION", "USED"))
+    if turned:
+        return (f"expected points, the C3D file holds rotations of {turned} segments and no markers, as Theia3D writes "
+                "them; export BVH in its place, for scape animate, or markers")
+    return f"expected points, the C3D file holds 0 points in {frames} frames"
+
+
+def _whole(parameters: _Parameters, group: str, name: str) -> list[int]:
+    """The first value of a parameter as a count, if it is there."""
+    return [int(value) & 0xFFFF for value in parameters.get((group, name), ())[:1] if isinstance(value, float | int)]
+
+
+def _analog(data: bytes, parameters: _Parameters, numbers: _Numbers) -> list[int]:
+    """Analog values a frame by what is said besides their number: channels times samples of each."""
+    samples = [int(numbers.words(data[18:20], "u2")[0])]
+    rates = [parameters.get((group, "RATE"), [0.0])[0] for group in ("ANALOG", "POINT")]
+    if all(isinstance(rate, float | int) and 0 < rate < np.inf for rate in rates):
+        samples.append(round(rates[0] / rates[1]))
+    return [channels * each for channels in _whole(parameters, "ANALOG", "USED") for each in samples]
+
+
+def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[int]:
+    """How many frames there may be, the likeliest first: the header counts to 65535, longer files say it elsewhere."""
+    said = []
     ends = [parameters.get(("TRIAL", key), []) for key in ("ACTUAL_START_FIELD", "ACTUAL_END_FIELD")]
     if all(len(end) == 2 for end in ends):
         low, high = ((int(end[0]) & 0xFFFF) + 65536 * (int(end[1]) & 0xFFFF) for end in ends)
-        return max(high - low + 1, 0)
-    said = parameters.get(("POINT", "LONG_FRAMES"))
-    return int(said[0]) if said else max(room, counted)
+        said.append(high - low + 1)
+    long = parameters.get(("POINT", "LONG_FRAMES"), ())[:1]
+    said += [int(value) for value in long if isinstance(value, float | int) and 0 < value < 2**31]
+    counted = max(last - first + 1, 0)
+    if last < MOST_FRAMES:
+        return [counted, *_whole(parameters, "POINT", "FRAMES"), *said]
+    return [*said, max(room, counted)]
 
 
 def _labels(parameters: _Parameters, count: int) -> list[str]:
     """The labels of all points; beyond 255 they go on in LABELS2, LABELS3, ..."""
-    labels: list[str] = []
-    part = 1
-    while more := parameters.get(("POINT", "LABELS" if part == 1 else f"LABELS{part}"), []):
-        labels += map(str, more)
-        part += 1
-    labels = (labels + [""] * count)[:count]
+    labels = (_lists(parameters, "LABELS") + [""] * count)[:count]
     return [label or f"point{i}" for i, label in enumerate(labels)]
+
+
+def _lists(parameters: _Parameters, name: str) -> list[str]:
+    """The texts of all points of LABELS or DESCRIPTIONS and what continues it."""
+    texts: list[str] = []
+    part = 1
+    while more := parameters.get(("POINT", name if part == 1 else f"{name}{part}"), []):
+        texts += map(str, more)
+        part += 1
+    return texts
 
 
 def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.ndarray, source: np.ndarray,
@@ -223,15 +321,48 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     fresh[np.isnan(positions[..., 0])] = [0, 0, 0, -1]
     if table.kind == "i2":
         fresh = np.rint(fresh)
-        if np.abs(fresh).max(initial=0) > 32767:
-            raise MarkerFileError(f"{path}: expected places within {32767 * abs(table.scale):g} {table.unit}, which "
-                                  f"its whole numbers reach, got {np.nanmax(np.abs(positions)):g} m")
+        if not holds(fresh):
+            return replace_points(path, as_floats(path, data), columns, positions, source, unit)
     words[:, mine] = fresh
     out = np.frombuffer(data, np.uint8).copy()
     rows = out[table.start:table.start + table.frames * table.width].reshape(table.frames, -1)
     encoded = np.frombuffer(table.numbers.encoded(words, table.kind), np.uint8)
     rows[:, :encoded.size // table.frames] = encoded.reshape(table.frames, -1)
     return out.tobytes()
+
+
+def holds(points: np.ndarray) -> bool:
+    """Whether whole numbers of two bytes hold points (T, L, 4), in steps of the file's scale."""
+    return bool(np.abs(points).max(initial=0) <= 32767)
+
+
+def as_floats(path: Path, data: bytes) -> bytes:
+    """A file of whole numbers as the same with floating-point ones, which hold places however far; with a warning.
+
+    Points, analog values and parameters stay what they are; rotations behind the points are left out.
+    """
+    table = point_table(path, data)
+    numbers, parameters = table.numbers, file_parameters(data, table.numbers)
+    warnings.warn(f"{path.name}: written with floating-point numbers, its whole ones reach only "
+                  f"{32767 * abs(table.scale):g} {table.unit}", stacklevel=2)
+    rows = np.frombuffer(data, np.uint8, table.frames * table.width, table.start).tobytes()
+    unsigned = "".join(map(str, parameters.get(("ANALOG", "FORMAT"), ()))).upper() == "UNSIGNED"
+    values = numbers.words(rows, "i2").reshape(table.frames, -1).astype(np.float64)
+    own = 4 * len(table.labels)
+    if unsigned:
+        values[:, own:] = numbers.words(rows, "u2").reshape(table.frames, -1)[:, own:]
+    values[:, :own] *= np.tile([table.scale] * 3 + [1.0], len(table.labels))
+    head = bytearray(data[:table.start])
+    minus = numbers.encoded(np.array([-abs(table.scale)]), "f4")
+    head[12:16] = minus
+    records = list(parameter_records(data, numbers))
+    points = next((-group for group, name, *_ in records if group < 0 and name == "POINT"), 0)
+    for group, name, _, link, _ in records:
+        if group == points and name == "SCALE":
+            value = link + 4 + data[link + 3]                          # behind type and dimensions
+            head[value:value + 4] = minus
+    body = numbers.encoded(values, "f4")
+    return bytes(head) + body + bytes(-len(body) % BLOCK)
 
 
 def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float,

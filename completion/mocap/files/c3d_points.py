@@ -9,7 +9,7 @@ import numpy as np
 
 from scanprep.geometry.format_common import UNITS
 
-from .c3d import BLOCK, PointTable, file_parameters, point_table
+from .c3d import BLOCK, PointTable, as_floats, file_parameters, holds, parameter_records, point_table, rotations_start
 from .text import MarkerFileError
 
 _MOST = 255                          # values along one dimension of a parameter, and blocks of all parameters
@@ -29,21 +29,24 @@ def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Seq
     points = np.zeros((*positions.shape[:2], 4))
     points[..., :3] = positions / UNITS[unit or table.unit] / (1.0 if table.kind == "f4" else table.scale)
     points[np.isnan(points).any(axis=2)] = [0, 0, 0, -1]
-    if table.kind == "i2" and np.abs(points).max(initial=0) > 32767:
-        raise MarkerFileError(f"{path}: expected places within {32767 * abs(table.scale):g} {table.unit}, which its "
-                              f"whole numbers reach, got {np.abs(positions).max():g} m")
+    if table.kind == "i2" and not holds(points):
+        return add_points(path, as_floats(path, data), labels, descriptions, positions, unit)
     begin = (data[0] - 1) * BLOCK
-    described = [str(text) for text in file_parameters(data, table.numbers).get(("POINT", "DESCRIPTIONS"), [])]
+    parameters = file_parameters(data, table.numbers)
+    described = [str(text) for text in parameters.get(("POINT", "DESCRIPTIONS"), [])]
+    body, behind = _padded(_frames(data, table, points)), rotations_start(parameters, table.start, len(data))
+    behind = behind if behind >= table.start + table.frames * table.width else 0
     described = (described + [""] * len(table.labels))[:len(table.labels)]
     try:
-        section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions])
+        section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions],
+                           len(body) // BLOCK if behind else 0)
     except (struct.error, IndexError, ValueError, OverflowError, StopIteration) as error:
         raise MarkerFileError(f"{path}: expected C3D parameters with a group POINT that can take more points "
                               f"({type(error).__name__} {error})") from None
     head = bytearray(data[:begin])
     struct.pack_into(f"{table.numbers.order}H", head, 2, len(table.labels) + len(labels))
     struct.pack_into(f"{table.numbers.order}H", head, 16, (begin + len(section)) // BLOCK + 1)
-    return bytes(head) + section + _padded(_frames(data, table, points))
+    return bytes(head) + section + body + (data[behind:] if behind else b"")
 
 
 def _frames(data: bytes, table: PointTable, points: np.ndarray) -> bytes:
@@ -56,13 +59,18 @@ def _frames(data: bytes, table: PointTable, points: np.ndarray) -> bytes:
     return np.concatenate([rows[:, :own], added, rows[:, own:]], axis=1).tobytes()
 
 
-def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: list[str], descriptions: list[str]
-             ) -> bytes:
-    """The parameters, all but those that tell of the points as they stand there."""
-    records = list(_records(data, begin + 4, table))
+def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: list[str], descriptions: list[str],
+             before_rotations: int) -> bytes:
+    """The parameters, all but those that tell of the points as they stand there.
+
+    `before_rotations` is the number of blocks of points where rotations follow, else 0.
+    """
+    records = list(_records(data, table))
     group = next(-number for number, name, _ in records if number < 0 and name == "POINT")
+    turned = next((-number for number, name, _ in records if number < 0 and name == "ROTATION"), 0)
     kept = [record for number, name, record in records if not (
-        number == group and (name in ("USED", "DATA_START") or name.startswith(("LABELS", "DESCRIPTIONS"))))]
+        number == group and (name in ("USED", "DATA_START") or name.startswith(("LABELS", "DESCRIPTIONS"))))
+        and not (before_rotations and (number, name) == (turned, "DATA_START"))]
     order = table.numbers.order
     kept.append(_parameter(group, "USED", b"\x02\x00" + struct.pack(f"{order}H", len(labels))))
     for name, texts in (("LABELS", labels), ("DESCRIPTIONS", descriptions)):
@@ -72,11 +80,14 @@ def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: lis
             cells = b"".join(text.encode("latin-1", "replace")[:width].ljust(width) for text in some)
             kept.append(_parameter(group, name + (str(part) if part > 1 else ""),
                                    bytes([255, 2, width, len(some)]) + cells))
-    start = _parameter(group, "DATA_START", b"\x02\x00\x00\x00")
-    blocks = -(-(4 + sum(map(len, kept)) + 2 * len(kept) + len(start) + 2) // BLOCK)
+    starts = [_parameter(group, "DATA_START", b"\x02\x00\x00\x00")]
+    starts += [_parameter(turned, "DATA_START", b"\x02\x00\x00\x00")] if before_rotations else []
+    blocks = -(-(4 + sum(len(record) + 2 for record in [*kept, *starts])) // BLOCK)
     if blocks > _MOST:
         raise MarkerFileError(f"{path}: expected room for more points, the C3D parameters are full")
-    kept.append(start[:-3] + struct.pack(f"{order}H", begin // BLOCK + blocks + 1) + start[-1:])
+    first = begin // BLOCK + blocks + 1
+    kept += [start[:-3] + struct.pack(f"{order}H", place) + start[-1:]
+             for start, place in zip(starts, (first, first + before_rotations), strict=False)]
     linked = [_linked(record, order, last=i == len(kept) - 1) for i, record in enumerate(kept)]
     return _padded(data[begin:begin + 2] + bytes([blocks, table.numbers.processor]) + b"".join(linked))
 
@@ -92,17 +103,11 @@ def _linked(record: bytes, order: str, last: bool) -> bytes:
     return record[:name] + struct.pack(f"{order}H", 0 if last else len(record) - name + 2) + record[name:]
 
 
-def _records(data: bytes, place: int, table: PointTable) -> Iterator[tuple[int, str, bytes]]:
+def _records(data: bytes, table: PointTable) -> Iterator[tuple[int, str, bytes]]:
     """Group, negative for that of a group itself, name, and the bytes of every record without its link."""
-    while place + 2 < len(data) and data[place]:
-        length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
-        link = place + 2 + length
-        step = struct.unpack_from(f"{table.numbers.order}H", data, link)[0]
-        end = link + (step or _last(data, link + 2, group) - link)
-        yield group, data[place + 2:link].decode("latin-1").upper(), data[place:link] + data[link + 2:end]
-        if not step:
-            return
-        place = end
+    for group, name, place, link, step in parameter_records(data, table.numbers):
+        end = link + step if step else _last(data, link + 2, group)
+        yield group, name, data[place:link] + data[link + 2:end]
 
 
 def _last(data: bytes, place: int, group: int) -> int:

@@ -1,6 +1,7 @@
-"""Files of marker sequences: C3D, TRC and CSV."""
+"""Files of marker sequences: C3D, TRC, CSV and TSV."""
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,12 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.geometry.format_common import FARTHEST, UNITS
+from scanprep.geometry.format_common import FARTHEST, UNITS, unit_named
+from scanprep.words import number_of
 
 from .c3d import read_c3d, write_c3d
-from .text import MarkerFileError, RawMarkers, encode_csv, encode_trc, read_csv, read_trc
+from .exports import OTHERS, read_table
+from .text import MarkerFileError, RawMarkers, encode_csv, encode_trc, read_trc
 
-READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_csv}
+READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_table, ".tsv": read_table}
+WRITTEN = (".c3d", ".trc", ".csv")
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
 
 
@@ -94,21 +98,28 @@ class MarkerSequence:
         return MarkerSequence(self.positions[which], self.labels, self.rate / step)
 
 
-def read_markers(path: str | Path, unit: str | None = None, subject: str | None = None,
-                 rate: float | None = None) -> MarkerSequence:
+def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str | None = None,
+                 rate: float | None = None, usual_rate: float | None = None) -> MarkerSequence:
     """Read a marker sequence.
+
+    What a file says wrongly of itself and what was done about it is told in a UserWarning each: another number of
+    frames, a label that comes twice, a number that stands for a marker that was not seen.
 
     Parameters
     ----------
     path : str or Path
-        C3D; TRC; or CSV with the columns `time, LABEL_x, LABEL_y, LABEL_z, ...`, an empty cell where a marker
-        is missing. Instead of `time`, seconds, there may be `frame`; then `rate` is needed.
+        C3D; TRC; CSV as Motive exports it; TSV as Qualisys does; or CSV with the columns `time, LABEL_x, LABEL_y,
+        LABEL_z, ...`, an empty cell where a marker is missing. Instead of `time`, seconds, there may be `frame`; then
+        `rate` is needed.
     unit : 'm', 'mm', 'cm' or 'in', optional
-        Unit of the file. When it is not given: what a C3D or TRC file says, or millimetres; metres for CSV.
-    subject : str, optional
-        Whose markers, in a C3D file with several: labels read `Subject:Label` there.
+        Unit of the file. When it is not given: what the file says, or millimetres; metres for CSV.
+    subject_prefix : str, optional
+        Whose markers, in a file with several people: labels read `Subject:Label` there. Several, `Head,Trunk`, are of
+        one person.
     rate : float, optional
         Frames per second, where the file does not say or says it wrongly.
+    usual_rate : float, optional
+        Frames per second to assume, with a warning, where the file does not say; without it such a file is refused.
 
     Returns
     -------
@@ -118,55 +129,115 @@ def read_markers(path: str | Path, unit: str | None = None, subject: str | None 
     Raises
     ------
     MarkerFileError
-        Missing, truncated or of another format, several subjects and none named, a label that comes twice.
+        Missing, truncated or of another format; several people of whom none is named; no rate.
+
+    Examples
+    --------
+    >>> read_markers("walk.c3d", subject_prefix="Ann").labels[:2]
+    ('LFHD', 'RFHD')
     """
     path = Path(path)
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
     raw = _read_raw(path)
-    own_unit = unit or raw.unit
-    if own_unit not in UNITS:
-        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{raw.unit}'; "
-                              f"say unit=")
+    own_unit = unit or unit_named(raw.unit)
+    if own_unit is None:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{raw.unit}'; say unit=")
+    notes = list(raw.notes)
     if rate is None and raw.rate is None:
-        raise MarkerFileError(f"{path}: expected a column time, found frame numbers only; say rate=")
-    columns, labels = _of_subject(path, raw.labels, subject)
-    positions = UNITS[own_unit] * raw.positions[:, columns]
-    positions[(positions == 0).all(axis=2)] = np.nan
+        if usual_rate is None:
+            raise MarkerFileError(f"{path}: expected the frames per second, it does not say them; say rate=")
+        notes.append(f"it does not say its frames per second, {usual_rate:g} are assumed")
+    columns, labels = subject_columns(path, raw.labels, subject_prefix)
+    together = people_of(raw.labels)
+    if subject_prefix is None and together and len(together[0]) > 1:
+        most = Counter(label.rpartition(":")[0] for label in raw.labels if ":" in label).most_common(1)[0][0]
+        notes.append(f"the labels of {', '.join(together[0])} are taken as those of one person; those of one only are "
+                     f"taken with subject_prefix={most}")
+    places, filled = _without_fill(raw.positions[:, columns])
+    for note in (*notes, *filled):
+        warnings.warn(f"{path}: {note}", stacklevel=2)
+    positions = UNITS[own_unit] * places
     if (np.abs(positions) > FARTHEST).any():
         raise MarkerFileError(f"{path}: expected positions that are finite and below {FARTHEST:g} m, found "
                               f"{np.nanmax(np.abs(positions)):.3g}")
     try:
-        return MarkerSequence(positions, labels, rate or raw.rate or 0.0)
+        return MarkerSequence(positions, labels, rate or raw.rate or usual_rate or 0.0)
     except ValueError as error:
         raise MarkerFileError(f"{path}: {error}") from None
 
 
+def _without_fill(places: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Places (T, L, 3) with NaN for what stands where a marker was not seen: 0 0 0, or one number three times, as
+    9999999, that lies beyond all places; and a note of the latter.
+    """
+    places = np.where((places == 0).all(axis=2, keepdims=True), np.nan, places)
+    same = (places == places[..., :1]).all(axis=2)
+    others = np.abs(places[~same & np.isfinite(places).all(axis=2)])
+    fill = same & (np.abs(places[..., 0]) > others.max(initial=0)) & bool(others.size)
+    if not fill.any():
+        return places, []
+    values = ", ".join(f"{value:.9g}" for value in np.unique(places[fill, 0])[:3])
+    return np.where(fill[..., None], np.nan, places), [
+        f"{number_of(int(fill.sum()), 'position')} of {values} three times taken as missing"]
+
+
 def marker_subjects(path: str | Path) -> tuple[str, ...]:
-    """Whose markers are in a file: what stands before the colon of its labels; none where there is no colon."""
-    split = (label.rpartition(":") for label in _read_raw(Path(path)).labels)
-    return tuple(dict.fromkeys(who for who, colon, _ in split if colon))
+    """The people whose markers are in a file, by what stands before the colon of its labels.
+
+    None where there is no colon, nor where several prefixes are parts of one person, as `people_of` says.
+    """
+    people = people_of(_read_raw(Path(path)).labels)
+    return tuple(prefixes[0] for prefixes in people if len(prefixes) == 1)
+
+
+def people_of(labels: Sequence[str]) -> tuple[tuple[str, ...], ...]:
+    """The prefixes of each person's labels, `Subject:Label`.
+
+    Where no bare label comes twice, prefixes are those of clusters, rigid bodies or a prop beside one person; where
+    some do, each prefix is that of a person.
+
+    Examples
+    --------
+    >>> people_of(["Head:LFHD", "Trunk:C7"]), people_of(["Ann:C7", "Bob:C7"])
+    ((('Head', 'Trunk'),), (('Ann',), ('Bob',)))
+    """
+    split = [label.rpartition(":") for label in labels]
+    prefixes = tuple(dict.fromkeys(who for who, colon, _ in split if colon))
+    bare = [label for _, colon, label in split if colon]
+    if len(set(bare)) == len(bare):
+        return (prefixes,) if prefixes else ()
+    return tuple((who,) for who in prefixes)
 
 
 def _read_raw(path: Path) -> RawMarkers:
     """What a file holds, by its ending."""
+    suffix = path.suffix.lower()
     data = storage.read_bytes(path, "a file of markers", MarkerFileError)
-    if path.suffix.lower() not in READERS:
-        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(READERS)}, found '{path.suffix}'")
+    if suffix not in READERS:
+        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(READERS)}, found "
+                              + (f"'{path.suffix}'" if suffix not in OTHERS else OTHERS[suffix]))
     if not data:
         raise MarkerFileError(f"{path}: the file is empty")
-    return READERS[path.suffix.lower()](path, data)
+    return READERS[suffix](path, data)
 
 
-def _of_subject(path: Path, labels: tuple[str, ...], subject: str | None) -> tuple[list[int], tuple[str, ...]]:
-    """Columns and bare labels of the only subject, or of the one that is named."""
+def subject_columns(path: Path, labels: Sequence[str], subject_prefix: str | None
+                    ) -> tuple[list[int], tuple[str, ...]]:
+    """Columns and bare labels of the only person, or of the prefixes that are named, with commas between several."""
     split = [label.rpartition(":") for label in labels]
-    subjects = list(dict.fromkeys(who for who, colon, _ in split if colon))
-    if subject is not None and subject not in subjects:
-        raise MarkerFileError(f"{path}: expected the subject '{subject}', found {', '.join(subjects) or 'none'}")
-    if subject is None and len(subjects) > 1:
-        raise MarkerFileError(f"{path}: expected one subject, found {', '.join(subjects)}; say subject=")
-    columns = [i for i, (who, _, _) in enumerate(split) if subject is None or who == subject]
+    people = people_of(labels)
+    known = {who for prefixes in people for who in prefixes}
+    if subject_prefix is None and len(people) > 1:
+        raise MarkerFileError(f"{path}: expected one subject, found {', '.join(who for who, in people)}; say "
+                              f"subject_prefix={people[0][0]}")
+    wanted = known | {""} if subject_prefix is None else \
+        {subject_prefix} if subject_prefix in known else set(subject_prefix.split(","))
+    missing = wanted - known - {""}
+    if missing:
+        raise MarkerFileError(f"{path}: expected the subject '{', '.join(sorted(missing))}', found "
+                              f"{', '.join(sorted(known)) or 'none'}")
+    columns = [i for i, (who, _, _) in enumerate(split) if who in wanted]
     return columns, tuple(split[i][2] for i in columns)
 
 
@@ -180,8 +251,8 @@ def write_markers(path: str | Path, sequence: MarkerSequence) -> None:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in READERS:
-        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(READERS)}, found '{path.suffix}'")
+    if suffix not in WRITTEN:
+        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(WRITTEN)}, found '{path.suffix}'")
     told = sequence.positions, sequence.labels, sequence.rate
     with storage.writing(path) as beside:
         if suffix == ".c3d":

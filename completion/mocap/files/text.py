@@ -1,7 +1,12 @@
-"""Marker sequences as text, TRC and CSV, and what all readers of marker files share."""
+"""Marker sequences as text, TRC and CSV, and what all readers of marker files share.
+
+Files are read as programs and spreadsheets write them: the lines are counted, not what the header says of their
+number, and every difference is a note.
+"""
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +15,11 @@ import numpy as np
 
 from scanprep.geometry import tables
 from scanprep.geometry.storage import StorageError
+from scanprep.words import number_of
+
+Rows = Sequence[tuple[int, Sequence[str]]]           # number and cells of each line of a table
+MOST_TOLD = 6                        # labels in one note
+OTHER_RATE = 0.02                    # share by which a rate and its times differ where one of them is wrong
 
 
 class MarkerFileError(StorageError):
@@ -21,43 +31,109 @@ class RawMarkers:
     """What a marker file holds, in its own unit."""
 
     positions: np.ndarray            # (T, L, 3) float, NaN where missing
-    labels: tuple[str, ...]          # L strings, as they stand in the file
+    labels: tuple[str, ...]          # L strings as they stand in the file, but each once
     rate: float | None               # frames per second, or None where the file does not say
     unit: str                        # as it stands in the file
+    notes: tuple[str, ...] = ()      # what the file says wrongly, and what was done
+
+
+def distinct_labels(labels: Sequence[str], descriptions: Sequence[str] = ()) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Labels of which none comes twice, and a note where some were changed.
+
+    A label that was there before becomes its description, as programs that cut labels to four letters keep the whole
+    name there, or else LABEL_2, LABEL_3, ...
+
+    Examples
+    --------
+    >>> distinct_labels(["LKNE", "LKNE", "C7"])[0]
+    ('LKNE', 'LKNE_2', 'C7')
+    """
+    taken, times, out, changed = set(labels), dict[str, int](), list[str](), list[str]()
+    for i, label in enumerate(labels):
+        name = label
+        if label in times:
+            who, colon, _ = label.rpartition(":")
+            said = descriptions[i].strip() if i < len(descriptions) else ""
+            name = f"{who}{colon}{said}" if said and ":" not in said else label
+            while name in taken:
+                times[label] += 1
+                name = f"{label}_{times[label]}"
+            taken.add(name)
+            changed.append(f"{label} now {name}")
+        times.setdefault(label, 1)
+        out.append(name)
+    if not changed:
+        return tuple(out), ()
+    more = f" and {len(changed) - MOST_TOLD} more" if len(changed) > MOST_TOLD else ""
+    return tuple(out), (f"labels come again: {', '.join(changed[:MOST_TOLD])}{more}",)
 
 
 def read_trc(path: Path, data: bytes) -> RawMarkers:
-    """A TRC file of Motion Analysis or OpenSim: empty cells and NaN are missing."""
-    lines = data.decode("latin-1").splitlines()
-    if not lines or not lines[0].startswith("PathFileType") or len(lines) < 5:
+    """A TRC file of Motion Analysis or OpenSim: empty cells and NaN are missing.
+
+    The names of line 4 say how many markers there are; trajectories without a name are left out.
+    """
+    tabs = b"PathFileType\t" in data[:100].replace(b"\0", b"")
+    separator, split = tables.table_rows(path, data, MarkerFileError, "\t" if tabs else ",;\t")
+    rows = [(number, cells if len(cells) > 1 else cells[0].split()) for number, cells in split]
+    if len(rows) < 4 or not rows[0][1][0].startswith("PathFileType"):
         raise MarkerFileError(f"{path}: expected a TRC file that begins with 'PathFileType' and has five lines "
-                              f"of header, found {len(lines)} lines, first {lines[0][:30] if lines else ''!r}")
-    keys, values = lines[1].split(), lines[2].split()
-    said = dict(zip(keys, values, strict=False))
+                              f"of header, found {len(rows)} lines, first "
+                              f"{' '.join(rows[0][1])[:30] if rows else ''!r}")
+    keys, values = ([cell for cell in rows[k][1] if cell] for k in (1, 2))
+    # cells without anything separate here, and there stand for a value that is not said
+    said = dict(zip(map(str.lower, keys), values if len(values) == len(keys) else rows[2][1], strict=False))
+    rate, frames, count = (_header_number(path, rows[2], said, key) for key in ("DataRate", "NumFrames", "NumMarkers"))
+    named = next((k for k, (_, cells) in enumerate(rows) if cells[0].lower().startswith("frame")), 3)
+    body = rows[named + 1:]
+    while body and not _is_number(body[0][1][0]):          # X1 Y1 Z1 ...
+        body = body[1:]
+    if not body:
+        raise MarkerFileError(f"{path}: truncated: expected frames below line {rows[named][0]}, found none")
+    usual = Counter(len(cells) for _, cells in body).most_common(1)[0][0]
+    columns, names = _named_columns(rows[named][1], count, usual)
+    if not names:
+        raise MarkerFileError(f"{path}: line {rows[named][0]}: expected marker names, found none")
+    width, notes = 5 + 3 * max(columns), []
+    if usual > width:
+        notes.append(f"{number_of(-(-(usual - width) // 3), 'trajectory', 'trajectories')} without a name left out")
+        body = [(number, cells[:width]) for number, cells in body]
+    table = table_numbers(path, body, width, separator, fill=len(split[-1][1]) > 1)
+    if frames is not None and frames != len(table):
+        notes.append(f"NumFrames says {frames:g}, there are {len(table)}")
+    clocked = even_rate(table[:, 1]) if len(table) > 1 else None
+    if clocked is not None and (not rate or abs(clocked / rate - 1) > OTHER_RATE):
+        notes.append(f"DataRate says {rate or 0:g} frames a second, the times {clocked:g}: the times are believed")
+        rate = clocked
+    labels, twice = distinct_labels(names)
+    places = table[:, 2:].reshape(len(table), -1, 3)[:, columns]
+    return RawMarkers(places, labels, rate if rate and rate > 0 else None, said.get("units") or "mm",
+                      (*notes, *twice))
+
+
+def _header_number(path: Path, row: tuple[int, Sequence[str]], said: dict[str, str], key: str) -> float | None:
+    """A number of the header; None where it says nothing."""
     try:
-        rate, frames, count = float(said["DataRate"]), int(said["NumFrames"]), int(said["NumMarkers"])
-    except (KeyError, ValueError):
-        raise MarkerFileError(f"{path}: line 3: expected values of DataRate, NumFrames and NumMarkers, "
-                              f"found {lines[2][:60]!r}") from None
-    labels = tuple(word.strip() for word in lines[3].split("\t")[2:] if word.strip())
-    if len(labels) != count:
-        labels = tuple(lines[3].split()[2:])
-    if len(labels) != count or not count:
-        raise MarkerFileError(f"{path}: line 4: expected {count or 'some'} marker names, found {len(labels)}")
-    rows = [(number, line) for number, line in enumerate(lines[5:], 6) if line.strip()]
-    if len(rows) != frames:
-        raise MarkerFileError(f"{path}: {'truncated: ' if len(rows) < frames else ''}expected {frames} frames, "
-                              f"found {len(rows)}")
-    width = 2 + 3 * count
-    table = np.empty((frames, width))
-    for place, (number, line) in zip(table, rows, strict=True):
-        cells = line.rstrip("\r\n").split("\t") if "\t" in line else line.split()
-        while len(cells) > width and not cells[-1].strip():
-            cells.pop()                                  # tabs at the end of the line
-        if "\t" in line:
-            cells += [""] * (width - len(cells))         # or too few of them where the last markers are missing
-        place[:] = _numbers(path, number, cells, width)
-    return RawMarkers(table[:, 2:].reshape(frames, count, 3), labels, rate, said.get("Units", "mm").lower())
+        value = tables.number_cells([said.get(key.lower(), "")], decimal_commas=True)[0]
+    except ValueError:
+        raise MarkerFileError(f"{path}: line {row[0]}: expected values of DataRate, NumFrames and NumMarkers, "
+                              f"found {' '.join(row[1])[:60]!r}") from None
+    return value if np.isfinite(value) else None
+
+
+def _named_columns(cells: Sequence[str], count: float | None, usual: int) -> tuple[list[int], list[str]]:
+    """Which trajectories have a name, and their names, of the line with the names.
+
+    `count` is what the header says, `usual` how many cells a line has. Names may be separated by blanks.
+    """
+    in_cells = [(k, name) for k, name in enumerate(cells[2:]) if name]
+    text = "  ".join(cells)
+    ways = [[name for _, name in in_cells], re.split(r"\s{2,}", text)[2:], text.split()[2:]]
+    names = next((way for way in ways if len(way) == count), None) \
+        or next((way for way in ways if 3 * len(way) + 2 == usual), ways[0])
+    if names is ways[0] and all(k % 3 == 0 for k, _ in in_cells):
+        return [k // 3 for k, _ in in_cells], names
+    return list(range(len(names))), names
 
 
 def encode_trc(positions: np.ndarray, labels: Sequence[str], rate: float, name: str) -> bytes:
@@ -78,12 +154,11 @@ def encode_trc(positions: np.ndarray, labels: Sequence[str], rate: float, name: 
     return ("\n".join(lines) + "\n").encode()
 
 
-def read_csv(path: Path, data: bytes) -> RawMarkers:
-    """A CSV file with the columns `time` or `frame`, then `LABEL_x, LABEL_y, LABEL_z` of every marker.
+def csv_markers(path: Path, separator: str, rows: Rows) -> RawMarkers:
+    """The markers of a table with the columns `time` or `frame`, then `LABEL_x, LABEL_y, LABEL_z` of every marker.
 
     Where semicolons or tabs separate, numbers may have decimal commas.
     """
-    separator, rows = tables.table_rows(path, data, MarkerFileError)
     head = rows[0][1] if rows else []
     clock = [word for word in head if word.lower() in ("time", "frame")]
     columns = {word.lower(): i for i, word in enumerate(head)}
@@ -93,42 +168,55 @@ def read_csv(path: Path, data: bytes) -> RawMarkers:
     if not clock or not labels or [n.lower() for n in names] != [w.lower() for w in wanted]:
         raise MarkerFileError(f"{path}: line 1: expected the columns time,LABEL_x,LABEL_y,LABEL_z,..., "
                               f"found {','.join(head)[:80]!r}")
-    body = rows[1:] if separator == "," else [(n, [cell.replace(",", ".") for cell in row]) for n, row in rows[1:]]
-    if not body:
+    if not rows[1:]:
         raise MarkerFileError(f"{path}: expected frames below the first line, found none")
-    table = np.array([_numbers(path, number, row, len(head)) for number, row in body])
+    table = table_numbers(path, rows[1:], len(head), separator)
     places = [i for i, word in enumerate(head) if word not in clock]
-    rate = _rate(path, table[:, columns["time"]], [n for n, _ in body]) if "time" in columns else None
-    return RawMarkers(table[:, places].reshape(len(table), len(labels), 3), labels, rate, "m")
+    rate = _rate(path, table[:, columns["time"]], [n for n, _ in rows[1:]]) if "time" in columns else None
+    labels, notes = distinct_labels(labels)
+    return RawMarkers(table[:, places].reshape(len(table), len(labels), 3), labels, rate, "m", notes)
 
 
-def _numbers(path: Path, number: int, cells: Sequence[str], width: int) -> list[float]:
-    """The numbers of one line, NaN for an empty cell."""
-    if len(cells) != width:
-        raise MarkerFileError(f"{path}: line {number}: expected {width} values, found {len(cells)}")
-    try:
-        return [float(cell) if cell.strip() else np.nan for cell in cells]
-    except ValueError as error:
-        raise MarkerFileError(f"{path}: line {number}: expected numbers, {error}") from None
+def table_numbers(path: Path, rows: Rows, width: int, separator: str, fill: bool = False) -> np.ndarray:
+    """The numbers (T, width) of some lines, NaN for an empty cell and, if `fill`, where a line ends before."""
+    table = np.full((len(rows), width), np.nan)
+    for place, (number, cells) in zip(table, rows, strict=True):
+        if len(cells) > width or (len(cells) < width and not fill):
+            raise MarkerFileError(f"{path}: line {number}: expected {width} values, found {len(cells)}")
+        try:
+            place[:len(cells)] = tables.number_cells(cells, separator != ",")
+        except ValueError as error:
+            raise MarkerFileError(f"{path}: line {number}: expected numbers, {error}") from None
+    return table
+
+
+def _is_number(cell: str) -> bool:
+    return bool(re.fullmatch(r"[-+]?\d+([.,]\d*)?(e[-+]?\d+)?", cell.strip().lower()))
+
+
+def even_rate(times: np.ndarray) -> float | None:
+    """Frames per second of times, at least two; None where they are not evenly spaced."""
+    typical = (times[-1] - times[0]) / (len(times) - 1)
+    even = typical > 0 and (np.abs(np.diff(times) - typical) <= 0.5 * typical).all()
+    return round(1 / typical, 6) if even else None
 
 
 def _rate(path: Path, times: np.ndarray, numbers: Sequence[int]) -> float | None:
     """Frames per second of evenly spaced times; None for a single frame."""
     if len(times) < 2:
         return 1.0
-    steps = np.diff(times)
-    typical = (times[-1] - times[0]) / (len(times) - 1)
-    off = np.flatnonzero(~(np.abs(steps - typical) <= 0.5 * typical))
-    if len(off) or not typical > 0:
-        where = numbers[int(off[0]) + 1] if len(off) else numbers[0]
-        raise MarkerFileError(f"{path}: line {where}: expected times in even steps of {typical:.4g} s, "
-                              f"found {times[off[0] + 1] if len(off) else times[0]:.6g} s "
-                              f"after {times[off[0]] if len(off) else times[0]:.6g} s")
-    return round(1 / typical, 6)
+    rate = even_rate(times)
+    if rate is None:
+        typical = (times[-1] - times[0]) / (len(times) - 1)
+        off = np.flatnonzero(~(np.abs(np.diff(times) - typical) <= 0.5 * typical))
+        k = int(off[0]) if len(off) else 0
+        raise MarkerFileError(f"{path}: line {numbers[k + 1] if len(off) else numbers[0]}: expected times in even "
+                              f"steps of {typical:.4g} s, found {times[k + 1]:.6g} s after {times[k]:.6g} s")
+    return rate
 
 
 def encode_csv(positions: np.ndarray, labels: Sequence[str], rate: float) -> bytes:
-    """Positions (T, L, 3), metres, as the CSV that `read_csv` reads."""
+    """Positions (T, L, 3), metres, as the CSV that `csv_markers` reads."""
     rows = np.column_stack([np.arange(len(positions)) / rate, positions.reshape(len(positions), -1)])
     header = ["time", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
     return tables.number_table(header, rows, "%.9g").encode()

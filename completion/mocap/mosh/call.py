@@ -41,6 +41,7 @@ class MoshCall(KeptCall):
     hold_out: tuple[str, ...] = ()
     retarget_to: Path | None = None
     unit: Unit | None = None
+    rate: float | None = None
     config: MoshConfig = field(default_factory=MoshConfig)
 
     def actors(self, output: Path) -> list[Actor]:

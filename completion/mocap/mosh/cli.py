@@ -16,6 +16,7 @@ from scanprep.cli import Output, Unit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, details, judgement_of, say
 from scanprep.judgement import Judgement, judge_many
 from scanprep.pictures.page import Page
+from scanprep.ranges import Positive
 from scanprep.words import number_of
 
 from ..marker_sets.named import choose_layout
@@ -32,7 +33,7 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
                  subjects: str = "auto", subject_prefix: str | None = None, hold_out: tuple[str, ...] = (),
                  retarget_to: Annotated[Path | None, Called("--character")] = None, unit: Unit | None = None,
-                 config: MoshConfig = MoshConfig(),               # noqa: B008
+                 rate: Positive | None = None, config: MoshConfig = MoshConfig(),               # noqa: B008
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
@@ -54,7 +55,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     Called again, the command leaves alone what is done and has not changed; killed, it goes on where it was.
 
     Args:
-        markers: C3D, TRC or CSV files, or folders of these.
+        markers: C3D, TRC, CSV or TSV files, or folders of these.
         output: Folder to write to.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use. Given three
             times, a model of both sexes, one of women and one of men: the markers tell the sex, by the first.
@@ -64,17 +65,20 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
             are left out are not used; or a rule: "name", by what stands before the first _, - or blank of the file
             name; "label", by what stands before the colon of the labels; "each", every file is of another person;
             "all", they are of one; "auto".
-        subject_prefix: Whose markers, in C3D files with several people: what stands before the colon of the labels.
+        subject_prefix: Whose markers, in files with several people: what stands before the colon of the labels.
+            Several, as Head,Trunk, are of one person.
         hold_out: Labels of markers that no stage sees, which then tell how well the body predicts.
         retarget_to: Model whose mean is a character, which makes the motion too: character.glb.
         unit: Unit of the markers, where the file cannot tell.
+        rate: Frames a second, where a file does not say or says it wrongly.
         config: Settings.
         workers: Who does the work, a person at a time.
     """
     if not markers:
         raise ValueError("MARKERS: expected at least one file or folder")
     held = tuple(label for words in hold_out for label in words.split(",") if label)
-    call = MoshCall(markers, model, layout, subjects, subject_prefix, held, retarget_to, unit, config)
+    call = MoshCall(markers, model, layout, subjects, subject_prefix, held, retarget_to, unit, rate,
+                    config)
     with bar("people") as people, bar("one of them") as inside:
         return carried_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
@@ -84,7 +88,7 @@ def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str
     actors, loaded = call.actors(space.folder), call.models()
     work = Work(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
                 None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
-                call.unit, call.config, command)
+                call.unit, call.rate, call.config, command)
     _keep_table(space, actors, call.subjects)
     _tell(actors)
     done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *tell)

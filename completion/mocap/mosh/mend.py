@@ -58,7 +58,8 @@ class Result:
         names = set(kept.kept(""))
         actors = [actor for actor in call.actors(folder) if actor.name in names]
         rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
-        people = found_people(folder, sorted(actors, key=lambda actor: _gravity(rows[actor.name])), models, call.unit)
+        people = found_people(folder, sorted(actors, key=lambda actor: _gravity(rows[actor.name])), models, call.unit,
+                              call.rate)
         return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
 
 

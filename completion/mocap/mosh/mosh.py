@@ -35,7 +35,9 @@ STEPS = 100                          # of progress, of each stage
 
 @dataclass(frozen=True)
 class PoseConfig(AnimateConfig):
-    """Settings of the poses of a person whose shape and marker places are known: as of `animate`."""
+    """Settings of the poses of a person whose shape and marker places are known: as of `animate`, without a flag."""
+
+    ground: bool = False
 
     @classmethod
     def weighted(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:

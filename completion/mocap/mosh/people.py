@@ -60,6 +60,7 @@ class Found:
     layout: MarkerLayout
     about: dict[str, Any]
     unit: str | None
+    rate: float | None
 
     @property
     def layout_name(self) -> str:
@@ -92,7 +93,7 @@ class Found:
     @cached_property
     def markers(self) -> list[MarkerSequence]:
         """As they were measured."""
-        return [read_markers(one.path, self.unit, one.who) for one in self.recordings]
+        return [read_markers(one.path, self.unit, one.who, self.rate) for one in self.recordings]
 
     @cached_property
     def labels(self) -> list[str]:
@@ -166,15 +167,16 @@ class Found:
                     frame.told)
 
 
-def found_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None) -> list[Found]:
+def found_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None,
+                 rate: float | None) -> list[Found]:
     """The people of an output, as their files tell; StorageError where they do not, ValueError where there are none."""
-    found = [_found(folder / actor.name, actor, models, unit) for actor in actors]
+    found = [_found(folder / actor.name, actor, models, unit, rate) for actor in actors]
     if not any(one.recordings for one in found):
         raise ValueError(f"{folder}: expected what scape mosh found of the people, there is none; run it once more")
     return [one for one in found if one.recordings]
 
 
-def _found(folder: Path, actor: Actor, models: Models, unit: str | None) -> Found:
+def _found(folder: Path, actor: Actor, models: Models, unit: str | None, rate: float | None) -> Found:
     about = storage.read_json(folder / "subject.json", "a person that scape mosh found")
     with storage.taking_apart(folder / "subject.json", "a person that scape mosh found"):
         sex = (about["sex"] or {}).get("sex", "")
@@ -182,7 +184,7 @@ def _found(folder: Path, actor: Actor, models: Models, unit: str | None) -> Foun
         about = {name: about[name] for name in ("betas", "layout", "worn_elsewhere", "exchanged", "left_out")}
     there = tuple(one for one in actor.recordings if (folder / one.name / "motion.npz").exists())
     layout = MarkerLayout.load(folder / "layout.json", len(model.template.vertices))
-    return Found(actor.name, folder, there, model, layout, about, unit)
+    return Found(actor.name, folder, there, model, layout, about, unit, rate)
 
 
 def _artefacts(path: Path) -> list[tuple[str, str]]:

@@ -20,7 +20,7 @@ TABLE = "subjects.csv"
 
 @dataclass(frozen=True)
 class Recording:
-    """One sequence of one person: its file, the name of its output folder, and whose markers in a C3D file."""
+    """One sequence of one person: its file, the name of its output folder, and whose markers in it, if of several."""
 
     path: Path
     name: str
@@ -41,12 +41,13 @@ class Grouping:
     """How recordings are given to people: by a rule, see --subjects of `scape mosh`, or by a table.
 
     "auto" is, of files that were named, "all"; of a folder its sub-folders, and of files that lie side by side "name"
-    where the name is two numbers, as in 85_02, else "label", else "each".
+    where the name is two numbers, as in 85_02, else "label", else "each". Several people in one file are kept apart,
+    by their labels, whatever the rule.
     """
 
     by: By = "auto"
     table: Path | None = None            # CSV with the columns file and subject, or JSON {file: subject}
-    who: str | None = None               # whose markers, in C3D files with several people
+    who: str | None = None               # whose markers, in files with several people
 
     @staticmethod
     def of(subjects: str, who: str | None = None) -> Grouping:
@@ -68,11 +69,12 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
     found = list(_files(given, output, grouping.table))
     if not found:
         raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(READERS)}, found none")
-    whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given))
+    whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given)
+                                     and not any(len(_labelled(f.path, grouping)) > 1 for f in found))
     if grouping.table is not None:
         said = _read_table(grouping.table, [f.path for f in found])
-        rows = [(folder_name(said[f.path]), f, grouping.who, f"as {grouping.table} says")
-                for f in found if f.path in said]
+        rows = [(folder_name(subject), f, grouping.who or _named_person(f.path, subject, grouping),
+                 f"as {grouping.table} says") for f in found for subject in said.get(f.path, ())]
     elif whole:
         name = next(_people(found[0], grouping))[0]
         if len(given) == 1 and given[0].is_dir():
@@ -127,21 +129,30 @@ def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterat
 def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, str]]:
     """Name, C3D subject and rule of the people in a file."""
     by, own = grouping.by, file.path.stem
-    numbers = re.fullmatch(r"(\d+)[_-]\d+", own)
-    if by == "auto" and file.folders:
+    numbers, people = re.fullmatch(r"(\d+)[_-]\d+", own), _labelled(file.path, grouping)
+    if len(people) > 1:
+        for who in people:
+            yield who, who, "by what stands before the labels"
+    elif by == "auto" and file.folders:
         yield file.folders[0], grouping.who, "by the sub-folder"
     elif by == "name" or (by == "auto" and numbers):
         yield re.split(r"[_\-\s]", own)[0], grouping.who, "by the file name" + (", NUMBER_NUMBER" if numbers else "")
-    elif by != "each" and grouping.who is None and (people := _labelled(file.path)):
-        for who in people:
-            yield who, who if len(people) > 1 else None, "by what stands before the labels"
+    elif by != "each" and people:
+        yield people[0], None, "by what stands before the labels"
     else:
         yield own if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
 
 
-def _labelled(path: Path) -> tuple[str, ...]:
+def _named_person(path: Path, subject: str, grouping: Grouping) -> str | None:
+    """The one of several people in a file whom a table names; None for a file of one."""
+    people = _labelled(path, grouping)
+    return next((who for who in people if folder_name(who) == folder_name(subject)), None) if len(people) > 1 else None
+
+
+def _labelled(path: Path, grouping: Grouping) -> tuple[str, ...]:
+    """The people in a file by its labels; none where one of them is named."""
     try:
-        return marker_subjects(path)
+        return marker_subjects(path) if grouping.who is None else ()
     except MarkerFileError:              # told when the file is read in earnest
         return ()
 
@@ -161,11 +172,10 @@ def _named(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recordin
     return tuple(Recording(f.path, n, who) for n, (f, who) in zip(names, files, strict=True))
 
 
-def _read_table(table: Path, found: list[Path]) -> dict[Path, str]:
-    """Whose each file is, of those that the table names by path, by name or without ending."""
-    said = dict(_table_rows(table))
-    out: dict[Path, str] = {}
-    for file, subject in said.items():
+def _read_table(table: Path, found: list[Path]) -> dict[Path, list[str]]:
+    """Whose each file is, of those that the table names by path, by name or without ending; several of some."""
+    out: dict[Path, list[str]] = {}
+    for file, subject in _table_rows(table):
         wanted = Path(file)
         hits = [path for path in found if path == wanted or path.parts[-len(wanted.parts):] == wanted.parts
                 or path.with_suffix("").parts[-len(wanted.parts):] == wanted.parts]
@@ -173,7 +183,7 @@ def _read_table(table: Path, found: list[Path]) -> dict[Path, str]:
             raise ValueError(f"{table}: no marker file '{file}' among those that were given")
         if len(hits) > 1:
             raise ValueError(f"{table}: '{file}' may be {' or '.join(map(str, hits))}; write more of the path")
-        out[hits[0]] = subject
+        out.setdefault(hits[0], []).append(subject)
     return out
 
 

@@ -57,6 +57,7 @@ class Work:
     layout: tuple[MarkerLayout, str] | None          # with its name; else the named one that fits the labels best
     hold_out: tuple[str, ...]            # labels that no stage sees
     unit: str | None
+    rate: float | None                   # frames a second, where a file does not say
     config: MoshConfig
     command: str = field(metadata={"digest": False})
 
@@ -154,7 +155,7 @@ def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording],
     found, sequences, failures = [], [], []
     for recording in recordings:
         try:
-            sequences.append(read_markers(recording.path, work.unit, recording.who))
+            sequences.append(read_markers(recording.path, work.unit, recording.who, work.rate))
             found.append(recording)
         except ValueError as error:
             failures.append(" ".join(str(error).replace(str(recording.path), recording.path.name).split()))

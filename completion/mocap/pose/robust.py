@@ -189,8 +189,11 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
         return "no marker of the layout was ever seen: markers of another layout?"
     known = layout.matched(markers.labels, 0)
     columns = [markers.labels.index(label) for label in known]
-    spans = [extent(frame) for frame in markers.positions[:: max(1, len(seen) // 50), columns]]
-    wrong = unit_problem(float(np.nanmax(spans)), extent(layout.select(known).place(body)), "the markers span a box")
+    some = markers.positions[:: max(1, len(seen) // 50), columns]
+    whole = np.isfinite(some[..., 0]).sum(axis=1)
+    # the median of frames that show most markers: a ghost of one frame makes its box as large as it likes
+    spans = [extent(frame) for frame in some[whole >= 0.9 * whole.max()]]
+    wrong = unit_problem(float(np.nanmedian(spans)), extent(layout.select(known).place(body)), "the markers span a box")
     # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
     off, far = float(motion.residuals[seen].mean()), 0.025 * size(body)
     if wrong is None and off <= far:
