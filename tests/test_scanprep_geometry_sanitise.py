@@ -154,7 +154,7 @@ def test_rows_that_differ_are_told_apart():
 
 @pytest.mark.parametrize("front", [1, 2, 8])
 def test_overlapping_views_do_not_throw_away_a_side(person, front):
-    """The back is seen once and sparsely, the front often and densely; up to 2% of the back are specks by themselves."""
+    """The back is seen once and sparsely, the front often and densely; 2% of the back are specks by themselves."""
     points, _, _ = person.sample(4000, np.random.default_rng(0))
     back = points[points[:, 1] > 0]
     dense, _, _ = person.sample(4000 * front, np.random.default_rng(1))
