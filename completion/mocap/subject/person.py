@@ -116,7 +116,7 @@ def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray]
     for i, factor in enumerate(config.annealing):
         last = i == stages - 1
         if i % 2 or (last and i):
-            state = fit.hung_anew(state, i in LOOK)                                         # [MoSh] Eq. 16
+            state = fit.hung_anew(state, i in LOOK, last)                                   # [MoSh] Eq. 16
         rows, converged, taken = step(f"person, stage {i}", given,
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
         state, steps = state.moved(rows), steps + taken
