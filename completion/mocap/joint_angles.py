@@ -167,8 +167,11 @@ def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray
     return np.stack([kept, y, np.cross(kept, y)] if by_front else [np.cross(y, kept), y, kept], axis=1)
 
 
-def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray) -> JointAngles:
+def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, told: np.ndarray | None = None
+                      ) -> JointAngles:
     """The joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
+
+    With `told` (J,) bool only those between parts of which the markers tell.
 
     Raises
     ------
@@ -181,8 +184,11 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray) -> 
     ground = ground_axes(found.axes, R[:, found.parts["pelvis"]])
     degrees = angles_of(found, ground, R)
     pelvis = centres[:, list(found.hips or (found.parts["pelvis"],))].mean(axis=1) @ ground
-    names = tuple(name for joint in found.joints() for name in joint.angles)
-    return JointAngles(names, degrees, pelvis, ground, found.missing())
+    known = [told is None or all(told[found.parts[segment]] for segment in (joint.proximal, joint.distal)
+                                 if segment != "ground") for joint in found.joints()]
+    names = tuple(name for joint, is_known in zip(found.joints(), known, strict=True) if is_known
+                  for name in joint.angles)
+    return JointAngles(names, degrees[:, np.repeat(known, 3)], pelvis, ground, found.missing())
 
 
 def rest_joints(subject: Subject) -> np.ndarray:

@@ -19,8 +19,9 @@ from scanprep.words import number_of
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
-from .frame_starts import mean_person, start_frames
-from .person import PersonConfig, PersonFit, common_markers, find_person
+from .frame_starts import mean_person, stand_off, start_frames
+from .latent_fit import distance_reach
+from .person import HAND, PersonConfig, PersonFit, common_markers, find_person
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
 FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
@@ -73,12 +74,16 @@ class Worn:
         Markers that are far from where the layout has them and that no place on the skin explains; they are left out.
     too_many : labels
         Markers that are far from where the layout has them, and so many that the body is at fault: nothing is changed.
+    lost : (part, labels) of parts
+        Parts of the body none of whose markers is where the layout has it: the part is at fault, not its markers,
+        which are kept.
     """
 
     moved: tuple[MovedMarker, ...] = ()
     exchanged: tuple[tuple[str, str], ...] = ()
     unplaced: tuple[str, ...] = ()
     too_many: tuple[str, ...] = ()
+    lost: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
     @property
     def changes(self) -> bool:
@@ -90,7 +95,15 @@ class Worn:
         return [*(Metric("names exchanged throughout, put back", " and ".join(pair)) for pair in self.exchanged),
                 *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
                 *(Metric("far from the layout's place, and found nowhere: left out", label) for label in self.unplaced),
-                *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many)]
+                *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many),
+                *(Metric(f"all markers of the {part} far from the layout's places", ", ".join(labels))
+                  for part, labels in self.lost)]
+
+    def problems(self) -> tuple[str, ...]:
+        """Why what was found with these markers means nothing."""
+        cause = "wrong labels there, the wrong layout, or a model that knows no such body?"
+        return tuple(f"all markers of the {part} ({', '.join(labels)}) are far from where the layout says: {cause}"
+                     for part, labels in self.lost)
 
     def doubts(self, labels: Sequence[str]) -> tuple[str, ...]:
         """Reasons to look at what was found with these markers, of all `labels` of a recording."""
@@ -100,7 +113,9 @@ class Worn:
                     ,) if 2 * len(self.exchanged) > sides else ()
         told = ((self.unplaced, "not worn where the layout says, and found nowhere: left out"),
                 (self.too_many, "far from where the layout says: the wrong layout, or the wrong body?"))
-        return (*mirrored, *(f"{', '.join(some)} {words}" for some, words in told if some))
+        far = [f"{m.label} by {100 * m.before:.0f} cm" for m in self.moved if m.before > HAND]
+        moved = (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
+        return (*mirrored, *moved, *(f"{', '.join(some)} {words}" for some, words in told if some))
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""
@@ -130,32 +145,36 @@ class Worn:
 class _Frames:
     """The bodies of a person in their frames, and the markers there."""
 
-    def __init__(self, model: BodyModel, person: PersonFit, sequences: Sequence[MarkerSequence], layout: MarkerLayout
-                 ) -> None:
+    def __init__(self, model: BodyModel, person: PersonFit, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
+                 wand: float) -> None:
         self.layout, positions = common_markers(sequences, layout)
         self.targets = np.stack([positions[which][t] for which, t in person.frames])                  # (B, L, 3)
-        vertices = model.subject(person.betas).vertices(person.poses, person.trans).astype(float)
-        self.bodies = [model.template.with_vertices(v) for v in vertices]
-        self.normals = [body.vertex_normals for body in self.bodies]
+        self.vertices = model.subject(person.betas).vertices(person.poses, person.trans).astype(float)     # (B, N, 3)
+        bodies = [model.template.with_vertices(v) for v in self.vertices]
+        self.normals = np.stack([body.vertex_normals for body in bodies])
+        self.reach, self.wand = distance_reach(self.layout, wand), wand
         self.part = model.skeleton.part_of_vertex(model.template)
         self.template: Mesh = model.template
-        self.places = np.stack([self.layout.place(body) for body in self.bodies])                     # (B, L, 3)
+        self.places = np.stack([self.layout.place(body) for body in bodies])                          # (B, L, 3)
 
-    def off_skin(self, row: int, distance: float) -> np.ndarray:
-        """(N,) RMS distance of a marker from every vertex, lifted off the skin so far, metres."""
-        return _rms(np.stack([np.linalg.norm(body.vertices + distance * normals - target, axis=1)
-                              for body, normals, target in
-                              zip(self.bodies, self.normals, self.targets[:, row], strict=True)]))
+    def off_skin(self, row: int, least: float, greatest: float) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) RMS distance of a marker from every vertex, lifted off the skin within limits, and how far; metres."""
+        seen = np.isfinite(self.targets[:, row, 0])
+        apart, lift = stand_off(self.targets[seen, row], self.vertices[seen], self.normals[seen], least, greatest)
+        return _rms(apart), lift
 
     def off_place(self, row: int, of: int) -> float:
-        """RMS distance of a marker from the usual place of one, that of a loose one anywhere along its part, metres."""
-        apart = float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
-        if self.layout.labels[of] not in self.layout.loose:
-            return apart
+        """RMS distance of a marker from the usual place of one, that of a loose one anywhere along its part, metres.
+
+        Where the distance from the skin is unknown, what a marker stands off the skin is not counted.
+        """
+        loose, least, greatest = self.layout.labels[of] in self.layout.loose, self.reach[0][of], self.reach[1][of]
+        if not (loose or least < greatest) or not np.isfinite(self.targets[:, row, 0]).any():
+            return float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
         centre = self.layout.nearest[of]
         near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
-            & (self.part == self.part[centre])
-        return min(apart, float(self.off_skin(row, float(np.asarray(self.layout.distances)[of]))[near].min()))
+            & (self.part == self.part[centre]) if loose else [centre]
+        return float(self.off_skin(row, float(least), float(greatest))[0][near].min())
 
     def off_usual(self) -> np.ndarray:
         """(L,) the same of every marker from its own, NaN for one that too few frames have seen."""
@@ -189,7 +208,7 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 
     [MoSh]
     """
-    at = _Frames(model, person, sequences, layout)
+    at = _Frames(model, person, sequences, layout, config.wand)
     rough = replace(config, n_betas=ROUGH_BETAS, annealing=ROUGH_STAGES)
     sides, sequences, at = _exchanged_sides(model, sequences, layout, at, rough)
     suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else SUSPECT
@@ -208,8 +227,24 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     found = _explained(at, suspects)
     if found.unplaced and (found.moved or found.exchanged):
         found = _once_more(model, sequences, layout, found, config)
+    found = _with_whole_parts(at, found, model.skeleton.names)
     again = set(sides) & set(found.exchanged)                           # exchanged, and put back
     return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
+
+
+def _with_whole_parts(at: _Frames, found: Worn, names: Sequence[str]) -> Worn:
+    """What was found, but for parts of the body that would lose all their markers, of two or more: those keep them."""
+    part_of_marker = at.part[at.layout.nearest]
+    ends = {m.label: at.part[m.corners[m.weights.argmax()]] for m in found.moved}
+    kept, lost = set[str](), []
+    for part in np.unique(part_of_marker).tolist():
+        mine = [label for label, of in zip(at.layout.labels, part_of_marker, strict=True) if of == part]
+        gone = [label for label in mine if label in found.unplaced or ends.get(label, part) != part]
+        if len(gone) == len(mine) > 1:
+            lost.append((names[part], tuple(mine)))
+            kept.update(mine)
+    return replace(found, moved=tuple(m for m in found.moved if m.label not in kept),
+                   unplaced=tuple(label for label in found.unplaced if label not in kept), lost=tuple(lost))
 
 
 def _once_more(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, found: Worn,
@@ -231,7 +266,7 @@ def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mark
              config: PersonConfig) -> _Frames:
     """The body that is fitted without some markers, and all markers on it."""
     others = layout.without([label for label in layout.labels if label in suspects])
-    return _Frames(model, find_person(model, sequences, others, config), sequences, layout)
+    return _Frames(model, find_person(model, sequences, others, config), sequences, layout, config.wand)
 
 
 def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
@@ -245,7 +280,7 @@ def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layo
     for tried in _promising(model, at) if (off > FAR).sum() >= SEVERAL else ():
         names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in tried))
         renamed = [names.named(each, layout) for each in sequences]
-        other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout)
+        other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout, rough.wand)
         if _burden(other) < 0.5 * _burden(at) and _burden(other) < _burden(best[2]):
             best = names.exchanged, renamed, other
     return best
@@ -313,11 +348,17 @@ def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
 
 
 def _best_place(at: _Frames, row: int, before: float) -> MovedMarker:
-    """Where on the skin a marker is nearest, at its own distance from it or that of a common one. [MoSh]"""
+    """Where on the skin a marker is nearest, its distance from it being that of the layout, common or on a wand.
+
+    [MoSh]
+    """
     own = float(np.asarray(at.layout.distances)[row])
+    least, greatest = min(own, DISTANCE), max(own, DISTANCE) + at.wand
     tried = []
-    for distance in {own, DISTANCE}:
-        vertex = int(at.off_skin(row, distance).argmin())
+    for low, high in {(own, own), (DISTANCE, DISTANCE), (least, greatest)}:
+        off, lift = at.off_skin(row, low, high)
+        vertex = int(off.argmin())
+        distance = float(lift[vertex])
         tried += [MovedMarker(at.layout.labels[row], corners, weights, distance, before, after)
                   for corners in at.template.faces[(at.template.faces == vertex).any(axis=1)]
                   for weights, after in [_on_triangle(at, row, distance, corners)]]
@@ -326,8 +367,7 @@ def _best_place(at: _Frames, row: int, before: float) -> MovedMarker:
 
 def _on_triangle(at: _Frames, row: int, distance: float, corners: np.ndarray) -> tuple[np.ndarray, float]:
     """The weights (3,) of a triangle's corners that come nearest to a marker, lifted so far, and its RMS distance."""
-    lifted = np.stack([body.vertices[corners] + distance * normals[corners]
-                       for body, normals in zip(at.bodies, at.normals, strict=True)])                 # (B, 3, 3)
+    lifted = at.vertices[:, corners] + distance * at.normals[:, corners]                              # (B, 3, 3)
     target = at.targets[:, row]
     seen = np.isfinite(target[:, 0])
     sides = (lifted[seen, 1:] - lifted[seen, :1]).swapaxes(1, 2).reshape(-1, 2)
