@@ -64,8 +64,7 @@ class PersonConfig(Settings):
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight; the paper weighs all alike.
     wand : float, metres
-        How much farther from the skin than the layout says a loose marker or one on a bar may be: clinics wear those
-        of thighs and shanks on wands. 0 takes all distances as the layout has them, as the paper does.
+        How much farther from the skin than the layout says a marker that may be on a wand, or one on a bar, can be. 0 takes all distances as the layout has them, as the paper does.
     seed : int
         Of the frames drawn at random.
     """
@@ -133,11 +132,11 @@ def each_own(frame: np.ndarray) -> np.ndarray:
 def distance_reach(layout: MarkerLayout, wand: float) -> tuple[np.ndarray, np.ndarray]:
     """The least and the greatest distance (L,) of every marker from the skin, metres.
 
-    That of the layout, but for loose markers, which clinics wear on wands, and for those that the layout itself has
-    away from the skin, on bars, which others wear without: there up to `wand` more, and down to the skin.
+    That of the layout, but for markers that some wear on wands, and for those that the layout itself has away from the
+    skin, on bars, which others wear without: there up to `wand` more, and down to the skin.
     """
     distances = np.asarray(layout.distances)
-    free = (np.isin(layout.labels, layout.loose) | (distances > DISTANCE + ON_SKIN)) & (wand > 0)
+    free = (np.isin(layout.labels, layout.wands) | (distances > DISTANCE + ON_SKIN)) & (wand > 0)
     return (np.where(free, np.minimum(distances, DISTANCE), distances),
             np.where(free, distances + wand, distances))
 
