@@ -426,8 +426,8 @@ def test_many_results_are_as_good_as_the_worst_of_them():
     (2.61, 290, 20.0, "failed", "scale"), (4.04, 1150, 46.0, "failed", "scale"), (0.93, 12, 6.0, "failed", "scale"),
     (1.20, 25, 5.0, "check", "child"), (2.20, 120, 5.0, "check", "giant"), (1.75, 190, 5.0, "check", "second person"),
     (1.75, 30, 5.0, "check", "flattened"),
-    (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 14.0, "check", "standard deviations"),
-    (1.75, 75, 20.0, "failed", "scale")])
+    (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 9.0, "check", "standard deviations"),
+    (1.75, 75, 6.5, "good", ""), (1.75, 75, 13.8, "failed", "scale")])
 def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
     found = beyond_people(stature, volume, np.eye(18)[0] * betas)
     assert found.verdict == verdict and word in found.why, found

@@ -26,7 +26,7 @@ from .attachment import Attachment, LatentMarkers, above_triangles, latent_marke
 from .frame_starts import find_loose
 
 CENTIMETRES = 100.0                  # in a metre
-ON_SKIN = 0.012                      # metres from a distance that the marker set names, within which it is that one
+ON_SKIN = 0.016                      # metres from a distance that the marker set names, within which it is that one
 
 
 @dataclass(frozen=True)
