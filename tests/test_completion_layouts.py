@@ -135,7 +135,8 @@ def test_the_layout_that_knows_most_labels_is_found(person):
     for name in COUNTS:
         layout = named_layout(name, person)
         assert fitting_layout(layout.labels, person)[1] == name
-    with pytest.raises(ValueError, match="of these 3 the sets know cmu41 1, .*biomech57 0.*scape layout list.*--layout"):
+    told = "of these 3 the sets know cmu41 1, .*biomech57 0.*scape layout list.*--layout"
+    with pytest.raises(ValueError, match=told):
         fitting_layout(["LTHI", "x", "y"], person)
 
 

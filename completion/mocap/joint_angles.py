@@ -90,6 +90,7 @@ class JointAngles:
     pelvis: np.ndarray               # (T, 3) metres, the middle of the hips
     ground: np.ndarray               # (3, 3) columns: its x, y (up) and z in the axes of the motion
     missing: tuple[str, ...]         # joints that people have and this body's parts do not
+    guessed: tuple[str, ...] = ()    # angles of joints that the markers do not tell of, which are left out
 
 
 def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> Anatomy:
@@ -184,11 +185,12 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, tol
     ground = ground_axes(found.axes, R[:, found.parts["pelvis"]])
     degrees = angles_of(found, ground, R)
     pelvis = centres[:, list(found.hips or (found.parts["pelvis"],))].mean(axis=1) @ ground
+    joints = found.joints()
     known = [told is None or all(told[found.parts[segment]] for segment in (joint.proximal, joint.distal)
-                                 if segment != "ground") for joint in found.joints()]
-    names = tuple(name for joint, is_known in zip(found.joints(), known, strict=True) if is_known
-                  for name in joint.angles)
-    return JointAngles(names, degrees[:, np.repeat(known, 3)], pelvis, ground, found.missing())
+                                 if segment != "ground") for joint in joints]
+    names, guessed = (tuple(name for joint, is_known in zip(joints, known, strict=True) if is_known == wanted
+                            for name in joint.angles) for wanted in (True, False))
+    return JointAngles(names, degrees[:, np.repeat(known, 3)], pelvis, ground, found.missing(), guessed)
 
 
 def rest_joints(subject: Subject) -> np.ndarray:

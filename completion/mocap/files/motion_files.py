@@ -18,9 +18,8 @@ from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
-from ..pose.coverage import unknown_joints
 from .markers import MarkerSequence
-from .opensim import known_centres, write_opensim
+from .opensim import guessed_angles, known_centres, write_opensim
 
 KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
 MEASURED = 40                        # frames in which it is compared with the exact bodies
@@ -54,13 +53,13 @@ def write_motion(folder: Path, motion: Motion, subject: Subject, markers: Marker
     bool) is an empty cell in tables and left out of the MOT.
     """
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
-    names, guessed = skeleton.names, np.zeros(len(skeleton.names), dtype=bool)
+    names, angles = skeleton.names, joint_angles(motion)
     if told is not None:
-        guessed = unknown_joints(skeleton, told)
+        angles[:, guessed_angles(skeleton, told)] = np.nan
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_table(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, np.where(guessed[:, None], np.nan, joint_angles(motion)).reshape(T, -1)])
+                np.c_[motion.times, angles.reshape(T, -1)])
     write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
                 np.c_[motion.times, known_centres(centres, skeleton, told).reshape(T, -1)])
     write_opensim(folder, motion, subject, centres, markers, told)

@@ -71,10 +71,17 @@ def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> Mar
 
 def known_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | None) -> np.ndarray:
     """Joint centres (T, J, 3) without, NaN, those between two parts of which the markers do not tell."""
-    if told is None:
-        return centres
-    above = np.where(skeleton.parents >= 0, skeleton.parents, np.arange(len(told)))
-    return np.where((told | told[above])[:, None], centres, np.nan)
+    return centres if told is None else np.where((told | told[_above(skeleton)])[:, None], centres, np.nan)
+
+
+def guessed_angles(skeleton: Skeleton, told: np.ndarray) -> np.ndarray:
+    """(J,) bool: joints whose angles are guesses, for parts `told` (J,) of which the markers tell."""
+    return ~(told & told[_above(skeleton)])
+
+
+def _above(skeleton: Skeleton) -> np.ndarray:
+    """(J,) the parent of every part, of the root the root itself."""
+    return np.maximum(skeleton.parents, 0)
 
 
 def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
@@ -96,7 +103,9 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
     lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
              "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
              f"Axes x, y, z are {', '.join(axes)} of the recording.",
-             *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []), "", "endheader"]
+             *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []),
+             *([f"Seen by no marker, left out: {', '.join(angles.guessed)}."] if angles.guessed else []),
+             "", "endheader"]
     lines += ["\t".join(names), *tables.number_lines(table, "%.8g", "\t")]
     with storage.writing(Path(path)) as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

@@ -114,9 +114,3 @@ def between(skeleton: Skeleton, seen: np.ndarray) -> np.ndarray:
     for way in ways:
         found[way[:way.index(top) + 1]] = True
     return found
-
-
-def unknown_joints(skeleton: Skeleton, told: np.ndarray) -> np.ndarray:
-    """(J,) bool: joints whose angles are guesses, for parts (J,) of which the markers tell."""
-    above = np.where(skeleton.parents >= 0, skeleton.parents, np.arange(len(told)))
-    return ~(told & told[above])

@@ -64,7 +64,8 @@ class PersonConfig(Settings):
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight; the paper weighs all alike.
     wand : float, metres
-        How much farther from the skin than the layout says a marker that may be on a wand, or one on a bar, can be. 0 takes all distances as the layout has them, as the paper does.
+        How much farther from the skin than the layout says a marker that may be on a wand, or one on a bar, can be.
+        0 takes all distances as the layout has them, as the paper does.
     seed : int
         Of the frames drawn at random.
     """

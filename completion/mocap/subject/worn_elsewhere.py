@@ -25,6 +25,7 @@ from .person import HAND, PersonConfig, PersonFit, common_markers, find_person
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
 FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
+UNUSUAL = 4.0                        # times that of the median marker, at least: on a body that the model hardly knows
 NEAR = 0.02                          # metres within which another place explains a marker, at least
 USUAL = 1.5                          # times that of the other markers from their usual places, likewise
 GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
@@ -74,16 +75,16 @@ class Worn:
         Markers that are far from where the layout has them and that no place on the skin explains; they are left out.
     too_many : labels
         Markers that are far from where the layout has them, and so many that the body is at fault: nothing is changed.
-    lost : (part, labels) of parts
-        Parts of the body none of whose markers is where the layout has it: the part is at fault, not its markers,
-        which are kept.
+    lost : (part, labels, whole) of parts
+        Parts of the body of which most markers, or all (`whole`), are not where the layout has them: the part is at
+        fault, not its markers. They are kept, and weighed.
     """
 
     moved: tuple[MovedMarker, ...] = ()
     exchanged: tuple[tuple[str, str], ...] = ()
     unplaced: tuple[str, ...] = ()
     too_many: tuple[str, ...] = ()
-    lost: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    lost: tuple[tuple[str, tuple[str, ...], bool], ...] = ()
 
     @property
     def changes(self) -> bool:
@@ -96,14 +97,12 @@ class Worn:
                 *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
                 *(Metric("far from the layout's place, and found nowhere: left out", label) for label in self.unplaced),
                 *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many),
-                *(Metric(f"all markers of the {part} far from the layout's places", ", ".join(labels))
-                  for part, labels in self.lost)]
+                *(Metric(f"{'all' if whole else 'most'} markers of the {part} far from the layout's places",
+                         ", ".join(labels)) for part, labels, whole in self.lost)]
 
     def problems(self) -> tuple[str, ...]:
         """Why what was found with these markers means nothing."""
-        cause = "wrong labels there, the wrong layout, or a model that knows no such body?"
-        return tuple(f"all markers of the {part} ({', '.join(labels)}) are far from where the layout says: {cause}"
-                     for part, labels in self.lost)
+        return tuple(_at_fault("all", part, labels) for part, labels, whole in self.lost if whole)
 
     def doubts(self, labels: Sequence[str]) -> tuple[str, ...]:
         """Reasons to look at what was found with these markers, of all `labels` of a recording."""
@@ -115,6 +114,7 @@ class Worn:
                 (self.too_many, "far from where the layout says: the wrong layout, or the wrong body?"))
         far = [f"{m.label} by {100 * m.before:.0f} cm" for m in self.moved if m.before > HAND]
         moved = (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
+        moved += tuple(_at_fault("most", part, names) for part, names, whole in self.lost if not whole)
         return (*mirrored, *moved, *(f"{', '.join(some)} {words}" for some, words in told if some))
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
@@ -140,6 +140,12 @@ class Worn:
         found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
                              np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
         return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
+
+
+def _at_fault(share: str, part: str, labels: Sequence[str]) -> str:
+    """What is told of a part whose markers are not where the layout says."""
+    return (f"{share} markers of the {part} ({', '.join(labels)}) are far from where the layout says: "
+            "wrong labels there, another layout, or a model that knows no such body?")
 
 
 class _Frames:
@@ -175,6 +181,11 @@ class _Frames:
         near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
             & (self.part == self.part[centre]) if loose else [centre]
         return float(self.off_skin(row, float(least), float(greatest))[0][near].min())
+
+    def far(self, least: float) -> float:
+        """From how far off its usual place on a marker is suspected, at least so far, metres."""
+        off = self.off_usual()
+        return max(least, UNUSUAL * float(np.nanmedian(off))) if np.isfinite(off).any() else least
 
     def off_usual(self) -> np.ndarray:
         """(L,) the same of every marker from its own, NaN for one that too few frames have seen."""
@@ -214,8 +225,9 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else SUSPECT
     for _ in range(ROUNDS):
         off = dict(zip(at.layout.labels, np.nan_to_num(at.off_usual()).tolist(), strict=True))
-        cleared |= {label for label in suspects if off[label] <= FAR}
-        before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > far)
+        limit = at.far(far)
+        cleared |= {label for label in suspects if off[label] <= max(limit, FAR)}
+        before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > limit)
         if len(suspects) > MOST * len(off):
             return Worn(too_many=tuple(label for label in at.layout.labels if label in suspects))
         if suspects == before:
@@ -233,16 +245,16 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 
 
 def _with_whole_parts(at: _Frames, found: Worn, names: Sequence[str]) -> Worn:
-    """What was found, but for parts of the body that would lose all their markers, of two or more: those keep them."""
+    """What was found, but for parts of the body that would lose most of their markers: those keep them all."""
     part_of_marker = at.part[at.layout.nearest]
     ends = {m.label: at.part[m.corners[m.weights.argmax()]] for m in found.moved}
     kept, lost = set[str](), []
     for part in np.unique(part_of_marker).tolist():
         mine = [label for label, of in zip(at.layout.labels, part_of_marker, strict=True) if of == part]
         gone = [label for label in mine if label in found.unplaced or ends.get(label, part) != part]
-        if len(gone) == len(mine) > 1:
-            lost.append((names[part], tuple(mine)))
-            kept.update(mine)
+        if len(gone) > max(1, len(mine) / 2):
+            lost.append((names[part], tuple(gone), len(gone) == len(mine)))
+            kept.update(gone)
     return replace(found, moved=tuple(m for m in found.moved if m.label not in kept),
                    unplaced=tuple(label for label in found.unplaced if label not in kept), lost=tuple(lost))
 
@@ -257,7 +269,8 @@ def _once_more(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Ma
     layout = replace(found, unplaced=()).placed(layout)
     at = _without(model, sequences, layout, (), config)
     off = dict(zip(at.layout.labels, at.off_usual(), strict=True))
-    far = [label for label in found.unplaced if off[label] > FAR]
+    limit = at.far(FAR)
+    far = [label for label in found.unplaced if off[label] > limit]
     rest = _explained(_without(model, sequences, layout, far, config), far) if far else Worn()
     return Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
 
@@ -336,7 +349,8 @@ def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
     labels, usual = at.layout.labels, at.off_usual()
     others = [i for i, label in enumerate(labels) if label not in suspects]
     limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
-    rows, exchanged = {i for i, label in enumerate(labels) if label in suspects and usual[i] > FAR}, []
+    far, exchanged = at.far(FAR), []
+    rows = {i for i, label in enumerate(labels) if label in suspects and usual[i] > far}
     crossed = [(at.off_place(i, j), at.off_place(j, i), i, j) for i, j in combinations(sorted(rows), 2)]
     for one, other, i, j in sorted(crossed, key=lambda both: max(both[:2])):
         if {i, j} <= rows and max(one, other) < FAR and one + other < GAIN * (usual[i] + usual[j]):
