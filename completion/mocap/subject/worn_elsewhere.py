@@ -183,9 +183,12 @@ class _Frames:
         return float(self.off_skin(row, float(least), float(greatest))[0][near].min())
 
     def far(self, least: float) -> float:
-        """From how far off its usual place on a marker is suspected, at least so far, metres."""
+        """From how far off its usual place on a marker is suspected, at least so far, metres.
+
+        It is farther on a body that fits all markers badly, but where labels are mixed up no farther than twice `FAR`.
+        """
         off = self.off_usual()
-        return max(least, UNUSUAL * float(np.nanmedian(off))) if np.isfinite(off).any() else least
+        return float(np.clip(UNUSUAL * np.nanmedian(off), least, 2 * FAR)) if np.isfinite(off).any() else least
 
     def off_usual(self) -> np.ndarray:
         """(L,) the same of every marker from its own, NaN for one that too few frames have seen."""
