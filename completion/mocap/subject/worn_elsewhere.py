@@ -113,7 +113,7 @@ class Worn:
         told = ((self.unplaced, "not worn where the layout says, and found nowhere: left out"),
                 (self.too_many, "far from where the layout says: the wrong layout, or the wrong body?"))
         far = [f"{m.label} by {100 * m.before:.0f} cm" for m in self.moved if m.before > HAND]
-        moved = (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
+        moved: tuple[str, ...] = (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
         moved += tuple(_at_fault("most", part, names) for part, names, whole in self.lost if not whole)
         return (*mirrored, *moved, *(f"{', '.join(some)} {words}" for some, words in told if some))
 
