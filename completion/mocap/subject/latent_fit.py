@@ -273,11 +273,12 @@ class LatentFit:
         r = np.clip(above_triangles(state.places, corners)[0], state.least, state.greatest)
         distances, given = np.where(free, r, np.asarray(state.layout.distances)), np.asarray(self.layout.distances)
         if last:
-            # both sides are worn alike, and together they tell with less error
+            # both sides are worn alike, and together they tell with less error than one alone
             pairs = label_pairs(self.layout.labels)
-            both = np.where((pairs >= 0) & free[pairs], (r + r[pairs]) / 2, r)
+            paired = (pairs >= 0) & free[pairs]
+            both, limit = np.where(paired, (r + r[pairs]) / 2, r), np.where(paired, ON_SKIN, np.sqrt(2) * ON_SKIN)
             for named in (np.full(len(r), DISTANCE), given):
-                near = free & (np.abs(both - named) < ON_SKIN)
+                near = free & (np.abs(both - named) < limit)
                 distances, free = np.where(near, named, distances), free & ~near
         return replace(state, layout=replace(state.layout, distances=distances),
                        least=np.where(free, state.least, distances), greatest=np.where(free, state.greatest, distances))
