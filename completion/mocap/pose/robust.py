@@ -190,7 +190,9 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     known = layout.matched(markers.labels, 0)
     columns = [markers.labels.index(label) for label in known]
     spans = [extent(frame) for frame in markers.positions[:: max(1, len(seen) // 50), columns]]
-    wrong = unit_problem(float(np.nanmax(spans)), extent(layout.select(known).place(body)), "the markers span a box")
+    # the median: a ghost that shows in a few frames has no say in the unit
+    wrong = unit_problem(float(np.nanmedian(spans)), extent(layout.select(known).place(body)),
+                         "the markers span a box")
     # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
     off, far = float(motion.residuals[seen].mean()), 0.025 * size(body)
     if wrong is None and off <= far:
