@@ -21,7 +21,7 @@ GROUPS = {      # an argument has the same name and meaning in all commands; wha
     "input": "model template poses shapes train_shapes bodies body target source motion control first registered "
              "skeleton candidates image correspondences views cameras rate",
     "output": "output out save_in format surfaces meshes level",
-    "what is known": "landmarks template_landmarks target_landmarks source_landmarks features subject subjects "
+    "what is known": "landmarks template_landmarks source_landmarks features subject subjects "
                      "subject_prefix layout mask unit up betas own_body pose sex",
     "method": "",
     "other": "interactive over serve seed workers scheduler preset config write_config force",

@@ -80,7 +80,10 @@ def settings_file(function: Callable[..., Outcome], argv: list[str]) -> str | No
     """The file of settings that `--write-config` asks for, or None where it does not."""
     found = {p.name: p.default for p in inspect.signature(function).parameters.values()
              if isinstance(p.default, ranges.Settings)}
-    return config_files.write(_Settings(found, argv).values) if found and "--write-config" in argv else None
+    if not found or "--write-config" not in argv:
+        return None
+    settings = _Settings(found, argv)
+    return settings.about + config_files.write(settings.values)
 
 
 class _Settings:
@@ -90,15 +93,17 @@ class _Settings:
         early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         early.add_argument("--config", type=Path)
         early.add_argument("--preset", default="default")
-        self.presets = hasattr(values.get("config"), "published")     # of the command's own method
-        self.values = values
+        published = getattr(next(iter(values.values()), None), "published", None)       # of the command's own method
+        self.presets = published is not None
+        self.values, self.about = values, ""
         if not values or {"-h", "--help"} & {*argv}:
             return
         with contextlib.suppress(argparse.ArgumentError):               # said by the parser of the whole line
             given = early.parse_known_args(argv)[0]
             if self.presets and given.preset == "published":
-                self.values = {name: getattr(value, "published", lambda value=value: value)()
-                               for name, value in values.items()}
+                self.about = config_files.comment(inspect.getdoc(published) or "")
+                self.values = {name: value.published() if hasattr(value, "published") and value == type(value)()
+                               else value for name, value in values.items()}
             if given.config is not None:
                 self.values = config_files.read(given.config, self.values)
 

@@ -91,6 +91,13 @@ def _hints(cls: type) -> dict[str, Any]:
     return typing.get_type_hints(cls, include_extras=True)
 
 
+def comment(text: str) -> str:
+    """Paragraphs as comment lines of a file, with an empty line after them; nothing for no text."""
+    parts = [textwrap.fill(part, 102, initial_indent="# ", subsequent_indent="# ")
+             for part in text.split("\n\n") if part]
+    return "\n#\n".join(parts) + "\n\n" * bool(parts)
+
+
 def _lines(config: Any, table: Path_) -> Iterator[str]:
     """Fields first, then tables, as TOML wants it."""
     import tomlkit

@@ -6,11 +6,13 @@ import shutil
 import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
+from config_files import config_file
 from glb_reader import Glb
-from mosh_folders import FRAMES, run, small_pictures, write_people
+from mosh_folders import FRAMES, QUICK, run, small_pictures, write_people
 from scene_reader import scenes_of
 
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
+from completion.__main__ import main
 from completion.mocap.mosh.recordings import Grouping, find_actors
 from completion.mocap.mosh.takes import held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
@@ -95,6 +97,18 @@ def test_held_out_markers_of_a_changing_shape_are_those_of_its_meshes(done, plac
                        for v in soft.vertices(model)])
     off = np.linalg.norm(places - markers.select(["M7", "M9"]).positions, axis=2)
     assert np.abs(held.soft - off).max() < 0.004
+
+
+@pytest.mark.parametrize("words", [("--preset", "published"), ("--config", "soft.toml", "--character", "model.npz")])
+def test_betas_may_change_in_every_frame(place, tmp_path, monkeypatch, words):
+    """As the paper has it: by its preset, and by the setting alone; every file is there."""
+    monkeypatch.chdir(place)
+    config_file(place, "soft.toml", person=QUICK, soft={"shape_change": 0.25})
+    assert main(["mosh", "people/ann/walk.csv", "-m", "model.npz", "--layout", "layout.json", "-o",
+                 str(tmp_path / "out"), "--workers", "1", *words]) == 0
+    take = next((tmp_path / "out").glob("*/walk*"), tmp_path / "out")
+    assert SoftTissue.load(take / "soft_tissue.npz").changes.any()
+    assert (take / "animation.glb").stat().st_size > 1000
 
 
 def test_gaps_are_filled_and_counted(done):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
+from completion.__main__ import main
 from model import LearnConfig, load_model
 from model.learning import parts
 from model.learning.cli import learn
@@ -93,6 +94,14 @@ def test_a_mix_takes_every_mesh_of_the_set(folder, tmp_path):
     learned(folder / "set", tmp_path / "mix.npz", kind="mixed", mixed=replace(MIX, refinements=1, components=4))
     model = load_model(tmp_path / "mix.npz")
     assert model.info["bodies"] == 18 and model.info["people"] == 7 and model.n_betas == 4
+
+
+def test_the_published_preset_learns_as_the_paper(folder, tmp_path, capsys):
+    learn_set = ["learn", "--poses", str(folder / "set"), "--shapes", str(folder / "set"), "--preset", "published"]
+    assert main([*learn_set, "-o", str(tmp_path / "m.npz")]) == 0
+    assert load_model(tmp_path / "m.npz").info["pruning"] == LearnConfig.published().prunings[0]
+    assert main([*learn_set, "-o", str(tmp_path / "n.npz"), "--kind", "skinning"]) == 2
+    assert "--kind skinning: the paper of --preset published has SCAPE alone" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("given, words", [

@@ -24,6 +24,7 @@ from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import cli as registration_cli
 from scanprep.registration.nonrigid import register
+from scanprep.registration.schedule import RegistrationConfig
 
 ROOT = Path(__file__).parents[1]
 
@@ -107,6 +108,16 @@ def test_run(place, tmp_path, capsys, quick):
     assert page.index("scan-broken") and page.count("<figure data-scene=") == 3
 
 
+def test_the_published_preset_registers_a_folder(place, tmp_path, monkeypatch):
+    """With a tenth of its nodes and rounds."""
+    paper = RegistrationConfig.published()
+    few = replace(paper, graph=tuple(replace(s, nodes=s.nodes // 10, rounds=2) for s in paper.graph))
+    monkeypatch.setattr(RegistrationConfig, "published", lambda: few)
+    words = "run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set"
+    assert run(*words, "--preset", "published") == 0
+    assert report(tmp_path / "set" / "report.json")["distance to the scan, mean"] < 5
+
+
 def test_page_with_other_limits(place, capsys):
     page = place / "set" / "report.html"
     assert run("page", place / "set", "--config", config_file(place, unseen=0.5)) == 0
@@ -161,6 +172,20 @@ def test_decimate_keeps_landmarks(place, tmp_path):
     assert len(small.faces) <= 400 and small.is_closed
     apart = np.linalg.norm(small.vertices[:, None] - template.vertices[list(MARKS.values())], axis=2).min(axis=0)
     assert apart.max() < 1e-9
+
+
+def test_align_begins_at_the_landmarks_beside_both(place, tmp_path, capsys):
+    """A body that stands on its head, where surfaces alone end in another pose."""
+    body, turn = read_mesh(place / "template.ply"), np.diag([1.0, -1.0, -1.0])
+    write_mesh(tmp_path / "turned.ply", body.with_vertices(body.vertices @ turn + [0.3, 0, 2]))
+    marks = {name: body.vertices[v] @ turn + [0.3, 0, 2] for name, v in MARKS.items()}
+    write_landmarks(tmp_path / "turned.landmarks.json", marks)
+    assert run("align", tmp_path / "turned.ply", place / "template.ply", "-o", tmp_path / "back.ply") == 0
+    np.testing.assert_allclose(read_mesh(tmp_path / "back.ply").vertices, body.vertices, atol=1e-4)
+    shutil.copy(place / "template.ply", tmp_path / "bare.ply")
+    assert run("align", tmp_path / "turned.ply", tmp_path / "bare.ply", "--landmarks",
+               tmp_path / "turned.landmarks.json", "-o", tmp_path / "no.ply") == 1
+    assert "bare.ply has no landmarks; expected a file of its name beside it" in capsys.readouterr().err
 
 
 def test_decimate_set(place, tmp_path, capsys):

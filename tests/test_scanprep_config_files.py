@@ -54,6 +54,10 @@ class Outer(Settings):
 
     @classmethod
     def published(cls):
+        """As on paper.
+
+        Not as there: nothing.
+        """
         return cls(share=0.25)
 
 
@@ -122,6 +126,7 @@ def test_a_file_that_is_not_there(tmp_path, capsys):
 def test_the_written_file_says_what_everything_means(capsys):
     config, code, said = run(["--write-config", "--preset", "published"], capsys)
     assert config is None and code == 0
+    assert said.out.startswith("# As on paper.\n#\n# Not as there: nothing.\n\n")
     assert "# Which part.\nshare = 0.25\n" in said.out and "# cleaning = (not set)" in said.out
     assert max(map(len, said.out.splitlines())) <= 102
 

@@ -73,6 +73,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         raise UsageError("--kind mixed: it learns one SCAPE model of --poses alone, without --shapes and --by-sex")
     if by_sex and (shapes is None or kind != "scape"):
         raise UsageError("--by-sex: it needs --shapes and the kind scape")
+    if kind not in ("scape", "blendscape") and scape == LearnConfig.published():
+        raise UsageError(f"--kind {kind}: the paper of --preset published has SCAPE alone")
     body, posed = read_poses(poses, template, subject, unit) if kind != "mixed" else _read_mix(poses)
     people = None if shapes is None else read_bodies(shapes, body, unit)[0]
     known = None if not by_sex or shapes is None else _read_sexes(shapes)

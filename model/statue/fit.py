@@ -37,7 +37,10 @@ class StatueConfig(Settings):
 
     @classmethod
     def published(cls) -> StatueConfig:
-        """The control mesh fitted by the steps of the paper alone."""
+        """The control mesh fitted by the steps of the paper alone.
+
+        Not as in the paper: without --features joints and landmarks are found by a search, which the paper has clicked.
+        """
         return cls(surface=SurfaceFitConfig.published())
 
 

@@ -19,6 +19,7 @@ from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
 from ..registration.person import PersonParts, person_parts
+from ..registration.schedule import RegistrationConfig
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
@@ -49,6 +50,11 @@ class PrepareConfig(Settings):
     skeleton: SkeletonConfig = field(default_factory=SkeletonConfig)
     min_poses: Count = 5
     workers: Workers = field(default_factory=Workers)
+
+    @classmethod
+    def published(cls) -> PrepareConfig:
+        """Scans registered as [SCAPE] did, from landmarks or the given pose."""
+        return cls(scan=ScanSettings(RegistrationConfig.published()))
 
 
 @dataclass(frozen=True, eq=False)

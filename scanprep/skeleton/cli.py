@@ -13,7 +13,6 @@ from ..dataset import RegisteredSet
 from ..geometry.files import read_mesh
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement
-from ..ranges import Signed
 from .edit import apply_edits, read_edits
 from .find import SkeletonSearch, search_skeleton, skeleton_problem
 from .names import skeleton_doubts
@@ -61,7 +60,7 @@ def _facts(search: SkeletonSearch) -> list[Metric]:
 
 def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, edits: Path | None = None,
          merge: tuple[str, str] | None = None, split: str | None = None, rename: tuple[str, str] | None = None,
-         move_joint: tuple[str, Signed, Signed, Signed] | None = None, unit: Unit | None = None) -> Outcome:
+         unit: Unit | None = None) -> Outcome:
     """Change a skeleton by hand: merge, split and rename parts, move joints.
 
     Example: scape prep edit-skeleton set --merge chest shoulder_left --rename part3 neck -o set/skeleton.json
@@ -75,12 +74,11 @@ def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, ed
         merge: Two parts to become one, called like the first.
         split: A part to become two, where it bends most in the poses of the set.
         rename: A part and its new name.
-        move_joint: A part and where the joint to its parent belongs on the template, in metres.
         unit: Unit of the template.
     """
-    wanted = [*(read_edits(edits) if edits else []), *_asked(merge, split, rename, move_joint)]
+    wanted = [*(read_edits(edits) if edits else []), *_asked(merge, split, rename)]
     if not wanted:
-        raise ValueError("edits: expected --edits FILE or one of --merge, --split, --rename, --move-joint")
+        raise ValueError("edits: expected --edits FILE or one of --merge, --split, --rename")
     before, body, poses = _read_skeleton(skeleton, template, unit)
     after = apply_edits(before, body, wanted, poses)
     after.save(output)
@@ -89,8 +87,7 @@ def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, ed
                    judgement=Judgement())
 
 
-def _asked(merge: tuple[str, str] | None, split: str | None, rename: tuple[str, str] | None,
-           move_joint: tuple[str, float, float, float] | None) -> list[dict[str, Any]]:
+def _asked(merge: tuple[str, str] | None, split: str | None, rename: tuple[str, str] | None) -> list[dict[str, Any]]:
     """The edits of the command line as they stand in a file."""
     asked: list[dict[str, Any]] = []
     if merge:
@@ -99,8 +96,6 @@ def _asked(merge: tuple[str, str] | None, split: str | None, rename: tuple[str, 
         asked.append({"split": split})
     if rename:
         asked.append({"rename": {rename[0]: rename[1]}})
-    if move_joint:
-        asked.append({"move_joint": move_joint[0], "position": list(move_joint[1:])})
     return asked
 
 

@@ -42,7 +42,7 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
 def skeleton_doubts(skeleton: Skeleton) -> list[str]:
     """What a person's skeleton lacks, as reasons of a judgement; none of a body that is no person."""
     missing = missing_joints(skeleton.names, skeleton.joints)
-    return [f"the skeleton has no joint at the {', '.join(missing)}: add scans in which they bend"] if missing else []
+    return [f"the skeleton has no joint at the {', '.join(missing)}: add scans in which the body bends there"] if missing else []
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.arguments import Called
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
@@ -33,8 +32,7 @@ from .linear import check_bodies, example_poses, in_poses
 
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
-           keep: str | None = None, poses: Annotated[int, Called("--poses-each")] = 0, unit: Unit | None = None,
-           config: DesignConfig = DesignConfig()) -> Outcome:      # noqa: B008
+           keep: str | None = None, unit: Unit | None = None, config: DesignConfig = DesignConfig()) -> Outcome:      # noqa: B008
     """Choose the markers from which bodies are estimated best.
 
     Of the candidates markers are taken away, and added, one by one or in pairs of left and right, always the one that
@@ -51,7 +49,6 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
         candidates: Layout whose markers may be chosen, one of `scape layout list` or a file; without it 114 places,
             left and right the same, spread between the markers of --keep, or of vicon47.
         keep: Layout whose markers stay in the set.
-        poses: Put each body into so many different poses that the model was learned from; 0 takes them as they are.
         unit: Unit of the meshes.
         config: Settings.
     """
@@ -60,10 +57,10 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
     among = _candidates(loaded, candidates, kept)
     labels = () if kept is None else kept.labels
     found, people = _read_bodies(loaded, bodies, unit)
-    if poses:
+    if config.poses:
         with bar("posing the bodies") as progress:
-            found = in_poses(loaded, found, example_poses(loaded, poses), progress).reshape(-1, *found.shape[1:])
-        people = np.repeat(people, poses)
+            found = in_poses(loaded, found, example_poses(loaded, config.poses), progress).reshape(-1, *found.shape[1:])
+        people = np.repeat(people, config.poses)
     partners = label_pairs(among.labels)
     if (partners == np.arange(len(partners))).all():                 # labels that name no sides at all
         partners = marker_pairs(among, loaded.template)
@@ -75,7 +72,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
     with storage.writing(output / "curve.csv") as part:
         part.write_text(chart_rows(result), encoding="utf-8")
     design_page(result, loaded, among, labels, metrics).write(output / "report.html")
-    settings = {"design": config, "model": name, "candidates": candidates, "keep": keep, "poses": poses}
+    settings = {"design": config, "model": name, "candidates": candidates, "keep": keep}
     return Outcome(output, metrics, settings, judgement=Judgement())
 
 

@@ -31,6 +31,9 @@ class DesignConfig(Settings):
         Markers of the set that is wanted.
     through : ints
         Further counts at which the curve must have a set of just that size; pairs go two at a time.
+    poses : int
+        Different poses that the model was learned from, into which `scape layout design` puts each body; 0 takes the
+        bodies as they are.
     n_betas : int, optional
         Betas that are estimated, the first ones; all when not given.
     joint : bool
@@ -47,6 +50,7 @@ class DesignConfig(Settings):
 
     count: Annotated[Count, FLAG] = 47
     through: tuple[Count, ...] = ()
+    poses: int = 0
     n_betas: int | None = None
     joint: bool = False
     marker_sd: Positive = 0.005

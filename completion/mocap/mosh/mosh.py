@@ -35,9 +35,7 @@ STEPS = 100                          # of progress, of each stage
 
 @dataclass(frozen=True)
 class PoseConfig(AnimateConfig):
-    """Settings of the poses of a person whose shape and marker places are known: as of `animate`, without a flag."""
-
-    ground: bool = False
+    """Settings of the poses of a person whose shape and marker places are known: as of `animate`."""
 
     @classmethod
     def weighted(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:
@@ -88,8 +86,13 @@ class MoshConfig(Settings):
 
     @classmethod
     def published(cls) -> MoshConfig:
-        """The weights of [MoSh], every marker believed alike, nothing repaired and nothing smoothed beyond them."""
-        poses = replace(PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6)
+        """The weights of [MoSh], every marker believed alike, nothing repaired, shrunk or smoothed beyond them.
+
+        Not as in the paper: covariances of poses have at least (0.05 radians)² along every direction, and the first
+        frame is found by a search.
+        """
+        poses = replace(PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6,
+                        prior_shrinkage=0.0)
         return cls(PersonConfig.published(), poses, SoftTissueConfig.published(), repair=False)
 
 

@@ -69,7 +69,7 @@ class Take:
     def make(self, frames: np.ndarray) -> np.ndarray:
         """As `bodies`, which are not kept."""
         return self.motion.vertices(self.subject, frames) if self.soft is None else \
-            self.soft.on(self.subject, frames)
+            self.soft.vertices(self.model, frames, subject=self.subject)
 
     def rigid(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
         """The meshes (n, N, 3) of the same poses with the person's own shape."""

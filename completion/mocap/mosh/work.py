@@ -239,7 +239,7 @@ def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor:
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
             exact += write_glb(folder / "exaggerated.glb", soft.motion, body,
-                              partial(soft.on, body, factor=factor))
+                               partial(soft.vertices, take.model, factor=factor, subject=body))
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
                   take.source.who, take.unit,

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,6 +41,8 @@ class SoftFollower(ABC):
         self.rows = np.array([markers.labels.index(label) for label in labels])
         self.targets = markers.positions[:, self.rows]
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
+        if config.shape_change:                  # as the paper: its prior is not shrunk, and places are not smoothed
+            poses = replace(poses, prior_shrinkage=0.0, place_acceleration=1e6)
         self.body = MarkedBody(model.subject(motion.betas), self.layout, config.pose, poses.prior_shrinkage)
         self.inertia = poses.inertia(markers.rate, self.body.n_unknowns)
         self.weight = config.data * PER_SQUARE_METRE

@@ -47,20 +47,18 @@ class SoftTissue:
         """The same with soft tissue `factor` times as large."""
         return replace(self, changes=factor * self.changes, skin=self.skin and self.skin.times(factor))
 
-    def vertices(self, model: BodyModel, frames: np.ndarray | slice = slice(None), factor: float = 1.0) -> np.ndarray:
-        """The meshes (n, N, 3) of some frames, metres, soft tissue taken `factor` times."""
-        if not self.changes.any():
-            return self.on(model.subject(self.motion.betas), frames, factor)
-        poses = self.motion.poses[frames]
-        out = changing_bodies(model, poses, self.betas(factor)[frames], self.motion.trans[frames])
-        return out if self.skin is None else out + factor * self.skin.at(self.skin.modes, poses, frames)
+    def vertices(self, model: BodyModel, frames: np.ndarray | slice = slice(None), factor: float = 1.0,
+                 subject: Subject | None = None) -> np.ndarray:
+        """The meshes (n, N, 3) of some frames, metres, soft tissue taken `factor` times.
 
-    def on(self, subject: Subject, frames: np.ndarray | slice = slice(None), factor: float = 1.0) -> np.ndarray:
-        """As `vertices`, of the person's body, which is there already; their betas do not change."""
-        assert not self.changes.any(), "a person whose betas change has no one body"
-        out = self.motion.vertices(subject, frames)
-        return out if self.skin is None else out + factor * self.skin.at(self.skin.modes, self.motion.poses[frames],
-                                                                         frames)
+        `subject` is the person's own body where the caller has it; where betas change, each frame has another.
+        """
+        poses, trans = self.motion.poses[frames], self.motion.trans[frames]
+        if self.changes.any():
+            out = changing_bodies(model, poses, self.betas(factor)[frames], trans)
+        else:
+            out = (subject or model.subject(self.motion.betas)).vertices(poses, trans)
+        return out if self.skin is None else out + factor * self.skin.at(self.skin.modes, poses, frames)
 
     def points(self, model: BodyModel, vertex_ids: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Places (T, L, 3), metres, of points of the skin; arguments as of `Subject.points`."""

@@ -63,6 +63,9 @@ class PersonConfig(Settings):
         Factors on the last three weights, one stage each.
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight; the paper weighs all alike.
+    loose : bool
+        Look along their limb for markers that the layout calls loose, and hold them there by 20 cm; the paper holds
+        all alike.
     wand : float, metres
         How much farther from the skin than the layout says a marker that may be on a wand, or one on a bar, can be.
         0 takes all distances as the layout has them, as the paper does.
@@ -81,13 +84,15 @@ class PersonConfig(Settings):
     pose: float = 0.25
     annealing: tuple[Positive, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
     outlier: Positive = 0.06
+    loose: bool = True
     wand: float = 0.1
     seed: Seed = 0
 
     @classmethod
     def published(cls) -> PersonConfig:
-        """Weights, twelve random frames and six stages of [MoSh]."""
-        return cls(choice="random", surface=100.0, initial=0.25, shape=1.0, outlier=1000.0, wand=0.0)
+        """Weights, twelve random frames and six stages of [MoSh], all markers alike."""
+        return cls(choice="random", surface=100.0, initial=0.25, shape=1.0, outlier=1000.0, loose=False,
+                   wand=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +240,7 @@ class LatentFit:
         self.latent = LatentPoints(model.vertices(rest, np.zeros(self.n_betas)),
                                    model.shape_jacobian(rest)[..., :self.n_betas])
         self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
-        self.loose = np.isin(layout.labels, layout.loose)
+        self.loose = np.isin(layout.labels, layout.loose) & config.loose
         self.reach = distance_reach(layout, config.wand)
         # weight of the usual place of a marker that the layout calls loose: 20 cm
         self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
@@ -256,7 +261,7 @@ class LatentFit:
         The `last` time the distances that are near one that the marker set names become that one.
         """
         layout, places, looked = state.layout, state.places, state.looked
-        if look and self.layout.loose:
+        if look and self.loose.any():
             vertices = self.model.subject(state.betas).vertices(*self.split(state.x))
             found, distances = find_loose(self.model, vertices, self.layout, self.targets, self.reach)
             layout, looked = replace(self.layout.moved(found), distances=distances), True

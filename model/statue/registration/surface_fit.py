@@ -66,8 +66,11 @@ class SurfaceFitConfig(Settings):
 
     @classmethod
     def published(cls) -> SurfaceFitConfig:
-        """As the paper has it; cooling and steps, which it does not tell, are such that the Euler steps converge."""
-        return cls(step="explicit", slack="published", cover=0.0, polish=0, cooling=0.7, most=100)
+        """As the paper has it; cooling and steps, which it does not tell, are such that the Euler steps converge.
+
+        Not as in the paper: vertices past the edge of a hole of the scan are carried by the shape.
+        """
+        return cls(step="explicit", slack="published", cover=0.0, polish=0, cooling=0.7, most=100, reach=10.0)
 
 
 @dataclass(frozen=True, eq=False)
