@@ -97,6 +97,24 @@ def test_loose_markers_are_found_where_they_are(model, layout):
     assert found.moved[firm].max() < 0.03 < found.moved[rows].min()
 
 
+@pytest.mark.parametrize(("wanded", "distance"), [
+    (("THI", "SHN"), 0.035), (("THI", "SHN"), 0.06), (("WRA", "WRB"), 0.0095)])
+def test_markers_on_wands_and_without_their_bars_are_the_same_person(model, layout, wanded, distance):
+    """Thighs and shanks 25 and 50 mm off the skin, wrists on the skin where the set has bars of 45 mm."""
+    these = np.isin([label[1:] for label in layout.labels], wanded)
+    worn = replace(layout, distances=np.where(these, distance, np.asarray(layout.distances)))
+    _, sequence = carried(model, worn, BETAS)
+    found = find_person(model, sequence, layout, CONFIG)
+    apart = np.linalg.norm(rest(model, found.betas) - rest(model, BETAS), axis=1)
+    assert apart.mean() < 0.005
+    np.testing.assert_allclose(np.asarray(found.layout.distances)[these], distance, atol=0.010)
+    assert set(found.standing_off(layout)) == {label for label, is_one in zip(layout.labels, these, strict=True)
+                                               if is_one}
+    off = found.metrics(layout)[0]
+    assert off.value == pytest.approx(1000 * distance, abs=6) and "skin" in off.name
+    assert not found.doubts(layout)
+
+
 def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
     person = Person(BodyShape(sex=1.0, stature=1.88, weight=1.0))
     on_skin = named_layout("cmu41", person.mesh)

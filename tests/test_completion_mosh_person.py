@@ -13,7 +13,7 @@ from completion.mocap.pose.robust import hardly_believed, markers_told
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.person import choose_frames, common_markers
-from completion.mocap.subject.worn_elsewhere import find_worn
+from completion.mocap.subject.worn_elsewhere import MovedMarker, Worn, _Frames, _with_whole_parts, find_worn
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -257,6 +257,21 @@ def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out():
     np.testing.assert_allclose(found.betas, beside().betas, atol=0.35)
 
 
+@pytest.mark.parametrize(("share", "verdict"), [(1.0, "all"), (0.7, "most")])
+def test_a_part_keeps_its_markers(share, verdict):
+    """When a part would lose its markers, not they are at fault: they stay, and it is said."""
+    at = _Frames(MODEL, beside(), [sequence(displaced())], LAYOUT, 0.0)
+    part = at.part[LAYOUT.nearest]
+    mine = np.array(LABELS)[part == part[0]]
+    gone = tuple(mine[:round(share * len(mine))].tolist())
+    found = _with_whole_parts(at, Worn(unplaced=(*gone, LABELS[-1])), MODEL.skeleton.names)
+    (told,) = found.lost
+    assert found.unplaced == (LABELS[-1],) and told == (MODEL.skeleton.names[part[0]], gone, verdict == "all")
+    why = found.problems() if verdict == "all" else found.doubts(LABELS)
+    assert why[0].startswith(f"{verdict} markers of the {told[0]} ({', '.join(gone)})")
+    assert bool(found.problems()) == (verdict == "all")
+
+
 def test_a_marker_that_is_never_believed_is_left_out_of_the_mean():
     floating = np.array(displaced())
     floating[3] += [0.0, 0.0, 0.3]
@@ -283,6 +298,13 @@ def test_where_the_body_is_at_fault_no_marker_is_moved():
     markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)
     found = find_worn(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
     assert not found.changes and len(found.too_many) > 7 and "the wrong layout" in found.doubts(LABELS)[0]
+
+
+def test_a_marker_moved_by_more_than_a_hand_is_to_be_looked_at():
+    moved = [MovedMarker(label, np.arange(3), np.eye(3)[0], 0.01, before, 0.01) for label, before in
+             (("M1", 0.07), ("M2", 0.31))]
+    (told,) = Worn(moved=tuple(moved)).doubts(LABELS)
+    assert told == "moved by more than a hand's width: M2 by 31 cm"
 
 
 def test_markers_in_their_places_are_let_be():

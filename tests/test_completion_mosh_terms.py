@@ -85,7 +85,7 @@ def of_frames(kind):
 
 TERMS = {
     "data": of_frames,
-    "surface": of_latent(lambda m, corners, usual: terms.surface_term(m, corners, np.full(L, 0.01), 3.0)),
+    "surface": of_latent(lambda m, corners, usual: terms.surface_term(m, corners, *(np.full((2, L), 0.01)), 3.0)),
     "usual_place": of_latent(lambda m, corners, usual: terms.place_term(m, usual, np.arange(1.0, L + 1))),
     "shape": lambda kind: ((lambda z: terms.shape_term(z, K, 2.0)), np.random.default_rng(4).normal(size=K + 3 * L)),
     "pose": lambda kind: ((lambda x: energy.pose_prior(x, PRIOR, 0.25)), np.random.default_rng(5).normal(size=15)),
@@ -104,6 +104,17 @@ def test_jacobian_is_the_finite_difference(name, kind):
         np.testing.assert_allclose(got.jacobian[:, i], slope, atol=2e-5, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("height", "energy"), [
+    (-0.01, 4.0), (0.0, 1.0), (0.0101, 0.0), (0.06, 0.0), (0.1099, 0.0), (0.13, 4.0)])
+def test_an_unknown_distance_costs_nothing_between_its_limits(height, energy):
+    """[MoSh] Eq. 18 with the best distance of 1 to 11 cm."""
+    at = MovingPoints(np.array([[0.0, 0.0, height]]), np.eye(3)[None])
+    corners = MovingPoints(np.array([[-1.0, -1, 0], [1, -1, 0], [0, 2, 0]]), np.zeros((3, 3, 3)))
+    found = terms.surface_term(at, corners, np.array([0.01]), np.array([0.11]), 1.0)
+    assert found.energy == pytest.approx(energy, abs=1e-9)
+    assert np.any(found.jacobian) == (energy > 0)
+
+
 def test_weights_are_per_square_centimetre():
     """A marker 2 cm from its place costs four times the weight, in every term of distances."""
     still = np.zeros((1, 3, 1))
@@ -111,7 +122,7 @@ def test_weights_are_per_square_centimetre():
     corners = MovingPoints(np.array([[-1.0, -1, 0], [1, -1, 0], [0, 2, 0]]), np.zeros((3, 3, 1)))
     assert terms.data_term(at, there.positions, np.array([0.75])).energy == pytest.approx(3.0)
     assert terms.place_term(at, there, np.array([0.25])).energy == pytest.approx(1.0)
-    assert terms.surface_term(at, corners, np.array([0.01]), 100.0).energy == pytest.approx(400.0)
+    assert terms.surface_term(at, corners, *np.array([[0.01], [0.01]]), 100.0).energy == pytest.approx(400.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -426,8 +426,8 @@ def test_many_results_are_as_good_as_the_worst_of_them():
     (2.61, 290, 20.0, "failed", "scale"), (4.04, 1150, 46.0, "failed", "scale"), (0.93, 12, 6.0, "failed", "scale"),
     (1.20, 25, 5.0, "check", "child"), (2.20, 120, 5.0, "check", "giant"), (1.75, 190, 5.0, "check", "second person"),
     (1.75, 30, 5.0, "check", "flattened"),
-    (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 14.0, "check", "standard deviations"),
-    (1.75, 75, 20.0, "failed", "scale")])
+    (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 9.0, "check", "standard deviations"),
+    (1.75, 75, 6.5, "good", ""), (1.75, 75, 13.8, "failed", "scale")])
 def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
     found = beyond_people(stature, volume, np.eye(18)[0] * betas)
     assert found.verdict == verdict and word in found.why, found
@@ -453,6 +453,19 @@ def test_time_that_is_told_wrongly_is_seen_in_the_speed_of_markers():
                   np.full(markers.positions.shape[:2], 0.5), LABELS)
     told = motion_problem(lost, model.template, layout, dataclasses.replace(markers, rate=300.0))
     assert told.endswith("the wrong rate?")                    # not swapped labels
+
+
+def test_a_ghost_of_one_frame_says_nothing_of_the_unit():
+    layout = MarkerLayout(LABELS, ROWS, 0.012)
+    markers = walk(layout)
+    positions = np.array(markers.positions)
+    positions[3, 5] += [0.0, 0.0, 50.0]
+    motion = Motion(np.zeros((len(positions), 4, 3)), np.zeros((len(positions), 3)), None, 30.0,
+                    np.full(positions.shape[:2], 0.004), LABELS)
+    body = worm_with_prior().template
+    assert motion_problem(motion, body, layout, dataclasses.replace(markers, positions=positions)) is None
+    big = dataclasses.replace(markers, positions=10 * markers.positions)
+    assert "the wrong unit?" in motion_problem(motion, body, layout, big)
 
 
 def test_the_size_of_a_body_far_from_its_markers_is_told_last():

@@ -90,6 +90,7 @@ class JointAngles:
     pelvis: np.ndarray               # (T, 3) metres, the middle of the hips
     ground: np.ndarray               # (3, 3) columns: its x, y (up) and z in the axes of the motion
     missing: tuple[str, ...]         # joints that people have and this body's parts do not
+    guessed: tuple[str, ...] = ()    # angles of joints that the markers do not tell of, which are left out
 
 
 def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> Anatomy:
@@ -167,8 +168,11 @@ def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray
     return np.stack([kept, y, np.cross(kept, y)] if by_front else [np.cross(y, kept), y, kept], axis=1)
 
 
-def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray) -> JointAngles:
+def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray, told: np.ndarray | None = None
+                      ) -> JointAngles:
     """The joint angles of a person in motion, whose joints are at `centres` (T, J, 3), metres.
+
+    With `told` (J,) bool only those between parts of which the markers tell.
 
     Raises
     ------
@@ -181,8 +185,12 @@ def anatomical_angles(motion: Motion, subject: Subject, centres: np.ndarray) -> 
     ground = ground_axes(found.axes, R[:, found.parts["pelvis"]])
     degrees = angles_of(found, ground, R)
     pelvis = centres[:, list(found.hips or (found.parts["pelvis"],))].mean(axis=1) @ ground
-    names = tuple(name for joint in found.joints() for name in joint.angles)
-    return JointAngles(names, degrees, pelvis, ground, found.missing())
+    joints = found.joints()
+    known = [told is None or all(told[found.parts[segment]] for segment in (joint.proximal, joint.distal)
+                                 if segment != "ground") for joint in joints]
+    names, guessed = (tuple(name for joint, is_known in zip(joints, known, strict=True) if is_known == wanted
+                            for name in joint.angles) for wanted in (True, False))
+    return JointAngles(names, degrees[:, np.repeat(known, 3)], pelvis, ground, found.missing(), guessed)
 
 
 def rest_joints(subject: Subject) -> np.ndarray:

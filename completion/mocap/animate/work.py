@@ -34,6 +34,7 @@ from ..files.motion_files import write_glb, write_motion
 from ..files.opensim import believed
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
+from ..pose.coverage import find_coverage
 from ..pose.follow import AnimateConfig, animate
 from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
@@ -82,12 +83,14 @@ class Work:
         sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
-        body, found, worn = self.subject, None, Worn()
+        body, found, worn, doubts = self.subject, None, Worn(), tuple[str, ...]()
         if body is None:
+            usual = layout
             sequence, found, worn = self._person(sequence, layout, room)
+            doubts += found.doubts(usual)
             body, layout = self.model.subject(found.betas), found.layout
             metrics += [Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"),
-                        *worn.metrics()]
+                        *worn.metrics(), *found.metrics(usual)]
         # a person found from a model: what it was found from tells as much as its body, and sooner
         whose = self.subject if found is None else (self.model, found.betas)
         motion = room.step("motion", (whose, sequence, layout, self.animate),
@@ -97,13 +100,14 @@ class Work:
             storage.write_json(output / "subject.json", {"betas": found.betas.tolist(),
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
+        covered = find_coverage(body, layout, [motion], [sequence])
         problem = motion_problem(motion, body.template, layout, sequence)
-        doubts = (*motion_doubts([motion], [sequence], body.template), *worn.doubts(sequence.labels))
-        judgement = Judgement.of(problem, doubts)
+        doubts = (*motion_doubts([motion], [sequence], body.template), *worn.doubts(sequence.labels), *doubts)
+        judgement = covered.judgement().joined(Judgement.of([*filter(None, [problem]), *worn.problems()], doubts))
         if found is not None:
             judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
-        metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
-        write_motion(output, motion, body, believed(motion, sequence))
+        metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *figures(motion)]
+        write_motion(output, motion, body, believed(motion, sequence), covered.told)
         metrics += write_glb(output / "animation.glb", motion, body)
         return metrics, motion, body, motion_page(motion, body, sequence, path.name, metrics)
 
@@ -123,7 +127,7 @@ class Work:
         return sequence, find("subject again", sequence, worn.placed(layout)), worn
 
 
-def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
+def figures(motion: Motion) -> list[Metric]:
     """What a motion is judged by."""
     seen = np.isfinite(motion.residuals)
     off = MM * motion.residuals[seen] if seen.any() else np.array([np.nan])
@@ -132,7 +136,6 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
         Metric(MEAN_ERROR, MM * float(np.nanmean(motion.told())) if seen.any() else np.nan, "mm"),
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
-        Metric("markers used", f"{int(seen.any(axis=0).sum())} of {len(markers.labels)}"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),
         Metric("frames that settled", 100 * float(motion.converged.mean()), "%"),
         *details([markers_told([motion]), Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s")])]

@@ -19,7 +19,7 @@ from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
 from .markers import MarkerSequence
-from .opensim import write_opensim
+from .opensim import guessed_angles, known_centres, write_opensim
 
 KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
 MEASURED = 40                        # frames in which it is compared with the exact bodies
@@ -45,19 +45,24 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     return subject.joints(motion.poses, motion.trans)
 
 
-def write_motion(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None) -> None:
+def write_motion(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
+                 told: np.ndarray | None = None) -> None:
     """motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; seconds.
 
-    `markers`, of as many frames, go into the TRC.
+    `markers`, of as many frames, go into the TRC. What is between parts of which the markers do not tell (`told` (J,)
+    bool) is an empty cell in tables and left out of the MOT.
     """
-    names, T, centres = subject.skeleton.names, len(motion.poses), joint_centres(motion, subject)
+    skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
+    names, angles = skeleton.names, joint_angles(motion)
+    if told is not None:
+        angles[:, guessed_angles(skeleton, told)] = np.nan
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_table(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, joint_angles(motion).reshape(T, -1)])
+                np.c_[motion.times, angles.reshape(T, -1)])
     write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, centres.reshape(T, -1)])
-    write_opensim(folder, motion, subject, centres, markers)
+                np.c_[motion.times, known_centres(centres, skeleton, told).reshape(T, -1)])
+    write_opensim(folder, motion, subject, centres, markers, told)
     if motion.labels:
         write_residuals(folder / "residuals.csv", motion)
 

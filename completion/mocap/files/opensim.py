@@ -24,11 +24,14 @@ _AXES = "+x", "+y", "+z", "-x", "-y", "-z"
 
 
 def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
-                  markers: MarkerSequence | None = None) -> None:
-    """motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot if the body is a person's."""
-    points = centre_sequence(centres, subject.skeleton, motion.rate)
+                  markers: MarkerSequence | None = None, told: np.ndarray | None = None) -> None:
+    """motion.trc with markers, if any, and joint centres (T, J, 3), metres; motion.mot if the body is a person's.
+
+    Centres and angles between parts of which the markers do not tell (`told` (J,) bool) are left out.
+    """
+    points = centre_sequence(known_centres(centres, subject.skeleton, told), subject.skeleton, motion.rate)
     try:
-        angles = anatomical_angles(motion, subject, centres)
+        angles = anatomical_angles(motion, subject, centres, told)
     except ValueError as error:
         say(f"motion.mot is not written: {error}")
         up, ahead = stance(subject.template, subject.skeleton.part_rotations(motion.poses)[:, 0])
@@ -66,6 +69,21 @@ def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> Mar
     return MarkerSequence(centres[:, 1:], centre_labels(skeleton), rate)
 
 
+def known_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | None) -> np.ndarray:
+    """Joint centres (T, J, 3) without, NaN, those between two parts of which the markers do not tell."""
+    return centres if told is None else np.where((told | told[_above(skeleton)])[:, None], centres, np.nan)
+
+
+def guessed_angles(skeleton: Skeleton, told: np.ndarray) -> np.ndarray:
+    """(J,) bool: joints whose angles are guesses, for parts `told` (J,) of which the markers tell."""
+    return ~(told & told[_above(skeleton)])
+
+
+def _above(skeleton: Skeleton) -> np.ndarray:
+    """(J,) the parent of every part, of the root the root itself."""
+    return np.maximum(skeleton.parents, 0)
+
+
 def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
     """(J - 1) names of the joints but the root's."""
     sided = {j: f"{role[2:]}_{role[0]}_joint" for role, j in
@@ -77,13 +95,17 @@ def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
 
 def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
     """Joint angles in degrees, and the middle of the hips in metres, as a motion file (Storage) of OpenSim."""
-    table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :3], angles.pelvis, angles.degrees[:, 3:]]
-    names = ("time", *angles.names[:3], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[3:])
+    first = 3 if "pelvis_tilt" in angles.names else 0               # the angles of the pelvis stand before its place
+    table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :first], angles.pelvis,
+                  angles.degrees[:, first:]]
+    names = ("time", *angles.names[:first], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[first:])
     axes = [_AXES[int(np.abs(axis).argmax()) + (3 if axis.sum() < 0 else 0)] for axis in angles.ground.T]
     lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
              "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
              f"Axes x, y, z are {', '.join(axes)} of the recording.",
-             *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []), "", "endheader"]
+             *([f"No parts for: {', '.join(angles.missing)}."] if angles.missing else []),
+             *([f"Seen by no marker, left out: {', '.join(angles.guessed)}."] if angles.guessed else []),
+             "", "endheader"]
     lines += ["\t".join(names), *tables.number_lines(table, "%.8g", "\t")]
     with storage.writing(Path(path)) as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

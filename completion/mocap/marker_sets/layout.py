@@ -35,13 +35,16 @@ class MarkerLayout:
         Other labels for the same places, where files differ.
     loose : strings
         Labels of markers that sit anywhere on their limb, not on a point of the anatomy: `vertices` has them where
-        they usually are, `subject_from_markers` finds where they are on one person.
+        they usually are, `find_person` finds where they are on one person.
+    wands : strings
+        Labels of markers that some wear on wands: their distances are those on the skin, `find_person` finds how far
+        they stand off on one person.
 
     Raises
     ------
     ValueError
         Shapes that do not agree, a label that comes twice, a negative vertex, an alias of an unknown label, an
-        unknown loose label.
+        unknown label among those that are loose or on wands.
     """
 
     labels: tuple[str, ...]
@@ -50,6 +53,7 @@ class MarkerLayout:
     weights: np.ndarray | None = None
     aliases: Mapping[str, str] = field(default_factory=dict)
     loose: tuple[str, ...] = ()
+    wands: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         labels, vertices = tuple(self.labels), np.array(self.vertices, dtype=np.int64)
@@ -78,10 +82,11 @@ class MarkerLayout:
         if wrong:
             raise ValueError(f"aliases: expected new labels for markers of the layout, got {wrong[0]!r} for "
                              f"{self.aliases[wrong[0]]!r}")
-        unknown = [label for label in self.loose if label not in labels]
-        if unknown:
-            raise ValueError(f"loose: {', '.join(unknown)} not among {', '.join(labels)}")
-        values["loose"] = tuple(self.loose)
+        for name, some in (("loose", self.loose), ("wands", self.wands)):
+            unknown = [label for label in some if label not in labels]
+            if unknown:
+                raise ValueError(f"{name}: {', '.join(unknown)} not among {', '.join(labels)}")
+            values[name] = tuple(some)
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
@@ -95,8 +100,8 @@ class MarkerLayout:
         """Read a layout of `save`, or of the same form from elsewhere.
 
         The form is `{"markersets": [{"type": ..., "distance_from_skin": 0.0095, "indices": {label: vertex}}]}`;
-        in place of a vertex there may be `{"vertices": [a, b, c], "weights": [u, v, w]}`, a set may be `"loose": true`,
-        and beside the sets there may be `"aliases": {other label: label}`.
+        in place of a vertex there may be `{"vertices": [a, b, c], "weights": [u, v, w]}`, a set may be `"loose": true`
+        or `"wand": true`, and beside the sets there may be `"aliases": {other label: label}`.
 
         Parameters
         ----------
@@ -135,15 +140,16 @@ class MarkerLayout:
 
     def save(self, path: str | Path) -> None:
         """Write as JSON, one marker set for each distance from the skin, whole or not at all."""
-        sets: dict[tuple[float, bool], dict[str, Any]] = {}
+        sets: dict[tuple[float, bool, bool], dict[str, Any]] = {}
         for i, (label, distance) in enumerate(zip(self.labels, np.asarray(self.distances).tolist(), strict=True)):
             place: Any = self.vertices[i].tolist()
             if self.weights is not None:
                 place = {"vertices": place, "weights": self.weights[i].tolist()}
-            sets.setdefault((distance, label in self.loose), {})[label] = place
+            sets.setdefault((distance, label in self.loose, label in self.wands), {})[label] = place
         tree: dict[str, Any] = {"markersets": [
             {"type": "body", "distance_from_skin": distance} | ({"loose": True} if loose else {})
-            | {"indices": indices} for (distance, loose), indices in sets.items()]}
+            | ({"wand": True} if wand else {})
+            | {"indices": indices} for (distance, loose, wand), indices in sets.items()]}
         storage.write_json(path, tree | ({"aliases": dict(self.aliases)} if self.aliases else {}))
 
     def matched(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
@@ -175,9 +181,10 @@ class MarkerLayout:
         if unknown:
             raise ValueError(f"labels: {', '.join(unknown)} not among {', '.join(self.labels)}")
         rows = [self.labels.index(self.aliases.get(label, label)) for label in labels]
-        loose = tuple(label for label, row in zip(labels, rows, strict=True) if self.labels[row] in self.loose)
+        loose, wands = (tuple(label for label, row in zip(labels, rows, strict=True) if self.labels[row] in some)
+                        for some in (self.loose, self.wands))
         return MarkerLayout(tuple(labels), self.vertices[rows], np.asarray(self.distances)[rows],
-                            None if self.weights is None else self.weights[rows], loose=loose)
+                            None if self.weights is None else self.weights[rows], loose=loose, wands=wands)
 
     def without(self, labels: Sequence[str]) -> MarkerLayout:
         """All markers but these; an alias takes its marker out, and aliases of markers that go, go too."""
@@ -201,7 +208,7 @@ class MarkerLayout:
             weights = np.concatenate([np.eye(3)[[0] * len(each.labels)] if each.weights is None else each.weights
                                       for each in both])
         return MarkerLayout(labels, places, np.r_[np.asarray(self.distances), np.asarray(other.distances)], weights,
-                            aliases, (*self.loose, *other.loose))
+                            aliases, (*self.loose, *other.loose), (*self.wands, *other.wands))
 
     def moved(self, places: Mapping[str, int]) -> MarkerLayout:
         """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
@@ -247,18 +254,19 @@ def _restored(path: Path, tree: Any) -> MarkerLayout:
     rows = _rows(path, tree)
     if not rows:
         raise MarkerFileError(f"{path}: expected markers in the layout, found none")
-    labels, places, distances, loose = zip(*rows, strict=True)
-    free = tuple(label for label, is_loose in zip(labels, loose, strict=True) if is_loose)
+    labels, places, distances, loose, wands = zip(*rows, strict=True)
+    free, on_wands = (tuple(label for label, is_one in zip(labels, some, strict=True) if is_one)
+                      for some in (loose, wands))
     aliases = dict(tree.get("aliases", {}))
     if all(isinstance(place, int) for place in places):
-        return MarkerLayout(labels, np.array(places), np.array(distances), None, aliases, free)
+        return MarkerLayout(labels, np.array(places), np.array(distances), None, aliases, free, on_wands)
     pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"]) for p in places]
     return MarkerLayout(labels, np.array([v for v, _ in pairs]), np.array(distances), np.array([w for _, w in pairs]),
-                        aliases, free)
+                        aliases, free, on_wands)
 
 
-def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool]]:
-    """Label, place, distance and looseness of every marker in the file."""
+def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool, bool]]:
+    """Label, place, distance, looseness of every marker in the file, and whether it may be on a wand."""
     sets = tree.get("markersets") if isinstance(tree, Mapping) else None
     if not isinstance(sets, list):
         raise MarkerFileError(f"{path}: expected a marker layout {{\"markersets\": [...]}}, found something else")
@@ -272,5 +280,6 @@ def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool]]:
         for label, place in indices.items():
             if isinstance(place, bool) or not isinstance(place, int | Mapping):
                 raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {str(place)[:40]!r}")
-            rows.append((label, place, float(distance), bool(markers.get("loose", False))))
+            rows.append((label, place, float(distance), bool(markers.get("loose", False)),
+                         bool(markers.get("wand", False))))
     return rows

@@ -20,6 +20,7 @@ from scanprep.judgement import size
 from ..files.text import MarkerFileError
 from .layout import MarkerLayout
 
+FEWEST = 3                           # labels by which a marker set is known
 OFF = 0.015                          # of the template's size: farthest from it that a clicked marker may be
 FOLDER = Path(__file__).parent / "layouts"
 OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {LABEL: VERTEX, ...}}]} '
@@ -105,8 +106,13 @@ def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | Non
                    ) -> tuple[MarkerLayout, str]:
     """The named layout that knows most of some labels, and its name; ValueError where none knows three of them."""
     found = {name: named_layout(name, template, kept).spelled(labels) for name in layout_names()}
-    best = max(found, key=lambda name: (len(found[name].matched(labels, 0)), -len(found[name].labels)))
-    found[best].matched(labels)
+    known = {name: len(layout.matched(labels, 0)) for name, layout in found.items()}
+    best = max(found, key=lambda name: (known[name], -len(found[name].labels)))
+    if known[best] < FEWEST:
+        told = ", ".join(f"{name} {count}" for name, count in sorted(known.items(), key=lambda item: -item[1]))
+        raise ValueError(f"labels: expected at least {FEWEST} of a marker set, of these {len(labels)} the sets know "
+                         f"{told}. The sets: scape layout list, scape layout show NAME; your own: --layout FILE, which "
+                         f"scape pick makes of the model's template. Labels found: {', '.join(labels) or 'none'}")
     return found[best], best
 
 

@@ -27,9 +27,10 @@ from ...motion_pictures import picture_bodies
 from ..artefacts.results import MarkerArtefacts, artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
-from ..files.opensim import centre_sequence
+from ..files.opensim import centre_sequence, known_centres
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
+from ..pose.coverage import Coverage, find_coverage
 from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
@@ -82,11 +83,7 @@ class Work:
             pages += seconds
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
         pages -= clocks()
-        problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
-        motions = [take.motion for take in found.takes]
-        doubts = (*motion_doubts(motions, [take.markers for take in found.takes], found.model.template),
-                  *found.result.worn.doubts(found.usual.labels))
-        judgement = judge_motions(found.person, Judgement.of(problems, doubts), motions, found.model.template)
+        judgement = found.judgement(found.takes)
         metrics = [judgement_row(judgement), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
@@ -117,9 +114,22 @@ class _Found:
         """Whether the body is one that a person can have."""
         return person_judgement(self.model, self.result.betas)
 
-    def problem(self, take: Take) -> str | None:
-        """Why the motion of a sequence means nothing."""
-        return motion_problem(take.motion, take.subject.template, self.result.layout, take.markers)
+    @cached_property
+    def covered(self) -> Coverage:
+        """What the markers of all sequences tell of the body."""
+        return find_coverage(self.takes[0].subject, self.result.layout, [take.motion for take in self.takes],
+                             [take.markers for take in self.takes])
+
+    def judgement(self, takes: Sequence[Take]) -> Judgement:
+        """What the person and the motions of some sequences are worth."""
+        body, result, several = self.model.template, self.result, len(takes) > 1
+        motions = [take.motion for take in takes]
+        problems = [(f"{take.name}: " if several else "") + why for take in takes if (why := motion_problem(
+            take.motion, take.subject.template, result.layout, take.markers))]
+        doubts = (*motion_doubts(motions, [take.markers for take in takes], body),
+                  *result.worn.doubts(self.usual.labels), *result.person.doubts(self.usual))
+        own = self.covered.judgement().joined(Judgement.of([*problems, *result.worn.problems()], doubts))
+        return judge_motions(self.person, own, motions, body)
 
 
 def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
@@ -187,19 +197,18 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, picture)
-        body = found.model.template
-        doubts = (*motion_doubts([take.motion], [take.markers], body),
-                  *found.result.worn.doubts(found.usual.labels))
-        judgement = judge_motions(found.person, Judgement.of(found.problem(take), doubts), [take.motion], body)
+        judgement = found.judgement([take])
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    metrics += room.files(f"{take.name} files", (solved, take.source.path, take.source.who, take.unit, factor),
-               lambda folder: write_take(place(folder), take, factor))
+    told = found.covered.told
+    metrics += room.files(f"{take.name} files",
+                          (solved, told, take.source.path, take.source.who, take.unit, factor),
+                          lambda folder: write_take(place(folder), take, told, factor))
     shown: list[Any] = []
     if work.character is not None:
-        *shown, told = room.files(f"{take.name} character", (solved, work.character, factor), character)
-        metrics += told
+        *shown, exact = room.files(f"{take.name} character", (solved, work.character, factor), character)
+        metrics += exact
     start = clocks()
     room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
     return metrics, clocks() - start
@@ -217,26 +226,28 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
     result.layout.save(folder / "layout.json")
 
 
-def write_take(folder: Path, take: Take, factor: float = 1.0) -> list[Metric]:
+def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor: float = 1.0) -> list[Metric]:
     """All files of a sequence but its page; exaggerated.glb where the factor on soft tissue is not 1.
 
+    Angles and joint centres between parts of which the markers do not tell (`told` (J,) bool) are left out.
     Returned is how far the GLB files are from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    write_motion(folder, motion, body, take.artefacts.virtual())
-    told = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
+    write_motion(folder, motion, body, take.artefacts.virtual(), told)
+    exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
-            told += write_glb(folder / "exaggerated.glb", soft.motion, body,
-                              partial(soft.vertices, take.model, factor=factor, subject=body))
+            exact += write_glb(folder / "exaggerated.glb", soft.motion, body,
+                               partial(soft.vertices, take.model, factor=factor, subject=body))
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
                   take.source.who, take.unit,
-                  centre_sequence(joint_centres(motion, body), body.skeleton, motion.rate))
+                  centre_sequence(known_centres(joint_centres(motion, body), body.skeleton, told), body.skeleton,
+                                  motion.rate))
     _write_artefacts(folder, take.artefacts)
-    return told
+    return exact
 
 
 def _write_artefacts(folder: Path, found: MarkerArtefacts) -> None:
@@ -273,7 +284,7 @@ def _person_metrics(found: _Found) -> list[Metric]:
             Metric("volume", 1000 * abs(body.volume), "l")]
     if found.guess is not None:
         told.append(Metric("sex", f"{found.guess.sex} ({100 * found.guess.probability:.0f}%)"))
-    return [*told, *result.worn.metrics(),
+    return [*told, *found.covered.metrics(), *result.worn.metrics(), *result.person.metrics(found.usual),
             Metric("markers beside the layout's places, mean", float(moved.mean()), "mm"),
             *details([Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
                       Metric("body shape from the mean person, length of the betas",

@@ -50,19 +50,40 @@ def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarr
     return end.x[np.argmin(end.energy)]
 
 
-def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, targets: np.ndarray) -> dict[str, int]:
-    """The vertex of its part on which each loose marker is nearest to its targets (B, L, 3), on bodies (B, N, 3)."""
-    template, distances, usual = model.template, np.asarray(layout.distances), layout.nearest
+def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, targets: np.ndarray,
+               reach: tuple[np.ndarray, np.ndarray]) -> tuple[dict[str, int], np.ndarray]:
+    """The vertex of its part below each loose marker, and distances (L,) from the skin, metres.
+
+    `targets` (B, L, 3) are where the markers were seen on bodies (B, N, 3); `reach` is the least and the greatest
+    distance (L,) of each. Those of other markers are the layout's.
+    """
+    template, distances, usual = model.template, np.array(layout.distances), layout.nearest
     meshes, found = [template.with_vertices(v) for v in vertices], {}
+    normals = np.stack([mesh.vertex_normals for mesh in meshes])
     tree, part = cKDTree(template.vertices), model.skeleton.part_of_vertex(template)
     for row in np.flatnonzero(np.isin(layout.labels, layout.loose)):
         # metres from its usual place that a loose marker is looked for: half a thigh
         near = np.array(tree.query_ball_point(template.vertices[usual[row]], 0.2))
         near = near[part[near] == part[usual[row]]]
-        off = np.stack([mesh.vertices[near] + distances[row] * mesh.vertex_normals[near] - target
-                        for mesh, target in zip(meshes, targets[:, row], strict=True)
-                        if np.isfinite(target[0])] or [np.zeros((len(near), 3))])
+        seen = np.isfinite(targets[:, row, 0])
+        if not seen.any():
+            found[layout.labels[row]] = int(usual[row])
+            continue
+        off, lifts = stand_off(targets[seen, row], vertices[seen][:, near], normals[seen][:, near],
+                               reach[0][row], reach[1][row])
         # metres beyond which it does not matter how far a loose marker is
-        squared = np.minimum((off**2).sum(axis=2), 0.06**2)
-        found[layout.labels[row]] = int(near[squared.mean(axis=0).argmin()])
-    return found
+        best = np.minimum(off**2, 0.06**2).mean(axis=0).argmin()
+        found[layout.labels[row]], distances[row] = int(near[best]), lifts[best]
+    return found, distances
+
+
+def stand_off(targets: np.ndarray, points: np.ndarray, normals: np.ndarray, least: float, greatest: float
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """How a marker seen at targets (B, 3) may stand off each of n points of the skin, whose distance is unknown.
+
+    Returned are the distances (B, n) from the points (B, n, 3) lifted along their normals, and how far (n,) each was
+    lifted: as far as the frames say on average, between the least and the greatest. Metres.
+    """
+    apart = targets[:, None] - points
+    lift = np.clip(np.einsum("bnd,bnd->bn", apart, normals).mean(axis=0), least, greatest)
+    return np.linalg.norm(apart - lift[:, None] * normals, axis=2), lift

@@ -19,12 +19,14 @@ from scanprep.ranges import Count, Positive, Seed, Settings
 
 from ... import energy
 from ...energy import MovingPoints
-from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.layout import DISTANCE, MarkerLayout
+from ..marker_sets.symmetry import label_pairs
 from ..pose.marked_body import supports
 from .attachment import Attachment, LatentMarkers, above_triangles, latent_markers, simulated
 from .frame_starts import find_loose
 
 CENTIMETRES = 100.0                  # in a metre
+ON_SKIN = 0.016                      # metres from a distance that the marker set names, within which it is that one
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,9 @@ class PersonConfig(Settings):
     loose : bool
         Look along their limb for markers that the layout calls loose, and hold them there by 20 cm; the paper holds
         all alike.
+    wand : float, metres
+        How much farther from the skin than the layout says a marker that may be on a wand, or one on a bar, can be.
+        0 takes all distances as the layout has them, as the paper does.
     seed : int
         Of the frames drawn at random.
     """
@@ -80,12 +85,14 @@ class PersonConfig(Settings):
     annealing: tuple[Positive, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
     outlier: Positive = 0.06
     loose: bool = True
+    wand: float = 0.1
     seed: Seed = 0
 
     @classmethod
     def published(cls) -> PersonConfig:
         """Weights, twelve random frames and six stages of [MoSh], all markers alike."""
-        return cls(choice="random", surface=100.0, initial=0.25, shape=1.0, outlier=1000.0, loose=False)
+        return cls(choice="random", surface=100.0, initial=0.25, shape=1.0, outlier=1000.0, loose=False,
+                   wand=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,19 +135,38 @@ def each_own(frame: np.ndarray) -> np.ndarray:
     return out.reshape(*frame.shape[:-1], 3 * L)
 
 
+def distance_reach(layout: MarkerLayout, wand: float) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest distance (L,) of every marker from the skin, metres.
+
+    That of the layout, but for markers that some wear on wands, and for those that the layout itself has away from the
+    skin, on bars, which others wear without: there up to `wand` more, and down to the skin.
+    """
+    distances = np.asarray(layout.distances)
+    free = (np.isin(layout.labels, layout.wands) | (distances > DISTANCE + ON_SKIN)) & (wand > 0)
+    return (np.where(free, np.minimum(distances, DISTANCE), distances),
+            np.where(free, distances + wand, distances))
+
+
 def data_term(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
     """Simulated markers against observed ones (..., L, 3); what was not seen (NaN) counts nothing. [MoSh] Eq. 17"""
     return energy.point_to_point(points, targets, CENTIMETRES**2 * weights)
 
 
-def surface_term(markers: MovingPoints, corners: MovingPoints, distances: np.ndarray, weight: float) -> Residual:
-    """Latent markers at their distance (L,) from the nearest triangles, of 3 L corners. [MoSh] Eq. 18"""
-    L, P = len(distances), markers.jacobian.shape[-1]
+def surface_term(markers: MovingPoints, corners: MovingPoints, least: np.ndarray, greatest: np.ndarray, weight: float
+                 ) -> Residual:
+    """Latent markers at their distance from the nearest triangles, of 3 L corners. [MoSh] Eq. 18
+
+    The distance is an unknown with an even prior between the least and the greatest (L,), metres, which has its best
+    value here; where both are the same, it is the paper's prescribed one.
+    """
+    L, P = len(least), markers.jacobian.shape[-1]
     r, by_point, by_corners = above_triangles(markers.positions, corners.positions.reshape(L, 3, 3))
     J = (by_point[:, None] @ markers.jacobian)[:, 0] + \
         (by_corners.reshape(L, 1, 9) @ corners.jacobian.reshape(L, 9, P))[:, 0]
+    off = r - np.clip(r, least, greatest)
+    held = (off != 0) | (least == greatest)
     root = CENTIMETRES * np.sqrt(weight)
-    return Residual(root * (r - distances), root * J)
+    return Residual(root * off, root * held[:, None] * J)
 
 
 def place_term(markers: MovingPoints, usual: MovingPoints, weights: np.ndarray) -> Residual:
@@ -178,6 +204,8 @@ class State:
     coefficients: np.ndarray             # (L, 3) of the latent markers
     hung: Hung                           # what they are coefficients of
     layout: MarkerLayout                 # where the markers usually are, loose ones where they were found
+    least: np.ndarray                    # (L,) metres from the skin, between which the distance of each is unknown,
+    greatest: np.ndarray                 # or that of the layout
     looked: bool = False                 # loose markers were looked for
 
     @property
@@ -212,7 +240,8 @@ class LatentFit:
         self.latent = LatentPoints(model.vertices(rest, np.zeros(self.n_betas)),
                                    model.shape_jacobian(rest)[..., :self.n_betas])
         self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
-        self.distances, self.loose = np.asarray(layout.distances), np.isin(layout.labels, layout.loose) & config.loose
+        self.loose = np.isin(layout.labels, layout.loose) & config.loose
+        self.reach = distance_reach(layout, config.wand)
         # weight of the usual place of a marker that the layout calls loose: 20 cm
         self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
         self.pool = PointPool(model, self.n_betas)
@@ -224,28 +253,53 @@ class LatentFit:
     def start(self, x: np.ndarray) -> State:
         """The mean person with the markers in their usual places, at poses (B, 3J + 3) that were found for it."""
         betas = np.zeros(self.n_betas)
-        return self._hung(x, betas, self.usual_places(self.layout, betas), self.layout, False)
+        return self._hung(x, betas, self.usual_places(self.layout, betas), self.layout, self.reach, False)
 
-    def hung_anew(self, state: State, look: bool) -> State:
-        """The same places on the triangles that are nearest now; to `look` finds loose markers along their limbs."""
-        if not look or not self.loose.any():
-            return self._hung(state.x, state.betas, state.places, state.layout, state.looked)
-        vertices = self.model.subject(state.betas).vertices(*self.split(state.x))
-        layout = self.layout.moved(find_loose(self.model, vertices, self.layout, self.targets))
-        places = np.where(self.loose[:, None], self.usual_places(layout, state.betas), state.places)
-        return self._hung(state.x, state.betas, places, layout, True)
+    def hung_anew(self, state: State, look: bool, last: bool) -> State:
+        """The same places on the triangles that are nearest now; to `look` finds loose markers along their limbs.
 
-    def _hung(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray, layout: MarkerLayout, looked: bool) -> State:
+        The `last` time the distances that are near one that the marker set names become that one.
+        """
+        layout, places, looked = state.layout, state.places, state.looked
+        if look and self.loose.any():
+            vertices = self.model.subject(state.betas).vertices(*self.split(state.x))
+            found, distances = find_loose(self.model, vertices, self.layout, self.targets, self.reach)
+            layout, looked = replace(self.layout.moved(found), distances=distances), True
+            places = np.where(self.loose[:, None], self.usual_places(layout, state.betas), places)
+        state = self._hung(state.x, state.betas, places, layout, (state.least, state.greatest), looked)
+        return self._measured(state, last)
+
+    def _measured(self, state: State, last: bool) -> State:
+        """The state with the distances of its markers from the skin as they are now, where they are unknown."""
+        free = state.least < state.greatest
+        if not free.any():
+            return state
+        corners = state.hung.corners.at(state.betas).reshape(-1, 3, 3)
+        r = np.clip(above_triangles(state.places, corners)[0], state.least, state.greatest)
+        distances, given = np.where(free, r, np.asarray(state.layout.distances)), np.asarray(self.layout.distances)
+        if last:
+            # both sides are worn alike, and together they tell with less error than one alone
+            pairs = label_pairs(self.layout.labels)
+            paired = (pairs >= 0) & free[pairs]
+            both, limit = np.where(paired, (r + r[pairs]) / 2, r), np.where(paired, ON_SKIN, np.sqrt(2) * ON_SKIN)
+            for named in (np.full(len(r), DISTANCE), given):
+                near = free & (np.abs(both - named) < limit)
+                distances, free = np.where(near, named, distances), free & ~near
+        return replace(state, layout=replace(state.layout, distances=distances),
+                       least=np.where(free, state.least, distances), greatest=np.where(free, state.greatest, distances))
+
+    def _hung(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray, layout: MarkerLayout,
+              reach: tuple[np.ndarray, np.ndarray], looked: bool) -> State:
         """The state with markers at points (L, 3) of the latent coordinate system, each on its nearest triangle."""
         vertices = self.latent.at(betas)
         markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
         corners = self.latent.combined(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
         hung = Hung(markers, self.pool.points(markers), self.latent.combined(markers.ids, markers.weights), corners)
-        return State(x, betas, markers.coefficients(vertices, points), hung, layout, looked)
+        return State(x, betas, markers.coefficients(vertices, points), hung, layout, *reach, looked)
 
     def usual_places(self, layout: MarkerLayout, betas: np.ndarray) -> np.ndarray:
         """Where a layout has the markers (L, 3) on a body of these betas in the latent pose, metres. [MoSh] Eq. 15"""
-        return energy.lifted(self._usual(layout).at(betas), self.distances)
+        return energy.lifted(self._usual(layout).at(betas), np.asarray(layout.distances))
 
     def _usual(self, layout: MarkerLayout) -> LatentPoints:
         return self.latent.combined(*supports(self.model.template, layout))
@@ -295,8 +349,9 @@ class LatentFit:
         """The terms of what frames share."""
         c, hung = self.config, state.hung
         markers = latent_places(hung.markers.kind, hung.supports, z)
-        return {"surface": surface_term(markers, hung.corners.moving(z), self.distances, c.surface),
-                "initial": place_term(markers, energy.above_skin(usual.moving(z), self.distances),
+        distances = np.asarray(state.layout.distances)
+        return {"surface": surface_term(markers, hung.corners.moving(z), state.least, state.greatest, c.surface),
+                "initial": place_term(markers, energy.above_skin(usual.moving(z), distances),
                                       factor * self.place_weight),
                 "shape": shape_term(z, self.n_betas, factor * c.shape)}
 

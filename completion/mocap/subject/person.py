@@ -9,6 +9,7 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.batch.room import Step, once
+from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.threads import one_thread
@@ -17,10 +18,11 @@ from ...motion import Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .frame_starts import mean_person, start_frames
-from .latent_fit import LatentFit, PersonConfig, State
+from .latent_fit import ON_SKIN, LatentFit, PersonConfig, State
 
 __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
+HAND = 0.08                          # metres, the width of a hand: a marker that is moved farther is to be looked at
 LOOK = (1, 3)                        # before these stages loose markers are looked for
 
 
@@ -62,6 +64,25 @@ class PersonFit:
     def residual(self) -> float:
         """The mean distance, metres."""
         return float(np.nanmean(self.residuals))
+
+    def standing_off(self, usual: MarkerLayout) -> dict[str, float]:
+        """Label -> distance from the skin, metres, of markers that are on wands, or off the bars of a layout."""
+        distances = dict(zip(usual.labels, np.asarray(usual.distances).tolist(), strict=True))
+        return {label: float(found) for label, found in
+                zip(self.layout.labels, np.asarray(self.layout.distances), strict=True)
+                if abs(found - distances.get(label, found)) > ON_SKIN}
+
+    def metrics(self, usual: MarkerLayout) -> list[Metric]:
+        """A row of the markers whose distance from the skin is another than the layout says."""
+        off = self.standing_off(usual)
+        return [Metric(f"not at the layout's distance from the skin ({', '.join(off)})",
+                       1000 * float(np.mean(list(off.values()))), "mm")] if off else []
+
+    def doubts(self, usual: MarkerLayout) -> tuple[str, ...]:
+        """Reasons to look at a person: markers that were moved by more than a hand's width."""
+        far = [f"{label} by {100 * moved:.0f} cm" for label, moved in zip(self.layout.labels, self.moved, strict=True)
+               if moved > HAND and label not in usual.loose]
+        return (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
 
 
 @one_thread()
@@ -116,7 +137,7 @@ def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray]
     for i, factor in enumerate(config.annealing):
         last = i == stages - 1
         if i % 2 or (last and i):
-            state = fit.hung_anew(state, i in LOOK)                                         # [MoSh] Eq. 16
+            state = fit.hung_anew(state, i in LOOK, last)                                   # [MoSh] Eq. 16
         rows, converged, taken = step(f"person, stage {i}", given,
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
         state, steps = state.moved(rows), steps + taken

@@ -19,11 +19,13 @@ from scanprep.words import number_of
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
-from .frame_starts import mean_person, start_frames
-from .person import PersonConfig, PersonFit, common_markers, find_person
+from .frame_starts import mean_person, stand_off, start_frames
+from .latent_fit import distance_reach
+from .person import HAND, PersonConfig, PersonFit, common_markers, find_person
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
 FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
+UNUSUAL = 4.0                        # times that of the median marker, at least: on a body that the model hardly knows
 NEAR = 0.02                          # metres within which another place explains a marker, at least
 USUAL = 1.5                          # times that of the other markers from their usual places, likewise
 GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
@@ -73,12 +75,16 @@ class Worn:
         Markers that are far from where the layout has them and that no place on the skin explains; they are left out.
     too_many : labels
         Markers that are far from where the layout has them, and so many that the body is at fault: nothing is changed.
+    lost : (part, labels, whole) of parts
+        Parts of the body of which most markers, or all (`whole`), are not where the layout has them: the part is at
+        fault, not its markers. They are kept, and weighed.
     """
 
     moved: tuple[MovedMarker, ...] = ()
     exchanged: tuple[tuple[str, str], ...] = ()
     unplaced: tuple[str, ...] = ()
     too_many: tuple[str, ...] = ()
+    lost: tuple[tuple[str, tuple[str, ...], bool], ...] = ()
 
     @property
     def changes(self) -> bool:
@@ -90,7 +96,13 @@ class Worn:
         return [*(Metric("names exchanged throughout, put back", " and ".join(pair)) for pair in self.exchanged),
                 *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
                 *(Metric("far from the layout's place, and found nowhere: left out", label) for label in self.unplaced),
-                *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many)]
+                *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many),
+                *(Metric(f"{'all' if whole else 'most'} markers of the {part} far from the layout's places",
+                         ", ".join(labels)) for part, labels, whole in self.lost)]
+
+    def problems(self) -> tuple[str, ...]:
+        """Why what was found with these markers means nothing."""
+        return tuple(_at_fault("all", part, labels) for part, labels, whole in self.lost if whole)
 
     def doubts(self, labels: Sequence[str]) -> tuple[str, ...]:
         """Reasons to look at what was found with these markers, of all `labels` of a recording."""
@@ -100,7 +112,10 @@ class Worn:
                     ,) if 2 * len(self.exchanged) > sides else ()
         told = ((self.unplaced, "not worn where the layout says, and found nowhere: left out"),
                 (self.too_many, "far from where the layout says: the wrong layout, or the wrong body?"))
-        return (*mirrored, *(f"{', '.join(some)} {words}" for some, words in told if some))
+        far = [f"{m.label} by {100 * m.before:.0f} cm" for m in self.moved if m.before > HAND]
+        moved: tuple[str, ...] = (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
+        moved += tuple(_at_fault("most", part, names) for part, names, whole in self.lost if not whole)
+        return (*mirrored, *moved, *(f"{', '.join(some)} {words}" for some, words in told if some))
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""
@@ -127,35 +142,53 @@ class Worn:
         return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
 
 
+def _at_fault(share: str, part: str, labels: Sequence[str]) -> str:
+    """What is told of a part whose markers are not where the layout says."""
+    return (f"{share} markers of the {part} ({', '.join(labels)}) are far from where the layout says: "
+            "wrong labels there, another layout, or a model that knows no such body?")
+
+
 class _Frames:
     """The bodies of a person in their frames, and the markers there."""
 
-    def __init__(self, model: BodyModel, person: PersonFit, sequences: Sequence[MarkerSequence], layout: MarkerLayout
-                 ) -> None:
+    def __init__(self, model: BodyModel, person: PersonFit, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
+                 wand: float) -> None:
         self.layout, positions = common_markers(sequences, layout)
         self.targets = np.stack([positions[which][t] for which, t in person.frames])                  # (B, L, 3)
-        vertices = model.subject(person.betas).vertices(person.poses, person.trans).astype(float)
-        self.bodies = [model.template.with_vertices(v) for v in vertices]
-        self.normals = [body.vertex_normals for body in self.bodies]
+        self.vertices = model.subject(person.betas).vertices(person.poses, person.trans).astype(float)     # (B, N, 3)
+        bodies = [model.template.with_vertices(v) for v in self.vertices]
+        self.normals = np.stack([body.vertex_normals for body in bodies])
+        self.reach, self.wand = distance_reach(self.layout, wand), wand
         self.part = model.skeleton.part_of_vertex(model.template)
         self.template: Mesh = model.template
-        self.places = np.stack([self.layout.place(body) for body in self.bodies])                     # (B, L, 3)
+        self.places = np.stack([self.layout.place(body) for body in bodies])                          # (B, L, 3)
 
-    def off_skin(self, row: int, distance: float) -> np.ndarray:
-        """(N,) RMS distance of a marker from every vertex, lifted off the skin so far, metres."""
-        return _rms(np.stack([np.linalg.norm(body.vertices + distance * normals - target, axis=1)
-                              for body, normals, target in
-                              zip(self.bodies, self.normals, self.targets[:, row], strict=True)]))
+    def off_skin(self, row: int, least: float, greatest: float) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) RMS distance of a marker from every vertex, lifted off the skin within limits, and how far; metres."""
+        seen = np.isfinite(self.targets[:, row, 0])
+        apart, lift = stand_off(self.targets[seen, row], self.vertices[seen], self.normals[seen], least, greatest)
+        return _rms(apart), lift
 
     def off_place(self, row: int, of: int) -> float:
-        """RMS distance of a marker from the usual place of one, that of a loose one anywhere along its part, metres."""
-        apart = float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
-        if self.layout.labels[of] not in self.layout.loose:
-            return apart
+        """RMS distance of a marker from the usual place of one, that of a loose one anywhere along its part, metres.
+
+        Where the distance from the skin is unknown, what a marker stands off the skin is not counted.
+        """
+        loose, least, greatest = self.layout.labels[of] in self.layout.loose, self.reach[0][of], self.reach[1][of]
+        if not (loose or least < greatest) or not np.isfinite(self.targets[:, row, 0]).any():
+            return float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
         centre = self.layout.nearest[of]
         near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
-            & (self.part == self.part[centre])
-        return min(apart, float(self.off_skin(row, float(np.asarray(self.layout.distances)[of]))[near].min()))
+            & (self.part == self.part[centre]) if loose else [centre]
+        return float(self.off_skin(row, float(least), float(greatest))[0][near].min())
+
+    def far(self, least: float) -> float:
+        """From how far off its usual place on a marker is suspected, at least so far, metres.
+
+        It is farther on a body that fits all markers badly, but where labels are mixed up no farther than twice `FAR`.
+        """
+        off = self.off_usual()
+        return float(np.clip(UNUSUAL * np.nanmedian(off), least, 2 * FAR)) if np.isfinite(off).any() else least
 
     def off_usual(self) -> np.ndarray:
         """(L,) the same of every marker from its own, NaN for one that too few frames have seen."""
@@ -189,14 +222,15 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 
     [MoSh]
     """
-    at = _Frames(model, person, sequences, layout)
+    at = _Frames(model, person, sequences, layout, config.wand)
     rough = replace(config, n_betas=ROUGH_BETAS, annealing=ROUGH_STAGES)
     sides, sequences, at = _exchanged_sides(model, sequences, layout, at, rough)
     suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else SUSPECT
     for _ in range(ROUNDS):
         off = dict(zip(at.layout.labels, np.nan_to_num(at.off_usual()).tolist(), strict=True))
-        cleared |= {label for label in suspects if off[label] <= FAR}
-        before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > far)
+        limit = at.far(far)
+        cleared |= {label for label in suspects if off[label] <= max(limit, FAR)}
+        before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > limit)
         if len(suspects) > MOST * len(off):
             return Worn(too_many=tuple(label for label in at.layout.labels if label in suspects))
         if suspects == before:
@@ -208,8 +242,24 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     found = _explained(at, suspects)
     if found.unplaced and (found.moved or found.exchanged):
         found = _once_more(model, sequences, layout, found, config)
+    found = _with_whole_parts(at, found, model.skeleton.names)
     again = set(sides) & set(found.exchanged)                           # exchanged, and put back
     return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
+
+
+def _with_whole_parts(at: _Frames, found: Worn, names: Sequence[str]) -> Worn:
+    """What was found, but for parts of the body that would lose most of their markers: those keep them all."""
+    part_of_marker = at.part[at.layout.nearest]
+    ends = {m.label: at.part[m.corners[m.weights.argmax()]] for m in found.moved}
+    kept, lost = set[str](), []
+    for part in np.unique(part_of_marker).tolist():
+        mine = [label for label, of in zip(at.layout.labels, part_of_marker, strict=True) if of == part]
+        gone = [label for label in mine if label in found.unplaced or ends.get(label, part) != part]
+        if len(gone) > max(1, len(mine) / 2):
+            lost.append((names[part], tuple(gone), len(gone) == len(mine)))
+            kept.update(gone)
+    return replace(found, moved=tuple(m for m in found.moved if m.label not in kept),
+                   unplaced=tuple(label for label in found.unplaced if label not in kept), lost=tuple(lost))
 
 
 def _once_more(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, found: Worn,
@@ -222,7 +272,8 @@ def _once_more(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Ma
     layout = replace(found, unplaced=()).placed(layout)
     at = _without(model, sequences, layout, (), config)
     off = dict(zip(at.layout.labels, at.off_usual(), strict=True))
-    far = [label for label in found.unplaced if off[label] > FAR]
+    limit = at.far(FAR)
+    far = [label for label in found.unplaced if off[label] > limit]
     rest = _explained(_without(model, sequences, layout, far, config), far) if far else Worn()
     return Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
 
@@ -231,7 +282,7 @@ def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mark
              config: PersonConfig) -> _Frames:
     """The body that is fitted without some markers, and all markers on it."""
     others = layout.without([label for label in layout.labels if label in suspects])
-    return _Frames(model, find_person(model, sequences, others, config), sequences, layout)
+    return _Frames(model, find_person(model, sequences, others, config), sequences, layout, config.wand)
 
 
 def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
@@ -245,7 +296,7 @@ def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layo
     for tried in _promising(model, at) if (off > FAR).sum() >= SEVERAL else ():
         names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in tried))
         renamed = [names.named(each, layout) for each in sequences]
-        other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout)
+        other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout, rough.wand)
         if _burden(other) < 0.5 * _burden(at) and _burden(other) < _burden(best[2]):
             best = names.exchanged, renamed, other
     return best
@@ -301,7 +352,8 @@ def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
     labels, usual = at.layout.labels, at.off_usual()
     others = [i for i, label in enumerate(labels) if label not in suspects]
     limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
-    rows, exchanged = {i for i, label in enumerate(labels) if label in suspects and usual[i] > FAR}, []
+    far, exchanged = at.far(FAR), []
+    rows = {i for i, label in enumerate(labels) if label in suspects and usual[i] > far}
     crossed = [(at.off_place(i, j), at.off_place(j, i), i, j) for i, j in combinations(sorted(rows), 2)]
     for one, other, i, j in sorted(crossed, key=lambda both: max(both[:2])):
         if {i, j} <= rows and max(one, other) < FAR and one + other < GAIN * (usual[i] + usual[j]):
@@ -313,11 +365,17 @@ def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
 
 
 def _best_place(at: _Frames, row: int, before: float) -> MovedMarker:
-    """Where on the skin a marker is nearest, at its own distance from it or that of a common one. [MoSh]"""
+    """Where on the skin a marker is nearest, its distance from it being that of the layout, common or on a wand.
+
+    [MoSh]
+    """
     own = float(np.asarray(at.layout.distances)[row])
+    least, greatest = min(own, DISTANCE), max(own, DISTANCE) + at.wand
     tried = []
-    for distance in {own, DISTANCE}:
-        vertex = int(at.off_skin(row, distance).argmin())
+    for low, high in {(own, own), (DISTANCE, DISTANCE), (least, greatest)}:
+        off, lift = at.off_skin(row, low, high)
+        vertex = int(off.argmin())
+        distance = float(lift[vertex])
         tried += [MovedMarker(at.layout.labels[row], corners, weights, distance, before, after)
                   for corners in at.template.faces[(at.template.faces == vertex).any(axis=1)]
                   for weights, after in [_on_triangle(at, row, distance, corners)]]
@@ -326,8 +384,7 @@ def _best_place(at: _Frames, row: int, before: float) -> MovedMarker:
 
 def _on_triangle(at: _Frames, row: int, distance: float, corners: np.ndarray) -> tuple[np.ndarray, float]:
     """The weights (3,) of a triangle's corners that come nearest to a marker, lifted so far, and its RMS distance."""
-    lifted = np.stack([body.vertices[corners] + distance * normals[corners]
-                       for body, normals in zip(at.bodies, at.normals, strict=True)])                 # (B, 3, 3)
+    lifted = at.vertices[:, corners] + distance * at.normals[:, corners]                              # (B, 3, 3)
     target = at.targets[:, row]
     seen = np.isfinite(target[:, 0])
     sides = (lifted[seen, 1:] - lifted[seen, :1]).swapaxes(1, 2).reshape(-1, 2)

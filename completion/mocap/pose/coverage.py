@@ -1,0 +1,116 @@
+"""How much of a recording was used, and which parts of the body its markers tell of."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.linear import Subject
+from scanprep.console import Metric
+from scanprep.judgement import Judgement
+from scanprep.skeleton.tree import Skeleton
+
+from ...motion import Motion
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import MarkerLayout
+
+FEWEST = 8                           # markers that tell of a body; six hold a pelvis and a head, and no limb
+HALF = 0.5                           # share of a file's markers that are to be used
+# share of the skin on parts that no marker saw: both hands have 5% of it, a head 7%, all above the waist 60%
+UNSEEN = 0.25
+PASSING = 0.1                        # share of the frames in which a trajectory is there that counts as a marker
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """What part of a recording was used for a body, and what part of the body the recording has seen.
+
+    Attributes
+    ----------
+    used : tuple of str
+        Markers that were used.
+    count : int
+        Markers of the recordings; trajectories that are hardly ever there are none.
+    told : (J,) bool
+        Parts that carry a marker or stand between two that do: the poses of the others are guesses.
+    parts : tuple of str
+        Names of the parts that carry a marker.
+    unseen : tuple of str
+        Names of the parts whose poses are guesses.
+    skin : float
+        Share of the skin on those.
+    """
+
+    used: tuple[str, ...]
+    count: int
+    told: np.ndarray
+    parts: tuple[str, ...]
+    unseen: tuple[str, ...]
+    skin: float
+
+    def metrics(self) -> list[Metric]:
+        """Rows of the table: markers used, and parts that none of them saw."""
+        rows = [Metric("markers used", f"{len(self.used)} of {self.count}")]
+        return rows + ([Metric("seen by no marker, their angles are left out", ", ".join(self.unseen))]
+                       if self.unseen else [])
+
+    def judgement(self) -> Judgement:
+        """Whether the markers can tell of a body."""
+        failed, check = [], []
+        some = f"{len(self.used)} of {self.count} markers used"
+        if len(self.used) < FEWEST:
+            failed.append(f"{some}, a body needs {FEWEST}: other labels than the marker set's? (scape layout show)")
+        elif len(self.parts) < 2:
+            failed.append(f"all markers used are on one part of the body, the {self.parts[0]}")
+        elif len(self.used) < HALF * self.count:
+            check.append(f"{some}: other labels than the marker set's? (scape layout show)")
+        if self.skin > UNSEEN:
+            check.append(f"no marker saw {', '.join(self.unseen)}: a guess, and their angles are left out")
+        return Judgement.of(failed, check)
+
+
+def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Motion],
+                  markers: Sequence[MarkerSequence]) -> Coverage:
+    """What the markers of some recordings tell of a body, as motions have followed them.
+
+    Markers that are hardly ever believed are used, but tell of no part.
+
+    Parameters
+    ----------
+    subject : Subject
+    layout : MarkerLayout
+        Where on the body the markers sit.
+    motions, markers : as many Motions and MarkerSequences
+    """
+    skeleton, body = subject.skeleton, subject.template
+    used = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)
+            if np.isfinite(column).any()}
+    lasting = {label for one in markers for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True)
+               if share >= PASSING}
+    doubted = {label for motion in motions for label in motion.distrusted}
+    known = {layout.aliases.get(label, label) for label in used - doubted}
+    part_of_marker = skeleton.part_of_vertex(body)[layout.nearest]
+    seen = np.unique(part_of_marker[np.isin(layout.labels, sorted(known))])
+    told = between(skeleton, seen)
+    area = np.bincount(skeleton.part_of_face, body.face_areas, minlength=len(told))
+    names = np.array(skeleton.names)
+    return Coverage(tuple(sorted(used)), len(lasting | used), told, tuple(names[seen].tolist()),
+                    tuple(names[~told].tolist()), float(area[~told].sum() / area.sum()))
+
+
+def between(skeleton: Skeleton, seen: np.ndarray) -> np.ndarray:
+    """(J,) bool: the parts (n,) and those on the way from one of them to another."""
+    found, ways = np.zeros(len(skeleton.parents), dtype=bool), []
+    for part in seen.tolist():
+        way = [part]
+        while skeleton.parents[way[-1]] >= 0:
+            way.append(int(skeleton.parents[way[-1]]))
+        ways.append(way)
+    if not ways:
+        return found
+    # from every part up to the first that all ways have in common
+    top = next(part for part in ways[0] if all(part in way for way in ways))
+    for way in ways:
+        found[way[:way.index(top) + 1]] = True
+    return found

@@ -1,0 +1,93 @@
+"""Which parts of a body the markers tell of, and what a recording of few markers is worth."""
+import csv
+
+import numpy as np
+import pytest
+from people_bodies import kept, small_people
+
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.files.motion_files import write_motion
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.pose.coverage import between, find_coverage
+from completion.motion import Motion
+
+MODEL = small_people()
+LAYOUT = named_layout("plugingait39", MODEL.template, kept())
+SUBJECT = MODEL.subject(np.zeros(MODEL.n_betas))
+NAMES = np.array(SUBJECT.skeleton.names)
+LEGS = tuple(label for label in LAYOUT.labels if label[1:] in ("ASI", "PSI", "THI", "KNE", "TIB", "ANK", "HEE", "TOE"))
+
+
+def covered(labels, others=0, doubted=()):
+    """Of a recording of these labels of the set and so many others."""
+    every = (*labels, *(f"X{i}" for i in range(others)))
+    residuals = np.full((5, len(every)), np.nan)
+    residuals[:, :len(labels)] = 0.005
+    trusted = np.isfinite(residuals) & ~np.isin(every, doubted)
+    motion = Motion(np.zeros((5, len(NAMES), 3)), np.zeros((5, 3)), None, 50.0, residuals, every, trusted=trusted)
+    return find_coverage(SUBJECT, LAYOUT, [motion], [MarkerSequence(np.zeros((5, len(every), 3)), every, 50.0)]), motion
+
+
+def test_a_whole_set_tells_of_the_whole_body():
+    found, _ = covered(LAYOUT.labels)
+    assert found.told.all() and not found.unseen and found.judgement().verdict == "good"
+    assert found.metrics()[0].value == "39 of 39"
+
+
+def test_legs_alone_say_what_they_did_not_see():
+    found, _ = covered(LEGS)
+    assert set(found.unseen) == {name for name in NAMES if name.startswith(
+        ("abdomen", "chest", "head", "upper_arm", "forearm", "hand"))}
+    assert found.judgement().verdict == "check" and "no marker saw" in found.judgement().why
+    assert 0.5 < found.skin < 0.7
+
+
+@pytest.mark.parametrize(("labels", "others", "verdict", "words"), [
+    (("LASI", "RASI", "C7"), 36, "failed", "3 of 39 markers used, a body needs 8"),
+    (LAYOUT.labels[:7], 0, "failed", "7 of 7"), (LAYOUT.labels, 40, "check", "39 of 79 markers used"),
+    (LAYOUT.labels, 39, "good", "")])
+def test_a_recording_of_which_little_is_used(labels, others, verdict, words):
+    judgement = covered(labels, others)[0].judgement()
+    assert judgement.verdict == verdict and words in judgement.why
+
+
+def test_markers_on_one_part_alone_tell_of_no_body():
+    many = tuple(f"H{i}" for i in range(9))
+    head = MarkerLayout(many, np.repeat(LAYOUT.select(["LFHD"]).nearest, 9))
+    motion = Motion(np.zeros((2, len(NAMES), 3)), np.zeros((2, 3)), None, 50.0, np.zeros((2, 9)), many)
+    found = find_coverage(SUBJECT, head, [motion], [MarkerSequence(np.zeros((2, 9, 3)), many, 50.0)])
+    assert found.judgement().verdict == "failed" and "one part of the body, the head" in found.judgement().why
+
+
+def test_markers_that_nobody_believes_tell_of_no_part():
+    hand = tuple(label for label in LAYOUT.labels if label == "LFIN")
+    found, _ = covered(LAYOUT.labels, doubted=hand)
+    assert found.unseen == ("hand_left",) and found.judgement().verdict == "good"          # a hand is said, no more
+
+
+def test_a_part_between_two_is_told():
+    parents, names = SUBJECT.skeleton.parents, NAMES.tolist()
+    hand, head = names.index("hand_left"), names.index("head")
+    chest = names[parents[names.index("upper_arm_left")]]
+    told = set(NAMES[between(SUBJECT.skeleton, np.array([hand, head]))])
+    assert told == {"hand_left", "forearm_left", "upper_arm_left", chest, "head"}
+    assert not between(SUBJECT.skeleton, np.array([], dtype=int)).any()
+
+
+def test_angles_that_are_guesses_are_in_no_table(tmp_path):
+    found, motion = covered(LEGS)
+    write_motion(tmp_path, motion, SUBJECT, None, found.told)
+    lines = (tmp_path / "motion.mot").read_text().splitlines()
+    head = lines[lines.index("endheader") + 1].split("\t")
+    assert "knee_angle_r" in head and "hip_flexion_l" in head and head[1:7] == [
+        "pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis_ty", "pelvis_tz"]
+    assert not [name for name in head if name.startswith(("arm_", "elbow", "neck", "lumbar", "wrist", "shoulder"))]
+    assert f"nColumns={len(head)}" in lines and any(line.startswith("Seen by no marker, left out: ") for line in lines)
+    with open(tmp_path / "joint_angles.csv", newline="", encoding="utf-8") as rows:
+        names, first = (next(csv.reader(rows)) for _ in range(2))
+    empty = {name[:-3] for name, cell in zip(names, first, strict=True) if not cell}
+    assert empty == set(found.unseen)
+    centres = read_markers(tmp_path / "motion.trc")
+    there = dict(zip(centres.labels, centres.seen.all(axis=0), strict=True))
+    assert there["knee_l_joint"] and not there["elbow_l_joint"] and not there["head_joint"]
