@@ -21,10 +21,11 @@ ANYBODY = (1.00, 2.30)                                 # metres: from a child of
 # litres per square metre of stature, of people and of anybody; 400 synthetic people have 14 to 31, a chair's body 8.6
 BUILD, ANY_BUILD = (13.0, 55.0), (9.0, 90.0)
 # Squared lengths of the betas of K components are chi-square distributed: one person of so many is beyond the first
-# limit, 7.0 of 18. `mosh` with a model of other people than the recorded one finds up to 12 of 18 where the motion is
-# right but the body is not; recordings scaled by 1.6 and 2.54 end at 20 and 46. The second limit is so many times the
-# first.
-ONE_OF, TOO_LONG = 10_000, 1.8
+# limit, 7.0 of 18. It is no less than `USUAL` times the root of K: completions of people have up to 1.4 times that, of
+# a chair and a cylinder, which other limits refuse, 2.1 and 2.3. `mosh` with a model of other people than the recorded
+# one finds up to 12 of 18 where the motion is right but the body is not; recordings scaled by 1.6 and 2.54 end at 20
+# and 46. The second limit is so many times the first.
+ONE_OF, USUAL, TOO_LONG = 10_000, 1.6, 1.8
 NAMED = 3                                              # results that one judgement of many names
 
 
@@ -190,10 +191,13 @@ def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray
 
 
 def longest_betas(count: int) -> float:
-    """The length of so many betas, standard deviations, beyond which one person of `ONE_OF` is. [MoSh] Eq. 20"""
+    """The length of so many betas, standard deviations, beyond which one person of `ONE_OF` is, or fewer.
+
+    [MoSh] Eq. 20
+    """
     from scipy.special import gammainccinv
 
-    return float(np.sqrt(2 * gammainccinv(count / 2, 1 / ONE_OF)))
+    return float(np.sqrt(max(2 * gammainccinv(count / 2, 1 / ONE_OF), USUAL**2 * count)))
 
 
 def size(body: Mesh) -> float:
