@@ -46,8 +46,8 @@ class LearnConfig(Settings):
     def published(cls) -> LearnConfig:
         """The paper's own way: joints pruned at 0.1, linear least squares, w_s = 0.001 ρ, nothing refined.
 
-        The 0.1 has no unit in the paper. Read as a standard deviation in radians, so a variance of 0.01, it removes the
-        third of the parameters that the paper reports; as a variance it would remove two thirds.
+        The 0.1 has no unit in the paper. It is read as a standard deviation in radians, a variance of 0.01; the paper's
+        own poses lost a third of the parameters by it, others lose another share.
 
         [SCAPE] Eq. 3, Eq. 4, Eq. 5, Eq. 7, Eq. 8
         """
