@@ -19,9 +19,10 @@ from typing import Any
 from . import config_files, ranges
 from .arguments import Argument, UsageError, make_parser, near, read_line, sentences
 from .config_files import Flag
-from .console import JUDGEMENT, OUR_MODULES, Metric, Outcome, say, show, write_report
+from .console import JUDGEMENT, Metric, Outcome, say, show, write_report
 from .interrupts import tidy_up
 from .threads import one_thread
+from .words import OUR_MODULES
 
 OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from

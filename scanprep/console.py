@@ -55,7 +55,6 @@ class Outcome:
     following: str = ""
 
 
-OUR_MODULES = r"(scanprep|model|completion)(\.|$)"     # whose warnings are notes for users
 MOST_ROWS = 12                       # of the closing table: what is read at a glance
 
 

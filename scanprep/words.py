@@ -1,5 +1,7 @@
-"""Numbers in sentences."""
+"""What messages for users are made of: numbers with their nouns, and the warnings that are notes for them."""
 from __future__ import annotations
+
+OUR_MODULES = r"(scanprep|model|completion)(\.|$)"     # whose warnings are notes for users
 
 
 def number_of(count: int, one: str, several: str = "") -> str:

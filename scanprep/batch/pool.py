@@ -10,9 +10,9 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Generic, TypeVar, cast
 
-from ..console import OUR_MODULES
 from ..ranges import FLAG, Processes, Settings
 from ..threads import begin_worker, helpers
+from ..words import OUR_MODULES
 from .room import Failure, Job, Progress, attempt
 
 T = TypeVar("T")
