@@ -32,10 +32,10 @@ def place(tmp_path, monkeypatch):
     points, _ = half_view(body, np.array([0.0, -1.0, 0.0]))
     write_points("half.ply", PointCloud(points))
     write_landmarks("half.landmarks.json", {name: body.vertices[v] for name, v in MARKS.items()})
-    labels = tuple(MARKS)
-    still = np.repeat(body.vertices[None, list(MARKS.values())], 40, axis=0)
-    write_markers("walk.c3d", MarkerSequence(still, labels, 60.0))
-    MarkerLayout(labels, np.array(list(MARKS.values()))).save("layout.json")
+    more = np.setdiff1d(np.linspace(0, len(body.vertices) - 1, 7).astype(int), list(MARKS.values()))
+    labels, rows = (*MARKS, *(f"M{k}" for k in more)), np.r_[list(MARKS.values()), more]
+    write_markers("walk.c3d", MarkerSequence(np.repeat(body.vertices[None, rows], 40, axis=0), labels, 60.0))
+    MarkerLayout(labels, rows).save("layout.json")
     return tmp_path
 
 

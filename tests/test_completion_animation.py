@@ -200,7 +200,6 @@ def test_a_motion_with_the_other_spelling_of_its_rate_is_read(tmp_path):
     ({"poses": np.zeros((2, 9))}, "it lacks trans"),
     ({"poses": np.zeros((2, 9)), "trans": np.zeros((2, 3)), "surface_model_type": "other"},
      "expected surface_model_type 'scape', found 'other'"),
-    ({"poses": np.zeros((2, 9)), "trans": np.zeros((2, 3)), "surface_model_type": "scape"}, "mocap_frame_rate"),
     ({"poses": np.zeros((2, 9)), "trans": np.zeros((3, 3)), "surface_model_type": "scape", "mocap_frame_rate": 1},
      "trans: expected shape"),
 ])

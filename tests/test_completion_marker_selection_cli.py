@@ -61,9 +61,12 @@ def test_a_layout_a_curve_and_a_page_are_written(folder, capsys):
 
 
 @pytest.mark.parametrize(("more", "message"), [
-    (("--count", "12"), "count: expected 3..10 markers"), (("--poses", "999", "--count", "5"), "count: expected 1.."),
+    (("--count", "12"), "count: expected 3..10 markers"),
+    (("--config", "many.toml", "--count", "5"), "count: expected 1.."),
     (("--candidates", "nosuch"), "expected a file or one of")])
-def test_wrong_input_is_one_line(folder, capsys, more, message):
+def test_wrong_input_is_one_line(folder, capsys, monkeypatch, more, message):
+    monkeypatch.chdir(folder)
+    (folder / "many.toml").write_text("poses = 999\n")
     assert run(folder, *more) == 1
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error

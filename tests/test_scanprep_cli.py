@@ -174,13 +174,14 @@ def test_decimate_keeps_landmarks(place, tmp_path):
     assert apart.max() < 1e-9
 
 
-def test_align_begins_at_the_landmarks_beside_both(place, tmp_path, capsys):
+def test_align_begins_at_landmarks(place, tmp_path, capsys):
     """A body that stands on its head, where surfaces alone end in another pose."""
     body, turn = read_mesh(place / "template.ply"), np.diag([1.0, -1.0, -1.0])
     write_mesh(tmp_path / "turned.ply", body.with_vertices(body.vertices @ turn + [0.3, 0, 2]))
     marks = {name: body.vertices[v] @ turn + [0.3, 0, 2] for name, v in MARKS.items()}
     write_landmarks(tmp_path / "turned.landmarks.json", marks)
-    assert run("align", tmp_path / "turned.ply", place / "template.ply", "-o", tmp_path / "back.ply") == 0
+    assert run("align", tmp_path / "turned.ply", place / "template.ply", "--landmarks",
+               tmp_path / "turned.landmarks.json", "-o", tmp_path / "back.ply") == 0
     np.testing.assert_allclose(read_mesh(tmp_path / "back.ply").vertices, body.vertices, atol=1e-4)
     shutil.copy(place / "template.ply", tmp_path / "bare.ply")
     assert run("align", tmp_path / "turned.ply", tmp_path / "bare.ply", "--landmarks",

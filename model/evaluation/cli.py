@@ -27,7 +27,7 @@ from .sampling import sample_bodies, specificity
 
 
 def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
-             train_shapes: Path | None = None, subject: Path | None = None,
+             counts: tuple[Count, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
              unit: Unit | None = None) -> Outcome:
     """Errors of a model on bodies that it was not trained on, with a page of curves and pictures.
 
@@ -38,6 +38,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
         output: Folder for report.html, report.json, poses.csv and people.csv.
         poses: Held-out meshes of the model's own body, or a registered set.
         shapes: Held-out people, or a registered set, of which the first mesh of each subject counts.
+        counts: Numbers of shape components to fit people with.
         train_shapes: The people that the model was trained on: adds plain PCA of vertices and specificity.
         subject: Whose poses they are, betas or a mesh; else the template's own body.
         unit: Unit of the meshes.
@@ -59,10 +60,10 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
             poses_found = pose_errors(loaded, posed, read_subject(loaded, subject, unit), progress=progress)
     if people is not None:
         with bar("fitting people") as progress:
-            shapes_found = shape_errors(loaded, people, train=train, progress=progress)
+            shapes_found = shape_errors(loaded, people, counts, train, progress=progress)
     if train is not None:
         with bar("bringing training people to rest") as progress:
-            specific = specificity(loaded, train, 100, np.random.default_rng(0), progress=progress)
+            specific = specificity(loaded, train, 100, np.random.default_rng(0), counts, progress=progress)
     samples = sample_bodies(loaded, 8, np.random.default_rng(0)) if loaded.n_betas else None      # on the page
     found = Findings(poses_found, pose_names, posed, shapes_found, people_names, people, specific, samples)
     notes, metrics = _notes(loaded, posed, people), _metrics(loaded, found)
@@ -71,7 +72,7 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     with bar("drawing the page") as progress:
         page = evaluation_page(model.stem, loaded, found, [m for m in metrics if m.name != "note"], notes, progress)
     page.write(output / "report.html")
-    return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes,
+    return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
                                      "train_shapes": train_shapes, "subject": subject},
                    judgement=Judgement.of(_problems(loaded, found)))
 

@@ -19,7 +19,6 @@ from ..correspondence.correspondences import (
 )
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_mesh, read_scan, write_mesh
-from ..geometry.landmark_names import paired_names
 from ..geometry.landmarks import (
     landmarks_beside,
     match_landmarks,
@@ -51,19 +50,17 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
         source: Mesh to move.
         target: Mesh that stays.
         output: Mesh to write, the moved one.
-        landmarks: Landmarks of the mesh that is moved; else the file of its name beside it. Those of the target are
-            beside it.
+        landmarks: Landmarks of the mesh that is moved, with the names of those that lie beside the target.
         unit: Unit of both meshes and of their landmarks.
         config: Settings.
     """
     moving, fixed = read_mesh(source, unit), read_mesh(target, unit)
     T = np.eye(4)
-    mine_file, theirs_file = landmarks or landmarks_beside(source), landmarks_beside(target)
-    if landmarks and not theirs_file:
-        raise ValueError(f"{landmarks}: {target} has no landmarks; expected a file of its name beside it")
-    known = [read_landmarks(file, mesh, unit) for file, mesh in ((mine_file, moving), (theirs_file, fixed)) if file]
-    if landmarks or (len(known) == 2 and len(paired_names(known[0], known[1])) > 2):
-        _, mine, theirs = match_landmarks(known[0], known[1])
+    if landmarks:
+        beside = landmarks_beside(target)
+        if beside is None:
+            raise ValueError(f"{landmarks}: {target} has no landmarks; expected a file of its name beside it")
+        _, mine, theirs = match_landmarks(read_landmarks(landmarks, moving, unit), read_landmarks(beside, fixed, unit))
         T = align_landmarks(mine, theirs).T_target_source
     placed = moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3])
     found = align_rigid(placed, fixed, config=config)

@@ -59,8 +59,8 @@ def _facts(search: SkeletonSearch) -> list[Metric]:
 
 
 def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, edits: Path | None = None,
-         merge: tuple[str, str] | None = None, split: str | None = None, rename: tuple[str, str] | None = None,
-         unit: Unit | None = None) -> Outcome:
+         merge: tuple[str, str] | None = None, rename: tuple[str, str] | None = None, unit: Unit | None = None
+         ) -> Outcome:
     """Change a skeleton by hand: merge, split and rename parts, move joints.
 
     Example: scape prep edit-skeleton set --merge chest shoulder_left --rename part3 neck -o set/skeleton.json
@@ -72,13 +72,12 @@ def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, ed
         edits: JSON list of edits, such as [{"merge": [a, b]}, {"split": a, "names": [b, c]}, {"rename": {a: b}},
             {"move_joint": a, "position": [x, y, z]}], which are made first, in their order.
         merge: Two parts to become one, called like the first.
-        split: A part to become two, where it bends most in the poses of the set.
         rename: A part and its new name.
         unit: Unit of the template.
     """
-    wanted = [*(read_edits(edits) if edits else []), *_asked(merge, split, rename)]
+    wanted = [*(read_edits(edits) if edits else []), *_asked(merge, rename)]
     if not wanted:
-        raise ValueError("edits: expected --edits FILE or one of --merge, --split, --rename")
+        raise ValueError("edits: expected --edits FILE or one of --merge, --rename")
     before, body, poses = _read_skeleton(skeleton, template, unit)
     after = apply_edits(before, body, wanted, poses)
     after.save(output)
@@ -87,13 +86,11 @@ def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, ed
                    judgement=Judgement())
 
 
-def _asked(merge: tuple[str, str] | None, split: str | None, rename: tuple[str, str] | None) -> list[dict[str, Any]]:
+def _asked(merge: tuple[str, str] | None, rename: tuple[str, str] | None) -> list[dict[str, Any]]:
     """The edits of the command line as they stand in a file."""
     asked: list[dict[str, Any]] = []
     if merge:
         asked.append({"merge": list(merge)})
-    if split is not None:
-        asked.append({"split": split})
     if rename:
         asked.append({"rename": {rename[0]: rename[1]}})
     return asked
