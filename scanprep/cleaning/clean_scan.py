@@ -198,14 +198,15 @@ def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
 def _sparse_links(points: np.ndarray, link: float, longest: float) -> np.ndarray:
     """Pairs (n, 2) of points farther apart than `link` and up to `longest` metres that are among each other's nearest.
 
-    They join a side that was seen from afar, or by one view where others overlap, to itself; two surfaces hardly.
+    Only where points are few: with less than `MUTUAL` others within a link, which do not count among the nearest. The
+    pairs join a side that was seen from afar, or by one view where others overlap, to itself; two surfaces hardly.
     """
     if len(points) < 2:
         return np.zeros((0, 2), dtype=np.int64)
-    apart, near = cKDTree(points).query(points, min(MUTUAL + 1, len(points)), distance_upper_bound=longest)
-    a, b = np.repeat(np.arange(len(points)), near.shape[1] - 1), near[:, 1:].ravel()
-    far = (apart[:, 1:].ravel() > link) & (b < len(points))
-    a, b = a[far], b[far]
+    apart, near = cKDTree(points).query(points, min(2 * MUTUAL, len(points)), distance_upper_bound=longest)
+    far = (apart > link) & (near < len(points)) & ((apart <= link).sum(axis=1, keepdims=True) <= MUTUAL)   # with itself
+    far &= np.cumsum(far, axis=1) <= MUTUAL
+    a, b = np.nonzero(far)[0], near[far]
     return np.stack([a, b], axis=1)[np.isin(a * len(points) + b, b * len(points) + a)]
 
 
