@@ -18,7 +18,7 @@ from ..marker_sets.layout import MarkerLayout
 FEWEST = 8                           # markers that tell of a body; six hold a pelvis and a head, and no limb
 HALF = 0.5                           # share of a file's markers that are to be used
 # share of the skin on parts that no marker saw: both hands have 5% of it, a head 7%, all above the waist 60%
-UNSEEN = 0.25
+UNSEEN_SKIN = 0.25
 PASSING = 0.1                        # share of the frames in which a trajectory is there that counts as a marker
 
 
@@ -65,7 +65,7 @@ class Coverage:
             failed.append(f"all markers used are on one part of the body, the {self.parts[0]}")
         elif len(self.used) < HALF * self.count:
             check.append(f"{some}: other labels than the marker set's? (scape layout show)")
-        if self.skin > UNSEEN:
+        if self.skin > UNSEEN_SKIN:
             check.append(f"no marker saw {', '.join(self.unseen)}: a guess, and their angles are left out")
         return Judgement.of(failed, check)
 

@@ -22,7 +22,7 @@ from .latent_fit import ON_SKIN, LatentFit, PersonConfig, State
 
 __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
-HAND = 0.08                          # metres, the width of a hand: a marker that is moved farther is to be looked at
+HAND_WIDTH = 0.08                          # metres, the width of a hand: a marker that is moved farther is to be looked at
 LOOK = (1, 3)                        # before these stages loose markers are looked for
 
 
@@ -81,7 +81,7 @@ class PersonFit:
     def doubts(self, usual: MarkerLayout) -> tuple[str, ...]:
         """Reasons to look at a person: markers that were moved by more than a hand's width."""
         far = [f"{label} by {100 * moved:.0f} cm" for label, moved in zip(self.layout.labels, self.moved, strict=True)
-               if moved > HAND and label not in usual.loose]
+               if moved > HAND_WIDTH and label not in usual.loose]
         return (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
 
 

@@ -21,7 +21,7 @@ from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
 from .frame_starts import mean_person, stand_off, start_frames
 from .latent_fit import distance_reach
-from .person import HAND, PersonConfig, PersonFit, common_markers, find_person
+from .person import HAND_WIDTH, PersonConfig, PersonFit, common_markers, find_person
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
 FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
@@ -112,7 +112,7 @@ class Worn:
                     ,) if 2 * len(self.exchanged) > sides else ()
         told = ((self.unplaced, "not worn where the layout says, and found nowhere: left out"),
                 (self.too_many, "far from where the layout says: the wrong layout, or the wrong body?"))
-        far = [f"{m.label} by {100 * m.before:.0f} cm" for m in self.moved if m.before > HAND]
+        far = [f"{m.label} by {100 * m.before:.0f} cm" for m in self.moved if m.before > HAND_WIDTH]
         moved: tuple[str, ...] = (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
         moved += tuple(_at_fault("most", part, names) for part, names, whole in self.lost if not whole)
         return (*mirrored, *moved, *(f"{', '.join(some)} {words}" for some, words in told if some))
