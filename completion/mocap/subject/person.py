@@ -22,7 +22,7 @@ from .latent_fit import ON_SKIN, LatentFit, PersonConfig, State
 
 __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
-HAND_WIDTH = 0.08                          # metres, the width of a hand: a marker that is moved farther is to be looked at
+HAND_WIDTH = 0.08                    # metres: a marker that is moved farther is to be looked at
 LOOK = (1, 3)                        # before these stages loose markers are looked for
 
 
