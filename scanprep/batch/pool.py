@@ -25,14 +25,12 @@ class Workers(Settings):
 
     Attributes
     ----------
-    workers : int
-        Processes on this machine; 0 for one a core.
-    scheduler : str, optional
-        Address of a Dask scheduler, whose workers do the work instead, such as tcp://host:8786.
+    workers : int or str
+        Processes on this machine, 0 for one a core; or the address of a Dask scheduler, whose workers do the work
+        instead, such as tcp://host:8786.
     """
 
     workers: Annotated[Processes, FLAG] = 0
-    scheduler: Annotated[str | None, FLAG] = None
 
 
 def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress | None = None
@@ -40,10 +38,10 @@ def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress 
     """Each job with what the work returned, or a Failure, as they finish."""
     if not jobs:
         return iter(())
-    if workers.scheduler is not None:
+    if isinstance(workers.workers, str):
         from .cluster import run_on_cluster
 
-        return run_on_cluster(workers.scheduler, work, jobs)
+        return run_on_cluster(workers.workers, work, jobs)
     count = min(workers.workers or os.cpu_count() or 1, len(jobs))
     if count == 1:
         return ((job, attempt(work, job, inside)) for job in jobs)
