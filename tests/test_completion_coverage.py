@@ -9,7 +9,7 @@ from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.files.motion_files import write_motion
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
-from completion.mocap.pose.coverage import between, find_coverage
+from completion.mocap.pose.coverage import between, find_coverage, marker_labels
 from completion.motion import Motion
 
 MODEL = small_people()
@@ -50,6 +50,14 @@ def test_legs_alone_say_what_they_did_not_see():
 def test_a_recording_of_which_little_is_used(labels, others, verdict, words):
     judgement = covered(labels, others)[0].judgement()
     assert judgement.verdict == verdict and words in judgement.why
+
+
+def test_points_that_plug_in_gait_computed_are_no_markers():
+    """Nor are trajectories without a name: a file with 39 markers can have 240 points."""
+    segments = {"A:" + stem + axis for stem in ("PEL", "LFE", "TRX") for axis in "OALP"}
+    unnamed = {"*113", "U_2", "U3", "Unlabeled 1023", "Unidentified 4"}
+    markers = {*("A:" + label for label in LAYOUT.labels), "LTHA", "LTHP", "LTHO", "U4D", "Centre"}
+    assert marker_labels(markers | segments | unnamed | {"A:CentreOfMass", "CentreOfMassFloor"}) == markers
 
 
 def test_markers_on_one_part_alone_tell_of_no_body():

@@ -1,7 +1,8 @@
 """How much of a recording was used, and which parts of the body its markers tell of."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,9 @@ HALF = 0.5                           # share of a file's markers that are to be 
 # share of the skin on parts that no marker saw: both hands have 5% of it, a head 7%, all above the waist 60%
 UNSEEN_SKIN = 0.25
 PASSING = 0.1                        # share of the frames in which a trajectory is there that counts as a marker
+UNNAMED = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"           # as Vicon, Motive and Qualisys write trajectories
+COMPUTED = r"CentreOfMass(Floor)?"   # what Plug-in Gait adds to the markers of a file,
+AXES = "OALP"                        # beside the origin and the ends of the axes of every segment, as PELO, PELA, ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +35,7 @@ class Coverage:
     used : tuple of str
         Markers that were used.
     count : int
-        Markers of the recordings; trajectories that are hardly ever there are none.
+        Markers of the recordings: their `marker_labels`, without those that are hardly ever there.
     told : (J,) bool
         Parts that carry a marker or stand between two that do: the poses of the others are guesses.
     parts : tuple of str
@@ -87,7 +91,7 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     used = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)
             if np.isfinite(column).any()}
     lasting = {label for one in markers for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True)
-               if share >= PASSING}
+               if share >= PASSING and label in marker_labels(one.labels)}
     doubted = {label for motion in motions for label in motion.distrusted}
     known = {layout.aliases.get(label, label) for label in used - doubted}
     part_of_marker = skeleton.part_of_vertex(body)[layout.nearest]
@@ -97,6 +101,20 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     names = np.array(skeleton.names)
     return Coverage(tuple(sorted(used)), len(lasting | used), told, tuple(names[seen].tolist()),
                     tuple(names[~told].tolist()), float(area[~told].sum() / area.sum()))
+
+
+def marker_labels(labels: Iterable[str]) -> set[str]:
+    """The labels of markers: without trajectories that have no name, and points that Plug-in Gait computed.
+
+    Examples
+    --------
+    >>> sorted(marker_labels(["C7", "*12", "PELO", "PELA", "PELL", "PELP", "LTHP", "CentreOfMass"]))
+    ['C7', 'LTHP']
+    """
+    every = set(labels)
+    segments = {label[:-1] for label in every if all(label[:-1] + axis in every for axis in AXES)}
+    axes = {stem + axis for stem in segments for axis in AXES}
+    return {label for label in every - axes if not re.fullmatch(f"{UNNAMED}|{COMPUTED}", label.rpartition(":")[2])}
 
 
 def between(skeleton: Skeleton, seen: np.ndarray) -> np.ndarray:
