@@ -12,7 +12,7 @@ import sys
 import time
 import typing
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,16 +38,16 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     interrupted. All others write to a folder of their own, from which the output takes its place when it is whole.
     """
     start, wrong, call = time.perf_counter(), 2, None
-    with _notes(prog) as notes, one_thread():
+    with _notes(prog) as (spelled, notes), one_thread():
         try:
             if (text := settings_file(function, argv)) is not None:
                 sys.stdout.write(text + "\n")
                 return 0
             call = _Call(function, prog, argv)
-            notes.append(call.arguments.as_flags)
+            spelled.append(call.arguments.as_flags)
             wrong = 1
             tidy_up()
-            outcome, report = call.carried_out(start)
+            outcome, report = call.carried_out(start, notes)
         except KeyboardInterrupt:
             goes_on = call is not None and call.wants_space
             say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if goes_on else
@@ -203,8 +203,8 @@ class _Call:
             return outcome
         return dataclasses.replace(outcome, judgement=outcome.judgement.joined(self.before))
 
-    def carried_out(self, start: float) -> tuple[Outcome, Path | None]:
-        """What the function did, and where its report is."""
+    def carried_out(self, start: float, notes: Sequence[str]) -> tuple[Outcome, Path | None]:
+        """What the function did, and where its report is, which has the notes too."""
         from .batch.opening import beside, workspace
         from .batch.workspace import NothingMadeError
         from .judgement import carry_judgements
@@ -222,7 +222,7 @@ class _Call:
                     raise NothingMadeError(outcome.failures)
                 with space.staging("report") as staged:
                     report = write_report(dataclasses.replace(outcome, output=staged.folder), self.command,
-                                          time.perf_counter() - start)
+                                          time.perf_counter() - start, notes)
                 return outcome, None if report is None else self.output / report.name
         with beside(self.output, self.force) as space, space.staging("output") as staged:
             self._staged = staged.folder
@@ -232,7 +232,7 @@ class _Call:
             top = made if made.is_dir() else made.parent
             written = {p.relative_to(top).as_posix(): space.digests.of_file(p) for p in sorted(top.rglob("*"))
                        if p.is_file()}
-            return outcome, write_report(outcome, self.command, time.perf_counter() - start, written)
+            return outcome, write_report(outcome, self.command, time.perf_counter() - start, notes, written)
 
 
 def _paths(values: Iterable[Any]) -> list[Path]:
@@ -242,21 +242,25 @@ def _paths(values: Iterable[Any]) -> list[Path]:
 
 
 @contextlib.contextmanager
-def _notes(prog: str) -> Iterator[list[Callable[[str], str]]]:
-    """Our own warnings as one line each, spelled by what is in the list; those of libraries are for their users."""
-    spelled: list[Callable[[str], str]] = []
+def _notes(prog: str) -> Iterator[tuple[list[Callable[[str], str]], list[str]]]:
+    """Our own warnings as one line each, spelled by what is in the first list and kept in the second.
+
+    Those of libraries are for their users.
+    """
+    spelled, notes = list[Callable[[str], str]](), list[str]()
 
     def tell(message: Warning | str, *_rest: Any, **_named: Any) -> None:
         text = " ".join(str(message).split())
         for spell in spelled:
             text = spell(text)
+        notes.append(text)
         say(f"{prog}: note: {text}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=OUR_MODULES)
         warnings.showwarning = tell
-        yield spelled
+        yield spelled, notes
 
 
 def _told(error: Exception) -> str:

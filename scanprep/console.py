@@ -9,7 +9,7 @@ import os
 import platform
 import sys
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -182,9 +182,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None
-                 ) -> Path | None:
-    """Write `report.json` beside the output: command, settings, versions, figures, digests of all files written."""
+def write_report(outcome: Outcome, command: str, seconds: float, notes: Sequence[str] = (),
+                 written: Mapping[str, str] | None = None) -> Path | None:
+    """Write `report.json` beside the output: command, settings, versions, figures, what was noticed on the way, and
+    digests of all files written."""
     from .batch.ownership import report_path
     from .geometry import storage
 
@@ -193,7 +194,7 @@ def write_report(outcome: Outcome, command: str, seconds: float, written: Mappin
     path = report_path(outcome.output)
     storage.write_json(path, {
         "command": command, "seconds": round(seconds, 2), "versions": versions(),
-        "settings": outcome.settings, "failures": outcome.failures,
+        "settings": outcome.settings, "failures": outcome.failures, "notes": list(notes),
         "judgement": None if outcome.judgement is None else dataclasses.asdict(outcome.judgement),
         "metrics": [{"metric": m.name, "value": m.value, "unit": m.unit} for m in outcome.metrics],
         **({} if written is None else {"written": dict(written)})})

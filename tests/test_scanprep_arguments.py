@@ -1,13 +1,16 @@
 """The command line: help that reads well, errors in one line before anything is done, completion in the shell."""
+import json
 import re
 import subprocess
 import warnings
+from pathlib import Path
 
 import pytest
 
 from completion.__main__ import COMMANDS, main
 from scanprep import command_line
 from scanprep.console import Outcome
+from scanprep.judgement import Judgement
 
 PATHS = command_line.listed(COMMANDS, "scape")
 
@@ -112,16 +115,19 @@ def test_messages_of_python_name_flags(capsys, tmp_path):
 
 
 def test_notes_and_failures_name_flags_too(capsys):
-    def work(times: int = 2) -> Outcome:
+    """Notes are kept in the report."""
+    def work(output: Path, times: int = 2) -> Outcome:
         warnings.warn("a.bvh: 30 are assumed; say times=", stacklevel=1)
-        return Outcome(None, [], failures=["b.c3d: which of the two? say times=3"], judgement=None)
+        output.mkdir()
+        return Outcome(output, [], failures=["b.c3d: which of the two? say times=3"], judgement=Judgement())
 
-    work.__annotations__, work.__module__ = {"times": int}, "scanprep.tried"
+    work.__annotations__, work.__module__ = {"output": Path, "times": int}, "scanprep.tried"
     work.__globals__["__name__"], before = "scanprep.tried", work.__globals__["__name__"]
     try:
-        command_line.run(work, "scape work", [])
+        command_line.run(work, "scape work", ["--output", "out"])
     finally:
         work.__globals__["__name__"] = before
+    assert json.loads(Path("out/report.json").read_text())["notes"] == ["a.bvh: 30 are assumed; say --times"]
     said = capsys.readouterr().err
     assert "scape work: note: a.bvh: 30 are assumed; say --times\n" in said
     assert "scape work: failed: b.c3d: which of the two? say --times 3\n" in said

@@ -91,11 +91,30 @@ def test_shipped_files_need_no_folder(scans, template):
     there = dataclasses.replace(task, scan=Path("/no/such/body0.ply"), landmarks=Path("/no/such/body0.landmarks.json"))
     files = {there.scan: task.scan.read_bytes(), there.landmarks: task.landmarks.read_bytes()}
     assert cluster._files(task) == {task.scan: files[there.scan], task.landmarks: files[there.landmarks]}
-    figures, made = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
+    figures, made, _ = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
     assert figures.name == "body0" and set(made) == {"meshes/body0.ply"} and figures.distance < 0.001
     files[there.scan] = files[there.scan][:-9]
-    failed, made = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
+    failed, made, _ = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
     assert failed.reason.startswith("/no/such/body0.ply: ") and not made
+
+
+class Noticing:
+    """Work that says something of its file."""
+
+    def __call__(self, given, room):
+        (room.folder / "made.txt").write_text("")
+        warn_of(f"{given}: its rate is 0")
+
+
+def warn_of(text):
+    exec(compile("import warnings; warnings.warn(text, stacklevel=1)", "tried", "exec"),
+         {"__name__": "scanprep.tried", "text": text})
+
+
+def test_what_a_worker_noticed_is_told_here_with_our_paths(tmp_path):
+    path = Path("/no/such/walk.c3d")
+    shared, job = pickle.dumps((Noticing(), cluster._versions())), ("walk", "", path, {path: b"data"})
+    assert cluster.do_there(shared, pickle.dumps(job)) == (None, {"made.txt": b""}, [f"{path}: its rate is 0"])
 
 
 def test_no_scheduler(scans, template, tmp_path, monkeypatch):

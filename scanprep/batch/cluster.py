@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import pickle
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from ..geometry import storage
 from .digests import paths_of, version
-from .room import Failure, Job, attempt
+from .room import Failure, Job, attempt_elsewhere
 
 ANSWER = 10                    # seconds that a scheduler may take
 
@@ -75,10 +76,10 @@ def _seen_there(client: Any, given: Any) -> bool:
     return all(client.run(same, files).values())
 
 
-def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes]]]:
+def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes], list[str]]]:
     """What is sent to the workers. Dask sends a function without a name of its own as code, and all else are
     bytes, so that a scheduler needs nothing of ours."""
-    def there(shared: bytes, job: bytes) -> tuple[Any, dict[str, bytes]]:
+    def there(shared: bytes, job: bytes) -> tuple[Any, dict[str, bytes], list[str]]:
         from scanprep.batch.cluster import do_there
 
         return do_there(shared, job)
@@ -95,7 +96,9 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
     except CancelledError:
         raise ValueError(f"workers: {address} has gone; what was done is kept, start again to go on") from None
     if error is None:
-        value, files = future.result()
+        value, files, notes = future.result()
+        for note in notes:
+            warnings.warn(note, stacklevel=2)
         for name, data in files.items():
             path = storage.path_inside(job.folder, name, address)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -107,8 +110,8 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
                      f"{' '.join(str(error).split())}); expected {_described(_versions())} on every worker")
 
 
-def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes]]:
-    """One job on the machine of a worker: what the work returned, and the files that it wrote."""
+def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[str]]:
+    """One job on the machine of a worker: what the work returned, the files that it wrote, and our warnings."""
     work, versions = pickle.loads(shared)
     if versions != _versions():
         raise RuntimeError(f"the worker has {_described(_versions())}")
@@ -117,15 +120,16 @@ def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes]]:
         here = Path(temporary)
         paths = {} if sent is None else _unpacked(sent, here / "sent")
         job = Job(name, _with_paths(given, lambda path: paths.get(path, path)), here / "made", place, here / "steps")
-        outcome = attempt(work, job)
+        outcome, notes = attempt_elsewhere(work, job)
+        for theirs, mine in paths.items():
+            notes = [note.replace(str(mine), str(theirs)) for note in notes]
+            if isinstance(outcome, Failure):
+                outcome = Failure(outcome.reason.replace(str(mine), str(theirs)))
         if isinstance(outcome, Failure):
-            reason = outcome.reason
-            for theirs, mine in paths.items():
-                reason = reason.replace(str(mine), str(theirs))
-            return Failure(reason), {}
+            return outcome, {}, notes
         made = {path.relative_to(here / "made").as_posix(): path.read_bytes()
                 for path in sorted((here / "made").rglob("*")) if path.is_file()}
-    return outcome, made
+    return outcome, made, notes
 
 
 def _with_paths(value: Any, change: Callable[[Path], Path]) -> Any:

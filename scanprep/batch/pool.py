@@ -12,8 +12,7 @@ from typing import Annotated, Any, Generic, TypeVar, cast
 
 from ..ranges import FLAG, Processes, Settings
 from ..threads import begin_worker, helpers
-from ..words import OUR_MODULES
-from .room import Failure, Job, Progress, attempt
+from .room import Failure, Job, Progress, attempt, attempt_elsewhere
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -160,12 +159,7 @@ def _watch(parent: int) -> None:
 
 
 def _do(job: Job) -> tuple[Any, list[str]]:
-    """What the work returned, and our warnings, which the process that wants it tells."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=UserWarning, module=OUR_MODULES)
-        outcome = attempt(_work, job)
-    return outcome, [str(warning.message) for warning in caught]
+    return attempt_elsewhere(_work, job)
 
 
 def _call(item: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from urllib.parse import quote
 
 from ..geometry import storage
 from ..threads import one_thread
+from ..words import OUR_MODULES
 from .digests import Digests, paths_of
 from .values import load_header, load_value, save_value
 
@@ -112,6 +114,15 @@ def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:
             text = f"{type(error).__name__}: {text}"
         files = [str(path) for path in paths_of(job.given)] or [job.name]
         return Failure(text if any(file in text for file in files) else f"{files[0]}: {text}")
+
+
+def attempt_elsewhere(work: Any, job: Job) -> tuple[Any, list[str]]:
+    """The same on behalf of another process: with our warnings, for that one to tell."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module=OUR_MODULES)
+        outcome = attempt(work, job)
+    return outcome, [str(warning.message) for warning in caught]
 
 
 class Step(Protocol):

@@ -168,7 +168,7 @@ def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording],
             sequences.append(read_markers(recording.path, work.unit, recording.who, work.rate))
             found.append(recording)
         except ValueError as error:
-            failures.append(" ".join(str(error).replace(str(recording.path), recording.path.name).split()))
+            failures.append(" ".join(str(error).split()))
     if not sequences:
         raise ValueError("; ".join(failures))
     return found, sequences, failures
