@@ -112,7 +112,7 @@ def test_markers_on_wands_and_without_their_bars_are_the_same_person(model, layo
                                                if is_one}
     off = found.metrics(layout)[0]
     assert off.value == pytest.approx(1000 * distance, abs=6) and "skin" in off.name
-    assert not found.doubts(layout)
+    assert not found.judgement(layout).reasons
 
 
 def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):

@@ -252,7 +252,7 @@ def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out():
     floating[3] += [0.0, 0.0, 0.3]
     found = worn_otherwise(3, sequence(floating).positions[:, 3])
     assert found.worn.unplaced == ("M03",) and not found.worn.moved and not found.worn.exchanged
-    assert "M03" not in found.layout.labels and "M03" in found.worn.doubts(found.layout.labels)[0]
+    assert "M03" not in found.layout.labels and "M03" in found.worn.judgement(found.layout.labels).doubts[0]
     assert np.nanmean(found.motions[0].residuals) < 5e-3
     np.testing.assert_allclose(found.betas, beside().betas, atol=0.35)
 
@@ -267,9 +267,10 @@ def test_a_part_keeps_its_markers(share, verdict):
     found = _with_whole_parts(at, Worn(unplaced=(*gone, LABELS[-1])), MODEL.skeleton.names)
     (told,) = found.lost
     assert found.unplaced == (LABELS[-1],) and told == (MODEL.skeleton.names[part[0]], gone, verdict == "all")
-    why = found.problems() if verdict == "all" else found.doubts(LABELS)
+    judgement = found.judgement(LABELS)
+    why = judgement.reasons
     assert why[0].startswith(f"{verdict} markers of the {told[0]} ({', '.join(gone)})")
-    assert bool(found.problems()) == (verdict == "all")
+    assert judgement.verdict == ("failed" if verdict == "all" else "check")
 
 
 def test_a_marker_that_is_never_believed_is_left_out_of_the_mean():
@@ -297,13 +298,13 @@ def test_where_the_body_is_at_fault_no_marker_is_moved():
     order = np.random.default_rng(0).permutation(26)
     markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)
     found = find_worn(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
-    assert not found.changes and len(found.too_many) > 7 and "the wrong layout" in found.doubts(LABELS)[0]
+    assert not found.changes and len(found.too_many) > 7 and "the wrong layout" in found.judgement(LABELS).doubts[0]
 
 
 def test_a_marker_moved_by_more_than_a_hand_is_to_be_looked_at():
     moved = [MovedMarker(label, np.arange(3), np.eye(3)[0], 0.01, before, 0.01) for label, before in
              (("M1", 0.07), ("M2", 0.31))]
-    (told,) = Worn(moved=tuple(moved)).doubts(LABELS)
+    (told,) = Worn(moved=tuple(moved)).judgement(LABELS).doubts
     assert told == "moved by more than a hand's width: M2 by 31 cm"
 
 

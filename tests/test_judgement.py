@@ -479,8 +479,8 @@ def test_the_size_of_a_body_far_from_its_markers_is_told_last():
 def test_a_recording_whose_sides_are_all_exchanged_may_be_mirrored():
     labels = ("LSHO", "RSHO", "LELB", "RELB", "LKNE", "RKNE", "C7")
     pairs = tuple(zip(labels[:6:2], labels[1:6:2], strict=True))
-    assert "mirrored recording" in Worn(exchanged=pairs).doubts(labels)[0]
-    assert Worn(exchanged=pairs[:1]).doubts(labels) == ()                  # two labels mixed up are put back
+    assert "mirrored recording" in Worn(exchanged=pairs).judgement(labels).doubts[0]
+    assert Worn(exchanged=pairs[:1]).judgement(labels).doubts == ()                  # two labels mixed up are put back
 
 
 def test_what_cannot_be_measured_for_its_size_is_told_so(monkeypatch):

@@ -83,11 +83,11 @@ class Work:
         sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
-        body, found, worn, doubts = self.subject, None, Worn(), tuple[str, ...]()
+        body, found, worn, placed = self.subject, None, Worn(), Judgement()
         if body is None:
             usual = layout
             sequence, found, worn = self._person(sequence, layout, room)
-            doubts += found.doubts(usual)
+            placed = found.judgement(usual)
             body, layout = self.model.subject(found.betas), found.layout
             metrics += [Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"),
                         *worn.metrics(), *found.metrics(usual)]
@@ -102,8 +102,8 @@ class Work:
             layout.save(output / "layout.json")
         covered = find_coverage(body, layout, [motion], [sequence])
         problem = motion_problem(motion, body.template, layout, sequence)
-        doubts = (*motion_doubts([motion], [sequence], body.template), *worn.doubts(sequence.labels), *doubts)
-        judgement = covered.judgement().joined(Judgement.of([*filter(None, [problem]), *worn.problems()], doubts))
+        moving = Judgement.of(problem, motion_doubts([motion], [sequence], body.template))
+        judgement = covered.judgement().joined(moving, worn.judgement(sequence.labels), placed)
         if found is not None:
             judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *figures(motion)]

@@ -126,9 +126,9 @@ class _Found:
         motions = [take.motion for take in takes]
         problems = [(f"{take.name}: " if several else "") + why for take in takes if (why := motion_problem(
             take.motion, take.subject.template, result.layout, take.markers))]
-        doubts = (*motion_doubts(motions, [take.markers for take in takes], body),
-                  *result.worn.doubts(self.usual.labels), *result.person.doubts(self.usual))
-        own = self.covered.judgement().joined(Judgement.of([*problems, *result.worn.problems()], doubts))
+        moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body))
+        own = self.covered.judgement().joined(moving, result.worn.judgement(self.usual.labels),
+                                              result.person.judgement(self.usual))
         return judge_motions(self.person, own, motions, body)
 
 

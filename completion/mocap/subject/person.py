@@ -1,7 +1,7 @@
 """The first stage of [MoSh]: the shape of a person and where the markers really sit, from some frames."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,6 +12,7 @@ from scanprep.batch.room import Step, once
 from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
+from scanprep.judgement import Judgement
 from scanprep.threads import one_thread
 
 from ...motion import Progress
@@ -78,11 +79,17 @@ class PersonFit:
         return [Metric(f"not at the layout's distance from the skin ({', '.join(off)})",
                        1000 * float(np.mean(list(off.values()))), "mm")] if off else []
 
-    def doubts(self, usual: MarkerLayout) -> tuple[str, ...]:
-        """Reasons to look at a person: markers that were moved by more than a hand's width."""
-        far = [f"{label} by {100 * moved:.0f} cm" for label, moved in zip(self.layout.labels, self.moved, strict=True)
-               if moved > HAND_WIDTH and label not in usual.loose]
-        return (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
+    def judgement(self, usual: MarkerLayout) -> Judgement:
+        """What a person is worth by where the markers were found on the body; loose ones may be anywhere."""
+        return Judgement.of(check=far_moved({label: moved for label, moved in
+                                             zip(self.layout.labels, self.moved, strict=True)
+                                             if label not in usual.loose}))
+
+
+def far_moved(moves: Mapping[str, float]) -> list[str]:
+    """A reason to look at a person where markers, label -> metres, were moved by more than a hand's width."""
+    far = [f"{label} by {100 * moved:.0f} cm" for label, moved in moves.items() if moved > HAND_WIDTH]
+    return [f"moved by more than a hand's width: {', '.join(far)}"] if far else []
 
 
 @one_thread()

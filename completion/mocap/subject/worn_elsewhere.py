@@ -14,6 +14,7 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 from scanprep.words import number_of
 
 from ..files.markers import MarkerSequence
@@ -21,7 +22,7 @@ from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
 from .frame_starts import mean_person, stand_off, start_frames
 from .latent_fit import distance_reach
-from .person import HAND_WIDTH, PersonConfig, PersonFit, common_markers, find_person
+from .person import PersonConfig, PersonFit, common_markers, far_moved, find_person
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
 FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
@@ -100,22 +101,21 @@ class Worn:
                 *(Metric(f"{'all' if whole else 'most'} markers of the {part} far from the layout's places",
                          ", ".join(labels)) for part, labels, whole in self.lost)]
 
-    def problems(self) -> tuple[str, ...]:
-        """Why what was found with these markers means nothing."""
-        return tuple(_at_fault("all", part, labels) for part, labels, whole in self.lost if whole)
-
-    def doubts(self, labels: Sequence[str]) -> tuple[str, ...]:
-        """Reasons to look at what was found with these markers, of all `labels` of a recording."""
-        sides = sum(i < j for i, j in enumerate(label_pairs(labels)))
-        mirrored = (f"left and right of {len(self.exchanged)} of {number_of(sides, 'pair')} of markers were exchanged "
-                    "and put back: labels of the other side, or a mirrored recording, which is to be mirrored first?"
-                    ,) if 2 * len(self.exchanged) > sides else ()
-        told = ((self.unplaced, "not worn where the layout says, and found nowhere: left out"),
-                (self.too_many, "far from where the layout says: the wrong layout, or the wrong body?"))
-        far = [f"{m.label} by {100 * m.before:.0f} cm" for m in self.moved if m.before > HAND_WIDTH]
-        moved: tuple[str, ...] = (f"moved by more than a hand's width: {', '.join(far)}",) if far else ()
-        moved += tuple(_at_fault("most", part, names) for part, names, whole in self.lost if not whole)
-        return (*mirrored, *moved, *(f"{', '.join(some)} {words}" for some, words in told if some))
+    def judgement(self, labels: Sequence[str]) -> Judgement:
+        """What is worth what was found with these markers, of all `labels` of a recording."""
+        sides, check = sum(i < j for i, j in enumerate(label_pairs(labels))), list[str]()
+        if 2 * len(self.exchanged) > sides:
+            check.append(f"left and right of {len(self.exchanged)} of {number_of(sides, 'pair')} of markers were "
+                         "exchanged and put back: labels of the other side, or a mirrored recording, which is to be "
+                         "mirrored first?")
+        check += far_moved({m.label: m.before for m in self.moved})
+        check += [_at_fault("most", part, names) for part, names, whole in self.lost if not whole]
+        if self.unplaced:
+            check.append(f"{', '.join(self.unplaced)} not worn where the layout says, and found nowhere: left out")
+        if self.too_many:
+            check.append(f"{', '.join(self.too_many)} far from where the layout says: the wrong layout, or the wrong "
+                         "body?")
+        return Judgement.of([_at_fault("all", part, names) for part, names, whole in self.lost if whole], check)
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""
