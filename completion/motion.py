@@ -105,9 +105,12 @@ class Motion:
                       trusted=none.astype(bool))
 
     @staticmethod
-    def load(path: str | Path) -> Motion:
-        """Read a file of `save`, or a body-model motion file of the same kind from elsewhere."""
-        stored = read_motion_file(path, OF_MARKERS)
+    def load(path: str | Path, rate: float | None = None) -> Motion:
+        """Read a file of `save`, or a body-model motion file of the same kind from elsewhere.
+
+        `rate` is frames a second, where the file does not say or says it wrongly.
+        """
+        stored = read_motion_file(path, OF_MARKERS, rate=rate)
         check_ours(path, stored, f"; scape animate {Path(path).name} -m MODEL -o OUT puts it on a model")
         with storage.taking_apart(path, "a whole motion"):
             return _restored(stored)

@@ -9,6 +9,7 @@ from viewing_apps import a_motion, app_of, open_app, seen, write_files
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.motion import Motion
 from completion.viewing.contents import Stance
+from completion.viewing.files import Files
 from completion.viewing.motions import as_columns
 from scanprep.geometry import rotations
 from scanprep.viewer.server import Server
@@ -89,6 +90,12 @@ def test_a_motion_plays(files, page, model):
         frame = page.evaluate("program.figure.frameOf(program.figure.panes[0].layers[0])")
         assert np.abs(seen(page) - bodies[frame]).max() < 2e-3
     assert not [error for error in page.errors if "ERR_CONNECTION" not in error]
+
+
+def test_motions_and_recordings_play_at_the_rate_that_is_said(files, tmp_path):
+    write_markers(tmp_path / "walk.csv", MarkerSequence(np.ones((3, 3, 3)), ("A", "B", "C"), 50.0))
+    known = Files((files / "wave.npz", tmp_path / "walk.csv"), files / "worm.npz", rate=20.0)
+    assert [entry.load().shapes[0].rate for entry in known.entries()] == [20.0, 20.0]
 
 
 def test_a_recording_at_another_rate_keeps_the_time(files, tmp_path, page, model):

@@ -210,6 +210,8 @@ def test_the_command_writes_what_the_name_says(files, model, rig, motion):
     assert np.abs(read_mesh(files / "a.ply", "m").vertices - model.vertices(np.zeros((4, 3)))).max() < 1e-12
     figures = exported(files, "slow.glb", "--motion", str(files / "motion.npz"), "--up", "y", "--fps", "2")
     assert figures["frames"] == 3
+    figures = exported(files, "fast.bvh", "--motion", str(files / "motion.npz"), "--up", "y", "--rate", "50")
+    assert figures["frames"] == 5 and "Frame Time: 0.02" in (files / "fast.bvh").read_text()
     assert exported(files, "frames", "--motion", str(files / "motion.npz"))["meshes"] == 5
     assert len(list((files / "frames").glob("*.ply"))) == 5
 

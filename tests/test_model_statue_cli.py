@@ -125,7 +125,8 @@ def test_a_walk_moves_the_statue(made, tmp_path):
     assert body.is_closed and 1.6 < np.ptp(body.vertices, axis=0).max() < 1.9
     # the motion that was written is one of the statue's own parts, and gives the same meshes again
     assert run("animate", made / "statue", tmp_path / "walking" / "motion.npz", "-o", tmp_path / "again", "--level", 1,
-               "--meshes") == 0
+               "--meshes", "--rate", 24) == 0
+    assert figures(tmp_path / "again" / "report.json")["rate"] == 24.0
     again = read_mesh(tmp_path / "again" / "meshes" / "00003.ply")
     assert np.abs(again.vertices - body.vertices).max() < 1e-6
 

@@ -7,6 +7,7 @@ from typing import Annotated
 from scanprep.arguments import Alias, Place
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, say
+from scanprep.ranges import Positive
 from scanprep.viewer.cli import Port
 
 from ..cli import ModelOrNone
@@ -15,7 +16,8 @@ FilesArg = Annotated[tuple[Path, ...], Place("[FILE ...]")]
 
 
 def view_files(files: FilesArg = (), model: ModelOrNone = None, over: bool = False, unit: Unit | None = None,
-               serve: Port | None = None, save_in: Annotated[Path, Alias("-o")] = Path()) -> Outcome:
+               rate: Positive | None = None, serve: Port | None = None,
+               save_in: Annotated[Path, Alias("-o")] = Path()) -> Outcome:
     """Look at meshes, scans, models, motions and results in the browser, and move models by sliders.
 
     Example: scape view scan.ply completed -m model.npz
@@ -31,6 +33,7 @@ def view_files(files: FilesArg = (), model: ModelOrNone = None, over: bool = Fal
         model: Model of motions that do not tell theirs.
         over: Lay everything over each other instead of side by side.
         unit: Unit of meshes, points, landmarks and markers.
+        rate: Frames a second of motions and markers, where files do not say or say it wrongly.
         serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
             to reach it is printed.
         save_in: Folder for bodies, poses and completions that are saved; files that are there stay.
@@ -41,7 +44,7 @@ def view_files(files: FilesArg = (), model: ModelOrNone = None, over: bool = Fal
     from .app import ViewApp
     from .files import Files
 
-    known = Files(files, model, unit, over)
+    known = Files(files, model, unit, over, rate)
     app = ViewApp(known.entries(), over, save_in, known)
     for problem in app.problems.values():
         say(f"scape view: note: {problem}")

@@ -65,11 +65,13 @@ class Files:
         Of meshes, points, landmarks and markers.
     over : bool
         Recordings of markers are shown with the motions that were made of them, not by themselves.
+    rate : float, optional
+        Frames a second of motions and markers, where files do not say or say it wrongly.
     """
 
     def __init__(self, paths: tuple[Path, ...] = (), model: Path | None = None, unit: Unit | None = None,
-                 over: bool = False) -> None:
-        self.paths, self.model, self.unit, self.over = paths, model, unit, over
+                 over: bool = False, rate: float | None = None) -> None:
+        self.paths, self.model, self.unit, self.over, self.rate = paths, model, unit, over, rate
         self._models: dict[Path, BodyModel] = {}
         self._found: list[Path] = []                     # models among the files
         self._recordings: list[Path] = []                # of markers, to be laid over motions
@@ -144,7 +146,7 @@ class Files:
             "model": lambda: of_model(name, self.read_model(path)),
             "motion": lambda: told(lambda: self._motion(path, name)),
             "completion": lambda: of_completion(name, load_completion(path.parent)),
-            "markers": lambda: told(lambda: of_markers(name, read_recording(path, self.unit))),
+            "markers": lambda: told(lambda: of_markers(name, read_recording(path, self.unit, self.rate))),
             "surface": lambda: told(lambda: self._surface(path, name)),
             "picture": lambda: from_camera(self._surface(path, name))}
         if kind not in loads:
@@ -238,11 +240,11 @@ class Files:
 
     def _on_model(self, path: Path) -> tuple[Motion, BodyModel, tuple[str, ...]]:
         """A motion on its model, or on the one that was named; of another skeleton what is to be told."""
-        if path.suffix.lower() == ".bvh" or read_motion_file(path).of_family:
+        if path.suffix.lower() == ".bvh" or read_motion_file(path, rate=self.rate).of_family:
             model = self._model_of(path)
-            found = read_motion(path, model, unit=self.unit)
+            found = read_motion(path, model, unit=self.unit, rate=self.rate)
             return Motion.of(found), model, tuple(f"{path.name}: {m.name} {m.value}" for m in found.told)
-        motion = Motion.load(path)
+        motion = Motion.load(path, self.rate)
         model = self._model_of(path, motion)
         parts = len(model.skeleton.parents)
         if motion.poses.shape[1] != parts:
@@ -258,7 +260,7 @@ class Files:
         virtual = path.with_name("virtual.c3d")
         tried = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
         for file, unit in [*tried, *((one, self.unit) for one in self._recordings if self.over)]:
-            markers = read_recording(file, unit)
+            markers = read_recording(file, unit, self.rate)
             if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= ENOUGH:
                 return markers
         return None

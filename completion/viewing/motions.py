@@ -74,14 +74,14 @@ def marker_dots(markers: MarkerSequence) -> Dots:
     return Dots(markers.positions[0], MARKER, 0.013, name="markers")
 
 
-def read_recording(path: Path, unit: str | None) -> MarkerSequence:
+def read_recording(path: Path, unit: str | None, rate: float | None = None) -> MarkerSequence:
     """The markers of all people in a file, labels with the name of each where there are several; played with a usual
     rate where the file does not say its own.
     """
     people = marker_subjects(path)
     if len(people) < 2:
-        return read_markers(path, unit, usual_rate=USUAL_RATE)
-    each = [read_markers(path, unit, who, usual_rate=USUAL_RATE) for who in people]
+        return read_markers(path, unit, rate=rate, usual_rate=USUAL_RATE)
+    each = [read_markers(path, unit, who, rate, USUAL_RATE) for who in people]
     labels = [f"{who}:{label}" for who, one in zip(people, each, strict=True) for label in one.labels]
     return MarkerSequence(np.concatenate([one.positions for one in each], axis=1), tuple(labels), each[0].rate)
 

@@ -35,18 +35,18 @@ from .usd import USD, write_points_usd, write_skinned_usd
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
-_BONES = _PLACED | {"motion", "fps", "root", "names"}
+_BONES = _PLACED | {"motion", "fps", "rate", "root", "names"}
 _TAKES = {"glb": _BONES | {"morphs", "correctives"}, "usd": _BONES | {"morphs", "correctives"},
-          "point cache": {"betas", "own_body", "motion", "fps", "up"}, "bvh": _BONES | {"unit"},
-          "npz": {"motion", "fps"},
-          "mesh": _PLACED, "folder": {"betas", "own_body", "motion", "fps"}}
+          "point cache": {"betas", "own_body", "motion", "fps", "rate", "up"}, "bvh": _BONES | {"unit"},
+          "npz": {"motion", "fps", "rate"},
+          "mesh": _PLACED, "folder": {"betas", "own_body", "motion", "fps", "rate"}}
 
 
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
            motion: Path | None = None, shapes: Annotated[int | None, Called("--morphs")] = None,
            correctives: int | None = None, unit: Unit | None = None, up: Literal["x", "y", "z"] | None = None,
            root: str | None = None, names: Names | None = None, ground: bool = False, front: bool = False,
-           fps: Positive | None = None) -> Outcome:
+           fps: Positive | None = None, rate: Positive | None = None) -> Outcome:
     """Write a model for other programs; what is written follows from the name of the output.
 
     OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
@@ -77,17 +77,18 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         ground: Soles on height 0, of the body and of the lowest frame.
         front: Face to the viewer: +z in GLB, USD and BVH, -y of a mesh with z up.
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
+        rate: Frames a second of the motion's file, where it does not say or says it wrongly.
     """
     kind, axis = _kind(output), None if up is None else "xyz".index(up)
     _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "morphs": shapes,
                             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
-                            "names": names, "ground": ground, "front": front, "fps": fps})
+                            "names": names, "ground": ground, "front": front, "fps": fps, "rate": rate})
     loaded = load_model(model)
     judgement = person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement()
     if kind == "npz" and motion is None:
         return Outcome(output, _npz(output, loaded), judgement=judgement)
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
-    moves = None if motion is None else read_motion(motion, loaded, chosen)
+    moves = None if motion is None else read_motion(motion, loaded, chosen, rate=rate)
     if moves is not None and fps is not None:
         moves = moves.at_rate(fps)
     if kind == "npz":

@@ -49,7 +49,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Annotated[Path, Called("--moti
     if not np.array_equal(mesh.faces, loaded.template.faces):
         raise ValueError(f"{body}: expected the triangles of the model ({loaded.template}), found {mesh}; "
                          "register the template to it first (scape prep register)")
-    moves = read_motion(poses, loaded)
+    moves = read_motion(poses, loaded, rate=1.0)            # meshes have none
     found = own_body(loaded, mesh.vertices)
     with bar("writing meshes") as progress:
         written = write_frames(output, found.subject, moves.poses, moves.trans, progress=progress)

@@ -269,7 +269,8 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
 
 
 def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | None = None,
-            registered: Path | None = None, level: LevelArg = 2, meshes: bool = False) -> Outcome:
+            registered: Path | None = None, rate: Positive | None = None, level: LevelArg = 2, meshes: bool = False
+            ) -> Outcome:
     """A statue in motion: its skeleton moves the control mesh, the detail stands on the moving normals.
 
     The motion is BVH; or .npz of the synthetic people, or of the statue's own body.npz, as scape animate writes it from
@@ -284,6 +285,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         output: Folder to write: statue.glb, motion.npz, motion.gif, and meshes on demand.
         model: Learned model (.npz) that the control mesh follows.
         registered: The model's template on the scan, in its triangles; else it is brought there.
+        rate: Frames a second, where the motion's file does not say or says it wrongly.
         level: Level of detail of the files.
         meshes: Write the exact mesh of every frame.
     """
@@ -294,8 +296,8 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     if model is None:
         if registered is not None:
             raise UsageError("--registered: expected --model with it")
-        moved = read_statue_motion(loaded, motion)
-        bodies, rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
+        moved = read_statue_motion(loaded, motion, rate)
+        bodies, of_file = control.rig.vertices(moved.poses, moved.trans), moved.rate
         output.mkdir(parents=True, exist_ok=True)
         write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
                          motion=moved, up=up)
@@ -303,22 +305,22 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         rows = [Metric("joints that follow the motion", len(moved.matched)),
                 *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
     else:
-        bodies, rate = _following(loaded, motion, model, registered)
+        bodies, of_file = _following(loaded, motion, model, registered, rate)
         step = max(1, len(bodies) // 120)
         write_animated_glb(output / "statue.glb", fine.faces, np.stack([detailed(body) for body in bodies[::step]]),
-                           rate / step, up=up)
+                           of_file / step, up=up)
         rows = [Metric("follows", str(model))]
     shown = bodies[::max(1, len(bodies) // 24)]
     with bar("rendering") as progress:
         write_gif(output / "motion.gif", motion_pictures(loaded, detailed, shown, progress),
-                  rate * len(shown) / len(bodies))
+                  of_file * len(shown) / len(bodies))
     if meshes:
         with bar("writing meshes") as progress:
             for t, body in enumerate(bodies):
                 write_mesh(output / "meshes" / f"{t:05d}.ply", detailed.mesh(body))
                 progress(t + 1, len(bodies))
     inverted = [len(inverted_triangles(control, body, fine, detailed(body))) for body in shown]
-    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", rate, "1/s"), *rows,
+    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", of_file, "1/s"), *rows,
                             Metric("inverted triangles in a frame, most", max(inverted))], {"level": level},
                    judgement=_judge_motion(max(inverted) / len(fine.faces)))
 
@@ -329,10 +331,11 @@ def _judge_motion(inverted: float) -> Judgement:
                                "what the skin can follow"] if inverted > CRUMPLED else [])
 
 
-def _following(statue: Statue, motion: Path, model: Path, registered: Path | None) -> tuple[np.ndarray, float]:
+def _following(statue: Statue, motion: Path, model: Path, registered: Path | None, rate: float | None
+               ) -> tuple[np.ndarray, float]:
     """The control mesh (T, N, 3) in a motion of a learned model, and its rate."""
     learned = load_model(model)
-    moves = read_motion(motion, learned)
+    moves = read_motion(motion, learned, rate=rate)
     there = None
     if registered is not None:
         body = read_mesh(registered)

@@ -33,15 +33,18 @@ from ..detail.reconstruction import Reconstruction
 from ..detail.subdivision import subdivide
 
 
-def read_statue_motion(statue: Statue, path: Path) -> Retargeted:
-    """A motion for the skeleton of a statue: BVH, AMASS, or `.npz` of its own parts or of the synthetic people."""
+def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) -> Retargeted:
+    """A motion for the skeleton of a statue: BVH, AMASS, or `.npz` of its own parts or of the synthetic people.
+
+    `rate` is frames a second, where the file does not say or says it wrongly.
+    """
     control, people = statue.control, 16
     if path.suffix.lower() == ".bvh":
-        return _named(path, bvh_motion, control, statue.pose, read_bvh(path, "cm"))   # travel is scaled by the legs
-    stored = read_motion_file(path)
+        return _named(path, bvh_motion, control, statue.pose, read_bvh(path, "cm", rate))   # travel: by the legs
+    stored = read_motion_file(path, rate=rate)
     count, own = stored.poses.shape[1], len(control.skeleton.parents)
     if count == own:
-        return own_motion(control, path)
+        return own_motion(control, path, rate)
     if stored.of_family:
         return _named(path, bvh_motion, control, statue.pose, moving_body(stored)[0])
     if count != people:
@@ -58,14 +61,14 @@ def _named(path: Path, make: Callable[..., Retargeted], *given: object) -> Retar
         raise StorageError(f"{path}: {problem}") from None
 
 
-def own_motion(control: ControlModel, path: str | Path) -> Retargeted:
+def own_motion(control: ControlModel, path: str | Path, rate: float | None = None) -> Retargeted:
     """A motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
 
     In such files trans is the travel of the middle of part 0, as body models place themselves; here that of the root's
     joint, as in a rig. Skinning moves the one a little against the other.
     """
     J, names = len(control.skeleton.parents), control.skeleton.names
-    stored = read_motion_file(path)
+    stored = read_motion_file(path, rate=rate)
     with taking_apart(path, f"a motion of the statue's {J} parts"):
         poses, trans = check_motion(control.skeleton, stored.poses, stored.trans, stored.rate)
         return Retargeted(poses, trans - middle_drift(control, poses), stored.rate,
