@@ -7,7 +7,7 @@ from scene_reader import SceneReader, scenes_of
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures import scene as scenes
-from scanprep.pictures.camera import Camera, look_around
+from scanprep.pictures.camera import Camera, look_around, stance
 from scanprep.pictures.low_rank import TOLERANCE, low_rank
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, framed_alike, pack_scene, picture_panes, small_scene, worst_that_turn
@@ -224,6 +224,15 @@ def test_the_worst_turn_as_long_as_there_is_room(tmp_path, monkeypatch):
     for path in paths[1:]:
         path.write_bytes(b"0123456789")
     assert [one is not None for one in worst_that_turn(paths)] == [False, True, True, False, False]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("points", "faces"), [
+    (np.ones((1, 3)), []), (np.ones((3, 3)), [[0, 1, 2]]), (np.eye(3)[:1] * np.arange(3.0)[:, None], [[0, 1, 2]])])
+def test_a_point_and_a_line_have_a_stance_too(points, faces):
+    """One marker, or a scan of which nothing is left but a sliver, can be looked at."""
+    up, ahead = stance(Mesh(points, np.array(faces, dtype=int).reshape(-1, 3)))
+    assert abs(np.linalg.norm(up) - 1) < 1e-12 and abs(np.linalg.norm(ahead) - 1) < 1e-12 and abs(up @ ahead) < 1e-12
 
 
 @pytest.mark.parametrize("turn", [np.zeros(3), [0, 0, 2.0], [0.5, 0, 0.4], [-np.pi / 2, 0, 0], [np.pi / 2, 0, 0],

@@ -114,9 +114,11 @@ def upright(mesh: Mesh) -> tuple[int, float]:
     """
     extent = np.ptp(mesh.vertices, axis=0)
     up = tallest(mesh.vertices)
+    if extent[up] == 0:                                                     # a point has no front
+        return up, 0.0
     height = (mesh.vertices[:, up] - mesh.vertices[:, up].min()) / extent[up]
     flat = mesh.vertices[:, [(up + 1) % 3, (up + 2) % 3]]
-    weights = mesh.vertex_areas if len(mesh.faces) else np.ones(len(flat))
+    weights = mesh.vertex_areas if len(mesh.faces) and mesh.face_areas.any() else np.ones(len(flat))
     _, directions = np.linalg.eigh(np.cov(flat.T, aweights=weights))
     forward, across = directions[:, 0], flat @ directions[:, 1]
     low = height < 0.1
