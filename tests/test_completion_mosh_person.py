@@ -12,10 +12,11 @@ from completion.mocap.mosh.mosh import PoseConfig
 from completion.mocap.pose.robust import hardly_believed, markers_told
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
-from completion.mocap.subject.person import choose_frames, common_markers
+from completion.mocap.subject.person import choose_frames, common_markers, judge_moves
 from completion.mocap.subject.worn_elsewhere import MovedMarker, Worn, _Frames, _with_whole_parts, find_worn
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
+from scanprep.judgement import Judgement
 
 MODEL = worm_with_prior()
 BETAS = np.array([1.4, -1.1, 0.8])
@@ -306,6 +307,13 @@ def test_a_marker_moved_by_more_than_a_hand_is_to_be_looked_at():
              (("M1", 0.07), ("M2", 0.31))]
     (told,) = Worn(moved=tuple(moved)).judgement(LABELS).doubts
     assert told == "moved by more than a hand's width: M2 by 31 cm"
+
+
+def test_a_quarter_of_the_markers_moved_by_more_than_a_hand_means_nothing():
+    moves = {label: 0.09 for label in LABELS[:7]}
+    failed = judge_moves(moves, 27)
+    assert failed.verdict == "failed" and failed.why.startswith("7 of 27 markers moved by more than a hand's width")
+    assert judge_moves(moves, 28).verdict == "check" and judge_moves(dict.fromkeys(LABELS, 0.07), 26) == Judgement()
 
 
 def test_markers_in_their_places_are_let_be():

@@ -22,7 +22,7 @@ from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
 from .frame_starts import mean_person, stand_off, start_frames
 from .latent_fit import distance_reach
-from .person import PersonConfig, PersonFit, common_markers, far_moved, find_person
+from .person import PersonConfig, PersonFit, common_markers, find_person, judge_moves
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
 FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
@@ -108,14 +108,14 @@ class Worn:
             check.append(f"left and right of {len(self.exchanged)} of {number_of(sides, 'pair')} of markers were "
                          "exchanged and put back: labels of the other side, or a mirrored recording, which is to be "
                          "mirrored first?")
-        check += far_moved({m.label: m.before for m in self.moved})
         check += [_at_fault("most", part, names) for part, names, whole in self.lost if not whole]
         if self.unplaced:
             check.append(f"{', '.join(self.unplaced)} not worn where the layout says, and found nowhere: left out")
         if self.too_many:
             check.append(f"{', '.join(self.too_many)} far from where the layout says: the wrong layout, or the wrong "
                          "body?")
-        return Judgement.of([_at_fault("all", part, names) for part, names, whole in self.lost if whole], check)
+        parts = [_at_fault("all", part, names) for part, names, whole in self.lost if whole]
+        return judge_moves({m.label: m.before for m in self.moved}, len(labels)).joined(Judgement.of(parts, check))
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""
