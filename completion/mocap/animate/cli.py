@@ -48,13 +48,17 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     A motion of another skeleton is BVH, or AMASS (.npz): segments point where they pointed, travel is as long as the
     legs are, and the report says how far joint centres and segments are off. scape animate walk.bvh -m model.npz -o out
 
+    Key poses are a table (.csv) with the columns time, in seconds, and PART_rx, PART_ry, PART_rz, in degrees, as
+    joint_angles.csv has them, and trans_x, trans_y, trans_z, in metres, if the body moves. Parts without columns stay
+    at rest, empty cells are no key. scape animate keys.csv -m model.npz -o out
+
     Written are motion.npz (poses, trans, betas, rate), animation.glb, motion.bvh, joint_angles.csv (rotation vectors
     of every part against its parent, in degrees), joint_centres.csv (metres), residuals.csv, for OpenSim motion.trc
     (markers, joint centres) and motion.mot (ISB joint angles), and report.html; of a subject that was found also
     subject.json and layout.json, with loose markers where they are on this person.
 
     Args:
-        markers: C3D, TRC, CSV or TSV of markers, BVH or .npz of a motion, or a folder of these.
+        markers: C3D, TRC, CSV or TSV of markers, BVH or .npz of a motion, CSV of key poses, or a folder of these.
         output: Folder to write to.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         layout: Where the markers sit: cmu41, plugingait39, biomech57, helenhayes29, or a JSON file {"markersets":
@@ -63,12 +67,12 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             from, betas in JSON or .npz, or a mesh in the model's triangles. Without it "markers" where the model has
             betas.
         unit: Unit of the markers, where the file cannot tell; of a BVH, else cm.
-        rate: Frames a second, where the file does not say or says it wrongly.
+        rate: Frames a second, where the file does not say or says it wrongly; of key poses, else 30.
         subject_prefix: Whose markers, in a file with several people: what stands before the colon of their labels.
             Several, as Head,Trunk, are of one person.
         retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
-        betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
-            {"0": [...], "2.5": [...]}: morph.glb.
+        betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], keys in seconds
+            {"0": [...], "2.5": [...]}, or [[b1, b2, ...], ...] of every frame: morph.glb.
         config: Settings.
         person: Settings of the person from markers.
         workers: Who works through the files of a folder.
@@ -150,8 +154,10 @@ def _subject(model: BodyModel, given: str | None, unit: Unit | None) -> Subject 
 
 
 def read_betas_to(path: Path, n_betas: int) -> BetasTo:
-    """Betas at the end, [b1, b2, ...] or {"betas": [...]}, or keys {"seconds": [b1, b2, ...]}, from JSON."""
-    wanted = 'betas at the end, [b1, b2, ...], or keys {"0": [b1, ...], "2.5": [...]} in seconds'
+    """Betas from JSON: at the end, [b1, b2, ...] or {"betas": [...]}; keys {"seconds": [b1, b2, ...]}; or of every
+    frame, [[b1, b2, ...], ...]."""
+    wanted = ('betas at the end, [b1, b2, ...], keys {"0": [b1, ...], "2.5": [...]} in seconds, or [[b1, ...], ...] '
+              "of every frame")
     tree = read_json(path, wanted)
     keyed = isinstance(tree, dict) and "betas" not in tree
     try:
@@ -159,7 +165,8 @@ def read_betas_to(path: Path, n_betas: int) -> BetasTo:
                  (tree if keyed else {0: tree["betas"] if isinstance(tree, dict) else tree}).items()}
     except (TypeError, ValueError, KeyError, OverflowError):
         found = {}
-    if not found or any(b.ndim != 1 or len(b) > n_betas or not np.isfinite(b).all() for b in found.values()):
+    if not found or any(b.ndim not in ((1,) if keyed else (1, 2)) or not b.size or b.shape[-1] > n_betas
+                        or not np.isfinite(b).all() for b in found.values()):
         raise ValueError(f"{path}: expected {wanted}, at most {n_betas} betas each")
     for betas in found.values():
         BETAS.check(betas, f"{path}: betas")

@@ -22,6 +22,7 @@ from scanprep.pictures.shading import Dots
 from ...motion import Motion
 from ...motion_pictures import MARKER, chart_residuals, frame_panes, moving_pane, played, worst_frames
 from ..files.motion_files import write_glb, write_motion, write_residuals
+from .keys import holds_keys, judge_keys, read_keys
 
 ENDINGS = (".bvh", ".npz")
 MEAN_DISTANCE = "distance of joint centres, mean"
@@ -29,24 +30,31 @@ MEAN_DISTANCE = "distance of joint centres, mean"
 
 def is_motion(path: Path) -> bool:
     """Whether a file is to be read as a motion, not as markers."""
-    return path.suffix.lower() in ENDINGS
+    return path.suffix.lower() in ENDINGS or holds_keys(path)
 
 
 def motion_among(path: Path) -> bool:
     """Whether a file of a folder is a motion; archives of other things may lie there."""
     try:
-        return path.suffix.lower() == ".bvh" or (is_motion(path) and holds_poses(path))
+        return path.suffix.lower() == ".bvh" or (path.suffix.lower() in ENDINGS and holds_poses(path))
     except StorageError:
         return False
 
 
 def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, rate: float | None,
           room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
-    """Bring a motion onto a body and write it into the folder of a room; the figures, and the page to be written."""
-    found = read_motion(path, model, subject, unit, rate)
-    body = subject if subject is not None else model.subject(found.betas)
+    """Bring a motion or keys onto a body and write it into the folder of a room; the figures, and the page to be
+    written."""
+    if holds_keys(path):
+        body = subject if subject is not None else model.subject(np.zeros(1) if model.n_betas else None)
+        found = read_keys(path, body, unit, rate)
+        judgement = judge_keys(found.poses)
+    else:
+        found = read_motion(path, model, subject, unit, rate)
+        body = subject if subject is not None else model.subject(found.betas)
+        judgement = judged(found.fit)
     motion = Motion.of(found)
-    metrics = [judgement_row(judged(found.fit)), Metric("model", name), *figures(found)]
+    metrics = [judgement_row(judgement), Metric("model", name), *figures(found)]
     write_motion(room.folder, motion, body)
     metrics += write_glb(room.folder / "animation.glb", motion, body)
     page = Page(f"{path.name}, on the body", "The body in motion" + (

@@ -42,7 +42,7 @@ from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
 from .motions import bring, is_motion
 
-BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
+BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, betas (k,) at the end or (T, k) of every frame
 MEAN_ERROR = "distance of markers, mean"
 
 
@@ -155,17 +155,22 @@ def _other_person(work: Work, person: Subject, output: Path, motion: Motion, bod
 def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page
                    ) -> list[Metric]:
     def bodies(frames: np.ndarray) -> np.ndarray:
-        return morphed_vertices(work.model, motion, morph_keys(goal, motion), frames)
+        return morphed_vertices(work.model, motion, changes, frames)
 
+    changes = betas_in_motion(goal, motion)
     told = write_glb(output / "morph.glb", motion, body, bodies)
-    page.section("With a body that changes", "Betas change from key to key, straight over time.")
+    page.section("With a body that changes", "Betas change straight from key to key, or are given for every frame.")
     page.bodies([moving_pane(motion, body, bodies=bodies)])
     return told
 
 
-def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
-    """Betas at some seconds, from these or from those at the end."""
+def betas_in_motion(given: BetasTo, motion: Motion) -> dict[float, np.ndarray] | np.ndarray:
+    """Betas at some seconds or (T, k) in every frame of a motion, from these or from those at its end."""
     if isinstance(given, dict):
+        return given
+    if given.ndim == 2:
+        if len(given) != len(motion.poses):
+            raise UsageError(f"--betas-to: expected betas of all {len(motion.poses)} frames, got those of {len(given)}")
         return given
     if motion.betas is None:
         raise UsageError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")

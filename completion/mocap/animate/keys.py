@@ -1,0 +1,164 @@
+"""A motion of a few keys in a table, as an animator writes them by hand. [SCAPE-patent] par. 12"""
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from model.linear import Subject
+from model.motion.onto import BodyMotion
+from scanprep.geometry import storage, tables
+from scanprep.geometry.format_common import UNITS
+from scanprep.judgement import Judgement
+from scanprep.ranges import TURNS
+
+from ..files.text import table_numbers
+
+USUAL_RATE = 30.0                    # frames a second between keys
+MOST_FRAMES = 200_000                # nearly two hours of them; more are times in other units than seconds
+LEAST_TURN = 2 * np.pi               # degrees of the largest turn of a joint, below which the table may be in radians
+PLACE = ("trans_x", "trans_y", "trans_z")
+ANGLE = re.compile(r".+_r[xyz]")     # a column of joint_angles.csv
+
+
+def holds_keys(path: Path) -> bool:
+    """Whether a table has columns of joint angles, as joint_angles.csv has them, and not those of markers."""
+    if path.suffix.lower() not in (".csv", ".tsv") or not path.is_file():
+        return False
+    with storage.taking_apart(path, "a table"):
+        head = tables.decoded(path.read_bytes()).split("\n", 1)[0]
+    return any(ANGLE.fullmatch(word.strip(' "\r').lower()) for word in re.split("[,;\t]", head))
+
+
+def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float | None = None) -> BodyMotion:
+    """The motion between the keys of a table.
+
+    The columns are `time` in seconds, then `PART_rx, PART_ry, PART_rz` of some parts, their rotation vectors against
+    the parent in degrees, as joint_angles.csv has them: a line of that file is a key. `trans_x, trans_y, trans_z` are
+    metres from where the model stands. A part without columns stays at rest; where its cells are empty it has no key.
+    Nothing goes beyond its keys, and what is alike in two of them stays so between them. Joints turn the shorter way.
+
+    Parameters
+    ----------
+    path : Path
+    subject : Subject
+        The body that moves.
+    unit : str, optional
+        Of the trans columns, else metres.
+    rate : float, optional
+        Frames a second of the motion, else 30.
+
+    Raises
+    ------
+    StorageError
+        Another table, a part that the body does not have, times that do not grow.
+
+    Examples
+    --------
+    >>> Path("wave.csv").write_text("time,upper_arm_right_rx\\n0,0\\n1,90\\n")
+    >>> read_keys(Path("wave.csv"), subject).poses.shape
+    (31, 18, 3)
+
+    [SCAPE-patent] par. 12
+    """
+    separator, rows = tables.table_rows(path, storage.read_bytes(path, "a table of keys"))
+    head, names = [word.lower() for word in rows[0][1]], subject.skeleton.names
+    known = {f"{name}_r{axis}".lower(): (j, k) for j, name in enumerate(names) for k, axis in enumerate("xyz")}
+    unknown = [word for word in head if word not in known and word not in ("time", *PLACE)]
+    if unknown:
+        raise storage.StorageError(f"{path}: line 1: expected the columns time, PART_rx, PART_ry, PART_rz, ..., "
+                                   f"trans_x, trans_y, trans_z, of the parts {', '.join(names)}, found {unknown[0]!r}")
+    if head.count("time") != 1 or len(set(head)) < len(head):
+        raise storage.StorageError(f"{path}: line 1: expected a column time and every column once, found "
+                                   f"{','.join(head)[:80]}")
+    if not rows[1:]:
+        raise storage.StorageError(f"{path}: expected keys below the first line, found none")
+    table = table_numbers(path, rows[1:], len(head), separator, fill=True)
+    lines = [number for number, _ in rows[1:]]
+    times = table[:, head.index("time")]
+    _check_times(path, times, lines)
+    rate = rate or USUAL_RATE
+    at = times[0] + np.arange(_frames(path, times, rate)) / rate
+
+    columns = {word: i for i, word in enumerate(head)}
+    poses = np.zeros((len(at), len(names), 3))
+    for j, name in enumerate(names):
+        angles = _coordinates(path, table, columns, [f"{name}_r{axis}".lower() for axis in "xyz"], lines)
+        keyed = np.isfinite(angles[:, 0])
+        if keyed.any():
+            TURNS.check(np.radians(angles[keyed]), f"{path}: {name}")
+            poses[:, j] = turned_between(times[keyed], np.radians(angles[keyed]), at)
+    places = _coordinates(path, table, columns, PLACE, lines)
+    keyed = np.isfinite(places[:, 0])
+    trans = _between(times[keyed], UNITS[unit or "m"] * places[keyed], at) if keyed.any() else np.zeros((len(at), 3))
+    return BodyMotion(poses, trans, subject.betas, rate, how=f"between {len(times)} keys")
+
+
+def judge_keys(poses: np.ndarray) -> Judgement:
+    """What poses (T, J, 3) from keys are worth, radians: those of somebody who wrote radians hardly move."""
+    largest = float(np.degrees(np.linalg.norm(poses, axis=-1)).max())
+    return Judgement.of(check=[f"no joint turns by more than {largest:.2g} degrees; if the table has radians, write "
+                               "degrees"] if 0 < largest < LEAST_TURN else [])
+
+
+def turned_between(times: np.ndarray, turns: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Rotation vectors (T, 3), radians, at some times, between those (n, 3) at growing `times` (n,).
+
+    Monotone cubics of unit quaternions of continuous sign. A spline of continuous acceleration, as `RotationSpline`,
+    would swing beyond keys: an arm that is held up through two keys would not stay.
+
+    Examples
+    --------
+    >>> np.degrees(turned_between([0, 1], np.radians([[0, 0, 0], [90, 0, 0]]), [0.5]))
+    array([[45., 0., 0.]])
+    """
+    q = Rotation.from_rotvec(turns).as_quat()
+    turned = np.einsum("nc,nc->n", q[1:], q[:-1]) < 0
+    q[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
+    return Rotation.from_quat(_between(np.asarray(times), q, np.asarray(at))).as_rotvec()
+
+
+def _between(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (T, K) at some times between those (n, K) of keys; before the first and after the last they stay."""
+    if len(times) == 1:
+        return np.repeat(values, len(at), axis=0)
+    return PchipInterpolator(times, values)(np.clip(at, times[0], times[-1]))
+
+
+def _coordinates(path: Path, table: np.ndarray, columns: dict[str, int], wanted: Sequence[str], lines: Sequence[int]
+                 ) -> np.ndarray:
+    """Three columns (n, 3) of a table, 0 for one that it does not have; all of a line or none are NaN."""
+    there = [k for k, word in enumerate(wanted) if word in columns]
+    found = np.zeros((len(table), 3)) if there else np.full((len(table), 3), np.nan)
+    for k in there:
+        found[:, k] = table[:, columns[wanted[k]]]
+    given = np.isfinite(found[:, there])
+    half = np.flatnonzero(given.any(axis=1) & ~given.all(axis=1))
+    if len(half):
+        raise storage.StorageError(f"{path}: line {lines[half[0]]}: expected numbers in all of "
+                                   f"{', '.join(wanted[k] for k in there)}, or in none for a line without this key")
+    if np.isinf(found).any():
+        raise storage.StorageError(f"{path}: expected finite numbers in {wanted[0]}")
+    found[~given.all(axis=1)] = np.nan
+    return found
+
+
+def _check_times(path: Path, times: np.ndarray, lines: Sequence[int]) -> None:
+    """StorageError unless the times (n,) of keys are numbers that grow."""
+    wrong = np.flatnonzero(~np.isfinite(times) | np.r_[False, ~(np.diff(times) > 0)])
+    if len(wrong):
+        raise storage.StorageError(f"{path}: line {lines[wrong[0]]}: expected a time in seconds that is later than "
+                                   f"that of the key before, found {times[wrong[0]]:g}")
+
+
+def _frames(path: Path, times: np.ndarray, rate: float) -> int:
+    """How many frames there are from the first to the last key."""
+    span = (times[-1] - times[0]) * rate
+    if span >= MOST_FRAMES:
+        raise storage.StorageError(f"{path}: expected times in seconds, those from {times[0]:g} to {times[-1]:g} would "
+                                   f"be {span:.3g} frames at {rate:g} a second")
+    return int(span + 1e-6) + 1
