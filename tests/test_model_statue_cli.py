@@ -1,5 +1,6 @@
 """`scape statue`: a scan becomes a folder that reconstructs, takes edits and moves; bad input is refused by name."""
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ from PIL import Image
 from completion.__main__ import main
 from model import load_model
 from model.statue import report
-from model.statue.commands import read_scan
-from model.statue.control.model import HOLE, MEASURED
+from model.statue.commands import judge_statue, read_scan
+from model.statue.control.model import HOLE, MEASURED, OUTSIDE
+from model.statue.detail.reconstruction import Level
 from model.statue.files import load_statue
+from model.statue.fit import FittedStatue, Posed
+from model.statue.registration.features import FeatureFit
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.pipeline.scans import ScanTask
 from scanprep.synthetic.people import LANDMARKS, BodyShape, Person, walk
@@ -64,6 +68,35 @@ def test_the_surface_comes_back_and_the_missing_arm_is_a_hole(made, person):
     assert statue.texture is not None and {HOLE, MEASURED} <= set(np.unique(statue.map.coverage).tolist())
     for name in ("report.html", "statue.glb", "statue.x3d", "displacement.png", "reconstruction.ply"):
         assert (made / "statue" / name).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("wrong, verdict, why", [
+    ({}, "check", "no data on right elbow, right wrist"),
+    ({"missing": ("left ankle", "l_knee")}, "check", "no data on right elbow, right wrist, left knee"),
+    ({"problem": "16% of the scan lies off the registered one"}, "check", "16% of the scan lies off the registered"),
+    ({"joint_rms": 0.039, "point_rms": np.nan}, "check", "features lie 39 mm from those of the posed"),
+    ({"joint_rms": np.nan, "point_rms": 0.096}, "check", "features lie 96 mm from those of the posed"),
+    ({"mean": 0.0014}, "check", "the detailed surface lies 1.4 mm off the scan"),
+    ({"off": 0.1}, "check", "% of the scan lies off the statue"),
+    ({"off": 0.5}, "failed", "% of the scan lies off the statue"),
+    ({"hole": 0.72}, "failed", "% has data one-to-one"),
+])
+def test_every_figure_that_calls_a_statue_wrong_is_in_its_verdict(made, wrong, verdict, why):
+    statue, whole = load_statue(made / "statue"), read_mesh(made / "statue" / "reconstruction.ply")
+    fit = FeatureFit(statue.pose, np.ones(9), statue.control.mesh.vertices, statue.control.skeleton.joints,
+                     wrong.get("joint_rms", 0.01), wrong.get("point_rms", 0.01), True)
+    posed = Posed(fit, fit.vertices, np.zeros(len(fit.vertices), dtype=bool), missing=wrong.get("missing", ()),
+                  problem=wrong.get("problem"))
+    coverage = statue.map.coverage.copy()
+    rows, columns = np.nonzero(coverage != OUTSIDE)
+    some = np.random.default_rng(0).permutation(len(rows))[:round(wrong.get("hole", 0) * len(rows))]
+    coverage[rows[some], columns[some]] = HOLE
+    told = FittedStatue(statue.control, statue.pose, replace(statue.map, coverage=coverage), posed=posed)
+    far = np.arange(len(whole.vertices)) < wrong.get("off", 0) * len(whole.vertices)
+    scan = whole.with_vertices(whole.vertices + far[:, None] * [0, 0.5, 0])
+    finest = Level("level 3", whole, wrong.get("mean", 0.0004), 0.001, np.ones(len(whole.faces), dtype=bool))
+    judgement = judge_statue(told, scan, finest)
+    assert judgement.verdict == verdict and why in judgement.why
 
 
 def test_the_texture_has_the_colours_of_the_scan(made):

@@ -35,9 +35,7 @@ STEPS = 100                          # of progress, of each stage
 
 @dataclass(frozen=True)
 class PoseConfig(AnimateConfig):
-    """Settings of the poses of a person whose shape and marker places are known: as of `animate`, without a flag."""
-
-    ground: bool = False
+    """Settings of the poses of a person whose shape and marker places are known: as of `animate`."""
 
     @classmethod
     def weighted(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:
@@ -288,8 +286,9 @@ def _soft_tissue(stages: _Stages, i: int, person: _Person, markers: MarkerSequen
                  ) -> SoftTissue:
     """The motion with a shape that changes."""
     model, layout, soft = person.model, person.fit.layout, config.soft
-    return stages.run("soft tissue", f"soft tissue {i}", (model, layout, markers, motion, soft),
-                      lambda tell: follow_soft_tissue(model, motion, markers, layout, soft, tell), True)
+    ground, floor = config.poses.ground, config.poses.floor
+    return stages.run("soft tissue", f"soft tissue {i}", (model, layout, markers, motion, soft, ground, floor),
+                      lambda tell: follow_soft_tissue(model, motion, markers, layout, soft, tell, ground, floor), True)
 
 
 @dataclass(frozen=True, eq=False)

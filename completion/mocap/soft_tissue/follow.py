@@ -12,6 +12,7 @@ from scanprep.threads import one_thread
 from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from ..pose.foot_contact import Floor, FootContact
 from ..pose.marked_body import batches
 from ..pose.settings import RATE
 from .follower import SoftFollower, Whitening, whiten
@@ -27,7 +28,8 @@ MOST_BETAS = 200                     # that change, of those that the model has
 
 @one_thread()
 def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
-                       config: SoftTissueConfig | None = None, progress: Progress | None = None) -> SoftTissue:
+                       config: SoftTissueConfig | None = None, progress: Progress | None = None, ground: bool = False,
+                       floor: tuple[float, float, float, float] | None = None) -> SoftTissue:
     """A motion in which the skin moves on the body, as the markers tell.
 
     [MoSh] changes the betas in every frame and holds the change by its squared length; `published()` does so. Betas of
@@ -48,6 +50,10 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     config : SoftTissueConfig, optional
     progress : callable, optional
         Called with (done, total) frames.
+    ground : bool
+        Feet neither sink into the floor nor slide while they stand on it, as by `AnimateConfig.ground`.
+    floor : four numbers, optional
+        A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
 
     Raises
     ------
@@ -60,13 +66,17 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     config = config or SoftTissueConfig()
     _check(model, motion, markers)
     follower = (ShapeFollower if config.shape_change else SkinFollower)(model, motion, markers, layout, config)
-    x, some, share = follower.solve(progress)
+    body, feet = follower.body, None
+    if ground and len(motion.poses) > 2:
+        feet = FootContact(body, body.body.join(motion.poses, motion.trans), markers.rate,
+                           None if floor is None else Floor.given(floor))
+    x, some, share = follower.solve(progress, feet)
     added, changes, skin = follower.moved(x, some, share)
     if progress:
         progress(len(x), len(x))
-    pose, trans, _ = follower.body.body.split(x)
+    pose, trans, _ = body.body.split(x)
     residuals = np.full(markers.positions.shape[:2], np.nan)
-    residuals[:, follower.rows] = np.linalg.norm(follower.body.positions(x) + added - follower.targets, axis=2)
+    residuals[:, follower.rows] = np.linalg.norm(body.positions(x) + added - follower.targets, axis=2)
     return SoftTissue(replace(motion, poses=pose.copy(), trans=trans.copy(), residuals=residuals,
                               converged=motion.converged & follower.settled), changes, skin)
 

@@ -15,6 +15,7 @@ from ...smoothing import windowed_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import FURTHEST, STILL
+from ..pose.foot_contact import FootContact, HeldPoints
 from ..pose.marked_body import MarkedBody, batches, point_system
 from ..pose.robust import marker_weights
 from ..pose.settings import RATE, AnimateConfig
@@ -62,17 +63,19 @@ class SoftFollower(ABC):
         What it adds to the places of the markers (T, L, 3), metres, and how `SoftTissue` holds it.
         """
 
-    def solve(self, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def solve(self, progress: Progress | None = None, feet: FootContact | None = None
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Unknowns (T, P), which frames count (n,) and the share of every marker (T, L).
 
-        Which frames settled is in `settled` (T,).
+        Which frames settled is in `settled` (T,). `feet` are held where they stand.
         """
         T, tell = len(self.targets), progress or (lambda done, total: None)
         x, last = self.body.body.join(self.motion.poses, self.motion.trans), np.zeros(T)
         some, share = self._share(x)
         for i in range(ROUNDS if len(some) > 2 else 0):
             before = self.body.positions(x[some])
-            x[some] = self.round(x[some], self.targets[some], share[some])
+            held = None if feet is None else feet.held(x).of(slice(some[0], some[-1] + 1))
+            x[some] = self.round(x[some], self.targets[some], share[some], held)
             last[some] = np.linalg.norm(self.body.positions(x[some]) - before, axis=2).max(axis=1)
             tell(round(T * (i + 1) / (ROUNDS + 1)), T)
         self.settled = last < STILL
@@ -90,7 +93,8 @@ class SoftFollower(ABC):
         away = targets - self.body.positions(x)
         return np.where(np.isnan(away), 0.0, away)
 
-    def round(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> np.ndarray:
+    def round(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray, held: HeldPoints | None = None
+              ) -> np.ndarray:
         """Frames (T, P) that follow each other after one Gauss-Newton step, the movement integrated out."""
         whitening = self.whitening(x, targets, share)
 
@@ -101,6 +105,10 @@ class SoftFollower(ABC):
                 mine = slice(frames[few][0], frames[few][-1] + 1)
                 _, gradient[few], hessian[few] = self.system(x[mine], targets[mine],
                                                              np.sqrt(self.weight) * whitening(mine))
+                if held is not None:
+                    _, pull, stiff = held.system(*self.body.body.split(x[mine])[:2], mine)
+                    gradient[few] += pull
+                    hessian[few] += stiff
             return gradient, hessian
 
         step = windowed_steps(x, equations, self.inertia)
