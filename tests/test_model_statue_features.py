@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from model.statue.control.files import humanoid
+from model.statue.fit import StatueConfig, posed_automatically, posed_by_features
 from model.statue.registration import automatic
 from model.statue.registration.articulated import Articulated, Points
-from model.statue.registration.automatic import find_features, likely_unit
+from model.statue.registration.automatic import Features, find_features, likely_unit
 from model.statue.registration.clicks import MedialAxis
 from model.statue.registration.features import fit_features, head_share, misfit, warp
 from scanprep.geometry import rotations
@@ -180,6 +181,24 @@ def cylinder(radius, length, around=40):
     faces = [np.column_stack(f) for f in ((i, j, j + around), (i, j + around, i + around), (bottom, j, i),
                                           (i + around, j + around, top))]
     return Mesh(v, np.vstack(faces))
+
+
+def test_features_that_were_found_pose_and_warp_as_those_that_were_clicked(control, model):
+    """[Statues] Eq. 4, 5 without a click: the published way; ours begins on the scan where it shows the body."""
+    joints, points = features_of(control, model, drawn(model, np.random.default_rng(5)))
+    points["nose tip"] = points["nose tip"] + [0.0, -0.02, 0.0]
+    clicked = posed_by_features(control, joints, points)
+    on_scan = control.mesh.with_vertices(clicked.features.vertices + [0.0, 0.0, 0.01])
+    found = Features(joints, points, (), on_scan, clicked.features, None)
+    published = posed_automatically(control, found, StatueConfig.published().start == "registered")
+    np.testing.assert_array_equal(published.start, clicked.start)
+    assert published.face == len(FACE) and np.abs(published.start - clicked.features.vertices).max() > 0.01
+    usual = posed_automatically(control, found, StatueConfig().start == "registered")
+    np.testing.assert_array_equal(usual.start, on_scan.vertices)
+    hidden = posed_automatically(control, Features(joints, points, ("skullbase",), on_scan, clicked.features, None))
+    head = head_share(control) == 1
+    np.testing.assert_allclose(hidden.start[head], clicked.start[head], atol=1e-12)
+    assert (usual.face, hidden.face) == (0, len(FACE)) and hidden.hidden[head].all()
 
 
 def test_a_click_on_a_cylinder_finds_its_axis_though_it_has_holes():

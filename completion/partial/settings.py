@@ -93,6 +93,10 @@ class CompletionConfig(Settings):
     def published(cls) -> CompletionConfig:
         """The paper's way: a few markers become correspondences, then rotations, surface and shape in turns.
 
+        Not as in the paper: the start is the best of several, from landmarks, typical poses and limbs held otherwise.
+        w_Z and w_T, which it does not print, are ours, and points that lie far from the body count less. Soles are
+        pressed to a scan that ends flat around the feet.
+
         [SCAPE] §7
         """
         return cls(method="alternation", correspondences=True)

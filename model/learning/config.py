@@ -47,7 +47,8 @@ class LearnConfig(Settings):
         """The paper's own way: joints pruned at 0.1, linear least squares, w_s = 0.001 ρ, nothing refined.
 
         The 0.1 has no unit in the paper. It is read as a standard deviation in radians, a variance of 0.01; the paper's
-        own poses lost a third of the parameters by it, others lose another share.
+        own poses lost a third of the parameters by it, others lose another share. Not as in the paper: 40 shape
+        components, of which it tells no number; twists by a logarithm that holds at every angle.
 
         [SCAPE] Eq. 3, Eq. 4, Eq. 5, Eq. 7, Eq. 8
         """

@@ -53,7 +53,12 @@ class PrepareConfig(Settings):
 
     @classmethod
     def published(cls) -> PrepareConfig:
-        """Scans registered as [SCAPE] did, from landmarks or the given pose."""
+        """Scans registered as [SCAPE] did, from landmarks.
+
+        Not as in the paper: landmarks are not multiplied by Correlated Correspondence, which finds all of them for a
+        scan that has none. How soft links are, and when, it does not tell. Triangles that end inverted are mended, and
+        soles are pressed to a scan that ends flat around the feet.
+        """
         return cls(scan=ScanSettings(RegistrationConfig.published()))
 
 

@@ -142,6 +142,8 @@ class RegistrationConfig(Settings):
         """The registration that [SCAPE] used: rigid links between neighbours, matches point to point [Hahnel].
 
         Nodes keep their size; the template is drawn to the landmarks first, then to the scan with ever softer links.
+        Not as in the paper: how soft they are and when, which it does not tell; triangles that end inverted are mended,
+        and commands press soles to a scan that ends flat around the feet.
         """
         def stage(nodes: int, length: float, landmarks: float, reach: float, rounds: int) -> GraphStage:
             return GraphStage(nodes, length, round(0.1 * length, 6), 0.0, landmarks, reach, 1.0, rounds, detail=1e-4)

@@ -88,8 +88,9 @@ class MoshConfig(Settings):
     def published(cls) -> MoshConfig:
         """The weights of [MoSh], every marker believed alike, nothing repaired, shrunk or smoothed beyond them.
 
-        Not as in the paper: covariances of poses have at least (0.05 radians)² along every direction, and the first
-        frame is found by a search.
+        Not as in the paper: covariances of poses have at least (0.05 radians)² along every direction. The first frame
+        is found by a search, then all frames are solved together, by Gauss-Newton. The weight of the velocity is meant
+        for 120 frames a second, and scaled for others.
         """
         poses = replace(PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6,
                         prior_shrinkage=0.0)

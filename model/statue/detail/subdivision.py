@@ -74,7 +74,8 @@ def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance
     metres.
 
     An edge is split if the surface is farther from it anywhere along it, or at a place inside a triangle beside it: a
-    decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge.
+    decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge. Fig. 16 of [Statues]
+    splits where the displacement is greater; a flat part needs no triangles, however far it is displaced.
     """
     return _subdivided(mesh, chart, level, lambda now: _bent(now, displaced, tolerance))
 

@@ -66,7 +66,7 @@ class MedialAxis:
     """Voxels inside a mesh, thinned to their medial axis, whose `points` (n, 3) are the centres. [Statues]
 
     The winding number tells inside from outside although a scan has holes. Thinning leaves curves along limbs and
-    trunk, which serve as a guide only: a joint does not have to lie on them.
+    trunk, where the paper's leaves surfaces; they serve as a guide only: a joint does not have to lie on them.
     """
 
     def __init__(self, mesh: Mesh, voxel: float = 0.01) -> None:
