@@ -8,11 +8,12 @@ import pytest
 from completion_bodies import worm_with_prior
 from config_files import config_file
 from glb_reader import Glb
-from mosh_folders import FRAMES, QUICK, run, small_pictures, write_people
+from mosh_folders import FRAMES, QUICK, QuietWork, run, small_pictures, write_people
 from scene_reader import scenes_of
 
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
 from completion.__main__ import main
+from completion.mocap.mosh import cli
 from completion.mocap.mosh.recordings import Grouping, find_actors, write_table
 from completion.mocap.mosh.takes import held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
@@ -181,6 +182,29 @@ def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
     assert run(place, people, "-o", out, soft_tissue=False) == 1
     assert told(out)["done before"] == 2 and "swim.csv" in capsys.readouterr().err
     assert [p.name for p in out.glob(".*")] == [".scapekit"]
+
+
+def test_two_people_and_a_prop_in_one_file_become_two_folders(place, tmp_path, capsys, monkeypatch):
+    """The same bodies as from files of their own, with feet held; the prop is told."""
+    some = slice(10, 22)
+    ann, bob = (read_markers(place / "people" / name).frames(some) for name in ("ann/walk.csv", "bob/jump.csv"))
+    ball = np.full((12, 3, 3), 1.0) + 0.1 * np.eye(3)
+    labels = [f"{who}:{label}" for who in ("Ann", "Bob") for label in ann.labels]
+    positions = np.concatenate([ann.positions, bob.positions + [2.0, 0, 0], ball], axis=1)
+    write_markers(tmp_path / "two.c3d", MarkerSequence(positions, (*labels, "Ball:A", "Ball:B", "Ball:C"), 60.0))
+    monkeypatch.setattr(cli, "Work", QuietWork)
+    out = tmp_path / "out"
+    assert run(place, tmp_path / "two.c3d", "-o", out, "--ground", soft_tissue=False, repair=False,
+               person={"frames": 3, "annealing": [2.0]}) == 0
+    assert "Ball taken for props beside people and left out" in capsys.readouterr().err
+    assert {p.name for p in out.iterdir() if p.is_dir() and p.name[0] != "."} == {"Ann", "Bob"}
+    assert json.loads((out / "report.json").read_text())["settings"]["mosh"]["poses"]["ground"] is True
+    truth = np.load(place / "truth.npz")
+    for who, take, shift in (("Ann", "walk", 0.0), ("Bob", "jump", 2.0)):
+        assert {"subject.json", "layout.json", "report.html"} <= {p.name for p in (out / who).iterdir()}
+        motion = Motion.load(out / who / "two" / "motion.npz")
+        body = motion.vertices(worm_with_prior().subject(motion.betas)) - [shift, 0, 0]
+        assert np.linalg.norm(body - truth[take][some], axis=2).mean() < 0.03
 
 
 def test_a_recording_without_a_rate_asks_for_the_flag(place, tmp_path, capsys):

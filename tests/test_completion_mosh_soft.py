@@ -355,3 +355,22 @@ def test_what_does_not_belong_together_is_refused() -> None:
             SkinFollower(model, motion, markers, where, SoftTissueConfig(**{name: value}))
     with pytest.raises(ValueError, match="k at most 3"):
         changing_bodies(model, motion.poses, np.zeros((T, 4)), motion.trans)
+
+
+def test_what_stands_on_the_floor_does_not_slide_while_the_skin_moves():
+    model, rng = body(), np.random.default_rng(6)
+    poses = np.repeat(model.pose_mean[None], T, axis=0)
+    poses[:, -1, 2] += 0.2 * np.sin(np.arange(T) / 8)                                          # the rest stands still
+    where = layout(model, 0.0)
+    motion = fixed(poses, np.zeros((T, 3)), where)
+    own = model.subject(OWN)
+    truth = motion.vertices(own)
+    placed = np.stack([where.place(model.template.with_vertices(v)) for v in truth])
+    markers = MarkerSequence(placed + rng.normal(0, 0.005, placed.shape), where.labels, RATE)
+    low = truth[..., 2].min()
+    free, held = (follow_soft_tissue(model, motion, markers, where, ground=ground, floor=(0, 0, 1, low))
+                  .motion.vertices(own) for ground in (False, True))
+    soles = np.flatnonzero((truth[..., 2] < low + 0.01).all(axis=0))
+    slide = [np.linalg.norm(np.diff(v[:, soles], axis=0), axis=2).mean() for v in (free, held)]
+    assert slide[1] < 0.5 * slide[0]
+    assert np.linalg.norm(held - truth, axis=2).mean() < 1.05 * np.linalg.norm(free - truth, axis=2).mean()

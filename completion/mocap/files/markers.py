@@ -19,6 +19,7 @@ from .text import MarkerFileError, RawMarkers, encode_csv, encode_trc, read_trc
 
 READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_table, ".tsv": read_table}
 WRITTEN = (".c3d", ".trc", ".csv")
+FEWEST_LABELS = 8                    # of a person beside others
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
 
 
@@ -185,10 +186,21 @@ def _without_fill(places: np.ndarray) -> tuple[np.ndarray, list[str]]:
 def marker_subjects(path: str | Path) -> tuple[str, ...]:
     """The people whose markers are in a file, by what stands before the colon of its labels.
 
-    None where there is no colon, nor where several prefixes are parts of one person, as `people_of` says.
+    None where there is no colon, nor where several prefixes are parts of one person, as `people_of` says. Beside
+    several people a prefix of fewer than eight labels, of which nobody else has one, is a prop: it is left out, with a
+    warning.
     """
-    people = people_of(_read_raw(Path(path)).labels)
-    return tuple(prefixes[0] for prefixes in people if len(prefixes) == 1)
+    labels = _read_raw(Path(path)).labels
+    people = tuple(prefixes[0] for prefixes in people_of(labels) if len(prefixes) == 1)
+    if len(people) < 2:
+        return people
+    bare = {who: {label.rpartition(":")[2] for label in labels if label.rpartition(":")[0] == who} for who in people}
+    times = Counter(label for own in bare.values() for label in own)
+    props = [who for who, own in bare.items() if len(own) < FEWEST_LABELS and all(times[label] == 1 for label in own)]
+    if props:
+        warnings.warn(f"{path}: {', '.join(props)} taken for props beside people and left out; taken all the same with "
+                      f"subject_prefix={props[0]}", stacklevel=2)
+    return tuple(who for who in people if who not in props)
 
 
 def people_of(labels: Sequence[str]) -> tuple[tuple[str, ...], ...]:

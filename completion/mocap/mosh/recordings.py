@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, cast, get_args
 
@@ -66,14 +66,15 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
     for place in given:
         if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
             raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
-    found = list(_files(given, output, grouping.table))
+    found = [replace(file, people=_labelled(file.path, grouping))
+             for file in _files(given, output, grouping.table)]
     if not found:
         raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(READERS)}, found none")
     whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given)
-                                     and not any(len(_labelled(f.path, grouping)) > 1 for f in found))
+                                     and not any(len(f.people) > 1 for f in found))
     if grouping.table is not None:
         said = _read_table(grouping.table, [f.path for f in found])
-        rows = [(folder_name(subject), f, grouping.who or _named_person(f.path, subject, grouping),
+        rows = [(folder_name(subject), f, grouping.who or _named_person(f, subject),
                  f"as {grouping.table} says") for f in found for subject in said.get(f.path, ())]
     elif whole:
         name = next(_people(found[0], grouping))[0]
@@ -100,10 +101,11 @@ def folder_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class _File:
-    """A marker file, and the folders it lies in below the one that was given."""
+    """A marker file, the folders it lies in below the one that was given, and the people that its labels tell."""
 
     path: Path
     folders: tuple[str, ...]
+    people: tuple[str, ...] = ()
 
 
 def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterator[_File]:
@@ -129,7 +131,7 @@ def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterat
 def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, str]]:
     """Name, C3D subject and rule of the people in a file."""
     by, own = grouping.by, file.path.stem
-    numbers, people = re.fullmatch(r"(\d+)[_-]\d+", own), _labelled(file.path, grouping)
+    numbers, people = re.fullmatch(r"(\d+)[_-]\d+", own), file.people
     if len(people) > 1:
         for who in people:
             yield who, who, "by what stands before the labels"
@@ -143,10 +145,10 @@ def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, 
         yield own if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
 
 
-def _named_person(path: Path, subject: str, grouping: Grouping) -> str | None:
+def _named_person(file: _File, subject: str) -> str | None:
     """The one of several people in a file whom a table names; None for a file of one."""
-    people = _labelled(path, grouping)
-    return next((who for who in people if folder_name(who) == folder_name(subject)), None) if len(people) > 1 else None
+    named = (who for who in file.people if folder_name(who) == folder_name(subject))
+    return next(named, None) if len(file.people) > 1 else None
 
 
 def _labelled(path: Path, grouping: Grouping) -> tuple[str, ...]:
