@@ -52,7 +52,8 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     Files that are named are of one person. In a folder every sub-folder is a person; of files that lie side by side
     those are, whose names begin with the same number, as 85_02.c3d and 85_03.c3d, or else whose labels begin with the
     same `Subject:`. Several people in one file, Ann:LKNE and Bob:LKNE, have a folder each; a prop beside them is left
-    out. What was found is printed, and kept in subjects.csv, which --subjects takes when it is mended. Called again, the command leaves alone what is done and has not changed; killed, it goes on where it was.
+    out. What was found is printed, and kept in subjects.csv, which --subjects takes when it is mended. Called again,
+    the command leaves alone what is done and has not changed; killed, it goes on where it was.
 
     Args:
         markers: C3D, TRC, CSV or TSV files, or folders of these.
