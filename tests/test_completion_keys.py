@@ -66,6 +66,7 @@ def test_keys_of_parts_and_places_are_as_the_table_says(tmp_path):
 
 
 @pytest.mark.parametrize("text, message", [
+    ("", "line 1: expected a column time"),
     ("time,arm_rx\n0,1\n", "line 1: expected the columns time, PART_rx, .*upper_arm_right.*found 'arm_rx'"),
     (f"{ARM}_rx\n0\n", "line 1: expected a column time"),
     (f"time,{ARM}_rx\n", "expected keys below the first line"),

@@ -30,7 +30,7 @@ def holds_keys(path: Path) -> bool:
     if path.suffix.lower() not in (".csv", ".tsv") or not path.is_file():
         return False
     with storage.taking_apart(path, "a table"):
-        head = tables.decoded(path.read_bytes()).split("\n", 1)[0]
+        head = tables.decoded(storage.read_bytes(path, "a table")).split("\n", 1)[0]
     return any(ANGLE.fullmatch(word.strip(' "\r').lower()) for word in re.split("[,;\t]", head))
 
 
@@ -66,7 +66,7 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     [SCAPE-patent] par. 12
     """
     separator, rows = tables.table_rows(path, storage.read_bytes(path, "a table of keys"))
-    head, names = [word.lower() for word in rows[0][1]], subject.skeleton.names
+    head, names = [word.lower() for word in rows[0][1]] if rows else [], subject.skeleton.names
     known = {f"{name}_r{axis}".lower(): (j, k) for j, name in enumerate(names) for k, axis in enumerate("xyz")}
     unknown = [word for word in head if word not in known and word not in ("time", *PLACE)]
     if unknown:
