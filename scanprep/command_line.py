@@ -104,8 +104,9 @@ class _Settings:
             given = early.parse_known_args(argv)[0]
             if self.presets and given.preset == "published":
                 self.about = config_files.comment(inspect.getdoc(published) or "")
-                self.values = {name: value.published() if hasattr(value, "published") and value == type(value)()
-                               else value for name, value in values.items()}
+                own = next(iter(values))           # other settings of one kind may stand for something else
+                self.values = {name: _as_published(value) if hasattr(value, "published") and (
+                    name == own or value == type(value)()) else value for name, value in values.items()}
             if given.config is not None:
                 self.values = config_files.read(given.config, self.values)
 
@@ -132,6 +133,14 @@ class _Settings:
                 first, *rest = flag.path
                 values[first] = config_files.replaced(values[first], tuple(rest), value)
         return {**given, **values}
+
+
+def _as_published(value: Any) -> Any:
+    """The published settings, but for the fields in which those of the command are not the usual ones anyway."""
+    usual = type(value)()
+    own = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return dataclasses.replace(type(value).published(), **{
+        name: mine for name, mine in own.items() if mine != getattr(usual, name)})
 
 
 class Arguments:

@@ -1,6 +1,7 @@
 """What has no flag comes from a file: every command writes one, reads it again, and says what is wrong with it."""
 import dataclasses
 import functools
+import inspect
 from typing import Annotated, Literal
 
 import pytest
@@ -131,14 +132,32 @@ def test_the_written_file_says_what_everything_means(capsys):
     assert max(map(len, said.out.splitlines())) <= 102
 
 
+def settings_of(prog):
+    """The settings of a command by the names of its arguments."""
+    return {p.name: p.default for p in inspect.signature(CALLS[prog]).parameters.values()
+            if isinstance(p.default, Settings)}
+
+
 @pytest.mark.parametrize("prog", CALLS)
 def test_every_command_writes_its_settings_and_reads_them_again(prog, tmp_path):
-    import inspect
-
-    settings = {p.name: p.default for p in inspect.signature(CALLS[prog]).parameters.values()
-                if isinstance(p.default, Settings)}
+    settings = settings_of(prog)
     path = tmp_path / "all.toml"
     path.write_text(config_files.write(settings), encoding="utf-8")
     assert config_files.read(path, settings) == settings
     for config in settings.values():
         assert set(config_files.sentences(type(config))) == {f.name for f in dataclasses.fields(config)}
+
+
+@pytest.mark.parametrize("prog", [prog for prog in CALLS if hasattr(next(iter(settings_of(prog).values()), None),
+                                                                    "published")])
+def test_the_preset_of_every_command_is_in_force(prog):
+    """Also where the command's own settings are not the usual ones, as the size of a statue's images is not."""
+    values = settings_of(prog)
+    found = command_line._Settings(values, ["--preset", "published"])
+    name, usual = next(iter(values.items()))
+    paper = type(usual).published()
+    own = {f.name for f in dataclasses.fields(usual) if getattr(usual, f.name) != getattr(type(usual)(), f.name)}
+    assert found.presets and found.values[name] != usual and own <= {"displacement"}
+    for field in dataclasses.fields(usual):
+        source = usual if field.name in own else paper
+        assert getattr(found.values[name], field.name) == getattr(source, field.name)
