@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 
-from completion.partial.alternation import Alternation, Blocks, Markers, damped_twists
+from completion.bodies import FixedBody
+from completion.partial.alternation import Alternation, Blocks, Markers, damped_twists, nearest_markers
 from completion.partial.completion import complete
+from completion.partial.fit import REACH, ScanFit
+from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
 from model.gradients import edges
 from scanprep.geometry import rotations
@@ -76,8 +79,35 @@ def test_twists_without_damping_are_those_of_each_part_and_with_much_they_are_on
     np.testing.assert_allclose(damped_twists(MODEL.skeleton, part, e, v, 0.0), turn, atol=1e-7)
     stiff = damped_twists(MODEL.skeleton, part, e, v, 1e6)
     np.testing.assert_allclose(stiff, np.tile(stiff[0], (4, 1)), atol=1e-9)
-    middle = damped_twists(MODEL.skeleton, part, e, v, 0.1)
-    assert np.ptp(stiff, axis=0).max() < np.ptp(middle, axis=0).max() < np.ptp(turn, axis=0).max()
+
+
+def test_damped_twists_are_where_the_gradient_of_their_energy_vanishes():
+    """[SCAPE] Eq. 11, a parabola: central differences are exact."""
+    skeleton, part, rng = MODEL.skeleton, MODEL.skeleton.part_of_face, np.random.default_rng(1)
+    e = edges(MODEL.template.vertices, MODEL.template.faces)
+    v = e @ np.swapaxes(rotations.exp(rng.normal(0, 0.3, (4, 3))), -1, -2)[part]
+
+    def energy(t):
+        off = e + np.cross(t[part][:, None], e) - v
+        return (off**2).sum() + 0.2 * ((t[1:] - t[skeleton.parents[1:]])**2).sum()
+
+    found = damped_twists(skeleton, part, e, v, 0.2)
+    for step in np.eye(12).reshape(12, 4, 3):
+        ahead, behind = energy(found + step), energy(found - step)
+        assert abs(ahead - behind) < 1e-9 * (ahead + behind - 2 * energy(found))
+
+
+def test_markers_weigh_as_the_points_of_the_scan():
+    """On the scan itself all matches of its points weigh `surface_weight` a point; a landmark as its variance says."""
+    model, config = worm_with_prior(0), replace(TURNS, surface_weight=0.7, landmark_sd=0.002, scan_sd=0.005)
+    mesh = model.template
+    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(mesh), MARKS, mesh.vertices[MARKS], config)
+    found = nearest_markers(fit, mesh, REACH)
+    cloud, thin = len(fit.cloud.points), len(fit.thin.points)
+    of_scan = found.weights[len(MARKS):len(MARKS) + thin]
+    np.testing.assert_allclose(of_scan.sum(), 0.7 * cloud, rtol=1e-3)
+    one = 400 / 0.005**2 / thin                                 # what a point is worth: `EVIDENCE` over its variance
+    np.testing.assert_allclose(found.weights[:len(MARKS)], 0.7 * cloud / thin * 0.002**-2 / one)
 
 
 @pytest.mark.parametrize("betas", [None, BETAS], ids=["own body", "unknown shape"])

@@ -50,6 +50,15 @@ def test_the_error_sets_in_away_from_the_data():
     assert np.isfinite(expected_error(posterior, away, np.nan)).all()   # no point of the scan was used
 
 
+def test_errors_set_in_within_millimetres_and_add_up_as_squares():
+    """As chosen on half views of tuning bodies (`half_views.py`): half of the square is there at 14 mm times log 2."""
+    half, far = 0.014 * np.log(2), np.inf
+    for left_out, beyond in ((0.01, 0.0085), (None, 0.0075)):
+        error = expected_error(np.full(3, 0.02), np.array([0, half, far]), 0.002, left_out)
+        square = (1.4 * 0.02)**2 + beyond**2
+        np.testing.assert_allclose(error**2, 0.002**2 + square * np.array([0, 0.5, 1]))
+
+
 def test_distance_to_the_nearest_seen_vertex_runs_along_the_surface():
     mesh = MODEL.template
     x = mesh.vertices[:, 0] - mesh.vertices[:, 0].min()

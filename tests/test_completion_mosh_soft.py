@@ -21,7 +21,6 @@ from completion.viewing.soft import soft_columns
 from model.body import BodyModel
 from scanprep.geometry import rotations
 from scanprep.geometry.geodesics import SurfaceGraph
-from scanprep.geometry.sparse import solve_smooth
 from scanprep.geometry.storage import StorageError
 
 T, RATE, SIZE = 48, 120.0, 0.01
@@ -195,13 +194,6 @@ def test_windows_hardly_matter(monkeypatch) -> None:
                                rtol=0, atol=1e-6)
 
 
-def test_systems_over_time_take_several_sides() -> None:
-    rng = np.random.default_rng(0)
-    blocks, sides = np.eye(3) + 0 * rng.normal(size=(9, 3, 3)), rng.normal(size=(9, 3, 2))
-    one_by_one = np.stack([solve_smooth(blocks, 2.0, sides[..., i]) for i in range(2)], axis=-1)
-    np.testing.assert_allclose(solve_smooth(blocks, 2.0, sides), one_by_one)
-
-
 def test_steadiness_holds_the_movement() -> None:
     model, where = body(), layout(body())
     markers, motion = seen(model, where, noise=0.005)
@@ -298,6 +290,19 @@ def test_betas_are_those_of_the_papers_energy() -> None:
     for step in (0.01, -0.01):
         for k in range(3):
             assert (energy(found.changes + step * np.eye(3)[k]) > least).all()
+
+
+@pytest.mark.parametrize("rate", [60.0, 120.0, 240.0])
+def test_changes_of_velocity_weigh_as_in_the_paper(rate: float) -> None:
+    """[MoSh] Eq. 24: lambda_u at 120 frames a second; in twice as many frames the same motion changes a fourth each."""
+    markers, motion = seen(body(), layout(body()))
+    config = SoftTissueConfig.published()
+    follower = ShapeFollower(body(), motion, replace(markers, rate=rate), layout(body()), config)
+    np.testing.assert_allclose(follower.inertia[:-3], 6.25 * (rate / 120)**4)
+    assert (config.data, config.pose, config.shape_change) == (0.75, 1.0, 0.25)
+    assert follower.weight == pytest.approx(config.data * 100**2)                          # of square centimetres
+    skin = SkinFollower(body(), motion, replace(markers, rate=rate), layout(body()), SoftTissueConfig())
+    assert skin.smoothness == pytest.approx(2.0 * (rate / 120)**4)
 
 
 def test_exaggeration_points_columns_and_movement() -> None:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
@@ -123,6 +125,38 @@ def test_weights_are_per_square_centimetre():
     assert terms.data_term(at, there.positions, np.array([0.75])).energy == pytest.approx(3.0)
     assert terms.place_term(at, there, np.array([0.25])).energy == pytest.approx(1.0)
     assert terms.surface_term(at, corners, *np.array([[0.01], [0.01]]), 100.0).energy == pytest.approx(400.0)
+
+
+def test_priors_are_annealed_and_data_and_distance_from_the_skin_are_not():
+    """[MoSh] Eq. 23 begins with 40 times E_I, E_beta and E_theta, and with E_D and E_S as they are."""
+    rng = np.random.default_rng(3)
+    fit = terms.LatentFit(MODEL, LAYOUT, beside(mean_mesh())[None], terms.PersonConfig(n_betas=K))
+    state = fit.start(rng.normal(0, 0.3, (1, 15)))
+    z, weights, usual = state.z + rng.normal(0, 0.01, K + 3 * L), fit.weights(state), fit._usual(state.layout)
+
+    def energies(factor):
+        found = fit.of_frames(state, state.x, z, weights, factor) | fit.shared(state, usual, z, factor)
+        return {name: float(term.energy.sum()) for name, term in found.items()}
+
+    once, begun = energies(1.0), energies(40.0)
+    assert {name: begun[name] / value for name, value in once.items()} == pytest.approx(
+        {"data": 1, "surface": 1, "initial": 40, "shape": 40, "pose": 40})
+
+
+def test_wands_may_stand_off_and_bars_may_be_worn_without():
+    """A wand reaches from the layout's distance outwards, a bar also down to the skin, at the radius of a marker."""
+    layout = MarkerLayout(("on_skin", "wand", "bar"), np.arange(3), np.array([0.0095, 0.0095, 0.05]), wands=("wand",))
+    least, greatest = terms.distance_reach(layout, 0.1)
+    np.testing.assert_allclose(least, [0.0095, 0.0095, 0.0095])
+    np.testing.assert_allclose(greatest, [0.0095, 0.1095, 0.15])
+    for same in terms.distance_reach(layout, 0.0):
+        np.testing.assert_array_equal(same, layout.distances)
+
+
+def test_loose_markers_are_held_by_twenty_centimetres():
+    layout = replace(LAYOUT, loose=("B",))
+    fit = terms.LatentFit(MODEL, layout, beside(mean_mesh())[None], terms.PersonConfig(n_betas=K, initial=1.0))
+    np.testing.assert_allclose(fit.place_weight, np.where(np.arange(L) == 1, 20.0**-2, 1.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)

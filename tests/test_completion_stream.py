@@ -166,6 +166,17 @@ def test_the_watch_changes_its_mind_only_with_reason():
     assert weights[2] < 1e-3 * weights[0] and believed.tolist() == [True, True, False, True, True]
 
 
+def test_the_watch_swaps_late_and_puts_back_late():
+    """Two markers on the way to each other's place: swapped past two thirds of it, put back before the half."""
+    places = np.array([[0, 0, 0], [0, 0, 0.08], [0.5, 0, 0], [0.5, 0.4, 0], [0, 0.8, 0]])
+    watch, seen = LabelWatch(5, 0.06), []
+    for share in (0.4, 0.64, 0.7, 1.0, 0.64, 0.52, 0.48, 0.2):
+        on_way = places.copy()
+        on_way[:2] += share * (places[1::-1] - places[:2])
+        seen.append(bool(watch.update(places, on_way)[0]))
+    assert seen == [False, False, True, True, True, True, False, False]
+
+
 def test_the_kalman_filter_is_the_smoother_of_its_past(subject, layout):
     """On numbers that add, a filter's last state is the least-squares solution over all frames so far."""
     body = MarkedBody(subject, layout, 0.3, 0.3)

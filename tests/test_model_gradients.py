@@ -4,6 +4,7 @@ from model_bodies import worm, worm_skeleton
 
 from model.blending import BlendedTemplate, rigid_weights
 from model.gradients import GradientSystem, edges, pose_gradients, shape_gradients
+from model.learning.config import LearnConfig
 from scanprep.geometry.mesh import Mesh
 
 
@@ -38,6 +39,15 @@ def test_a_linear_map_per_part_is_recovered_exactly(body):
     found = pose_gradients(GradientSystem(body, 0.001, parts), local)
     # the pull towards I is the only thing that moves them
     np.testing.assert_allclose(found, Q[:, parts], atol=1e-3)
+
+
+def test_smoothness_is_a_thousandth_of_the_mean_edge(body):
+    """[SCAPE] Eq. 5: w_s = 0.001 ρ, in the system and in what learning sets."""
+    sides = np.unique(np.sort(body.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    rho = np.linalg.norm(body.vertices[sides[:, 0]] - body.vertices[sides[:, 1]], axis=1).mean()
+    for smoothness in (GradientSystem(body).smoothness, LearnConfig().smoothness, LearnConfig.published().smoothness):
+        assert GradientSystem(body, smoothness).w_s == pytest.approx(0.001 * rho)
+        assert GradientSystem(body.with_vertices(2 * body.vertices), smoothness).w_s == pytest.approx(0.002 * rho)
 
 
 def test_eq_5_is_the_minimum_of_its_energy(body):

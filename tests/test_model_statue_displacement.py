@@ -24,7 +24,7 @@ from model.statue.detail.reconstruction import (
     remaining_error,
     surface_error,
 )
-from model.statue.detail.subdivision import chart_places, subdivide, subdivide_adaptive
+from model.statue.detail.subdivision import INNER, chart_places, subdivide, subdivide_adaptive
 from model.statue.detail.texels import bake_texture, continue_chart, find_texels, scan_look, vertex_of_row
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
@@ -262,6 +262,19 @@ def test_adaptive_subdivision_splits_where_the_surface_bends_without_a_crack(con
     truth = Reconstruction(control, one_bump, even).mesh()
     assert Surface(detailed).closest(truth.vertices).distances.max() < 3.5e-4
     assert len(subdivide_adaptive(control.mesh, control.chart, displaced, 1e-3, 4).faces) < len(fine.faces)
+
+
+@pytest.mark.parametrize("place", INNER.tolist(), ids=["middle", "corner 0", "corner 1", "corner 2"])
+def test_a_triangle_is_split_where_the_surface_rises_inside_it_alone(control, place):
+    """A cone on one triangle, flat along its sides: in four, and the three beside it in two."""
+    def displaced(faces, bary):
+        p, n = interpolate(control.mesh, faces, bary)
+        cone = np.maximum(0, 0.01 - 0.1 * np.linalg.norm(bary - place, axis=1))       # of 0.1 in barycentric numbers
+        return p + (np.where(faces == 77, cone, 0))[:, None] * n
+    for tolerance, more in ((0.009, 6), (0.011, 0)):
+        fine = subdivide_adaptive(control.mesh, control.chart, displaced, tolerance, 1)
+        assert len(fine.faces) == len(control.mesh.faces) + more
+        assert (np.bincount(fine.face_parent)[77] == 4) == bool(more)
 
 
 def test_reconstruction_comes_nearer_to_the_scan_with_every_level(control, scan, baked):

@@ -4,6 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from jointed_bodies import crab
+from scanned_shapes import bumpy
 
 from scanprep.alignment.icp import RigidConfig, align_landmarks, align_rigid, apply
 from scanprep.geometry import rotations
@@ -62,6 +63,15 @@ def test_clutter_and_missing_data_are_trimmed():
     away = rotations.log(found.T_target_source[:3, :3].T @ T[:3, :3])
     assert np.linalg.norm(away) < np.deg2rad(0.5)
     assert np.linalg.norm(apply(found.T_target_source, points) - apply(T, points), axis=1).max() < 0.005
+
+
+def test_what_lies_beyond_the_border_of_the_target_does_not_pull():
+    """Two thirds of a body have no partner on the part of it that is the target, but for its border."""
+    body, T = bumpy(4), transform([0.02, -0.01, 0.015], [0.001, -0.002, 0.001])
+    part = body.submesh(body.corners.mean(axis=1)[:, 2] > 0.05)[0]
+    found = align_rigid(body, part.with_vertices(apply(T, part.vertices)), config=RigidConfig(keep=1.0))
+    np.testing.assert_allclose(found.T_target_source, T, atol=1e-6)
+    assert found.inliers < len(part.vertices) < 0.4 * len(body.vertices)
 
 
 def test_equivariant_under_a_rigid_motion_of_the_target():

@@ -105,6 +105,7 @@ def test_glb_has_y_up_and_comes_back_as_it_was(tmp_path, up):
     write_mesh(tmp_path / "a.glb", mesh)
     shown = trimesh.load(tmp_path / "a.glb", force="mesh", process=False).vertices
     assert np.ptp(shown, axis=0).argmax() == 1 and np.array_equal(shown, np.float32(mesh.vertices @ turn_up(up).T))
+    assert np.array_equal(shown[:, 1], np.float32(mesh.vertices[:, up])) and np.linalg.det(turn_up(up)) == 1
     again = read_mesh(tmp_path / "a.glb", "m")
     assert np.array_equal(again.vertices, mesh.vertices) and np.array_equal(again.faces, mesh.faces)
     assert np.allclose(again.colors, mesh.colors, atol=1e-6)

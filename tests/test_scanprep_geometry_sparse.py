@@ -7,7 +7,7 @@ from scipy.sparse import csc_array, eye_array, random_array
 from scipy.spatial import ConvexHull
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import Factored, factor, harmonic
+from scanprep.geometry.sparse import Factored, conjugate_gradients, factor, harmonic, solve_smooth
 
 
 def system(n=80, seed=0):
@@ -53,6 +53,28 @@ def test_an_empty_system_is_refused_or_solved():
 def test_a_factored_system_can_be_sent_to_another_process():
     A, b = system(), np.random.default_rng(3).normal(size=(80, 3))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(Factored(A))).solve(b), Factored(A).solve(b))
+
+
+@pytest.mark.parametrize("columns", [(), (2,)], ids=["one side", "two sides"])
+def test_frames_are_coupled_by_their_second_differences(columns):
+    """As the whole matrix says: blocks on its diagonal, and D2 of every unknown with its own stiffness."""
+    rng, (T, P) = np.random.default_rng(4), (9, 3)
+    roots, stiffness, rhs = rng.normal(size=(T, P, P)), rng.uniform(1, 5, P), rng.normal(size=(T, P, *columns))
+    blocks = roots @ np.swapaxes(roots, 1, 2) + 0.1 * np.eye(P)
+    D2 = np.diff(np.eye(T), n=2, axis=0)
+    whole = np.kron(D2.T @ D2, np.diag(stiffness))
+    for t in range(T):
+        whole[P * t:P * t + P, P * t:P * t + P] += blocks[t]
+    expected = np.linalg.solve(whole, rhs.reshape(T * P, -1)).reshape(rhs.shape)
+    np.testing.assert_allclose(solve_smooth(blocks, stiffness, rhs), expected, rtol=1e-6, atol=1e-8)
+
+
+def test_conjugate_gradients_end_after_as_many_steps_as_there_are_values():
+    rng = np.random.default_rng(5)
+    values, axes = np.geomspace(1, 100, 6), np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    A, b, scale = axes * values @ axes.T, rng.normal(size=6), rng.uniform(0.5, 2, 6)
+    found = conjugate_gradients(lambda d: A @ d, b, lambda r: scale * r, 6, 1e-12)
+    np.testing.assert_allclose(A @ found, b, atol=1e-8)
 
 
 def test_harmonic_values_are_means_of_their_neighbours():

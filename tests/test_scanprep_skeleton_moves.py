@@ -39,6 +39,19 @@ def test_groups_are_halved_side_by_side_as_one_by_one(search, label):
         np.testing.assert_allclose(*costs, rtol=1e-9, atol=1e-15)
 
 
+def test_a_border_as_long_as_the_body_costs_a_hundredth_of_its_residual(search, label):
+    """Counted over the edges of the mesh; the residual counts as no less than the tolerance, 0.1% of the size."""
+    mesh, size = search.surface.mesh, np.sqrt(search.surface.mesh.face_areas.sum())
+    border = sum(np.linalg.norm(np.subtract(*mesh.vertices[edge])) for edge, (a, b) in
+                 zip(mesh.edges[mesh.edge_use == 2], mesh.face_pairs, strict=True) if label[a] != label[b])
+    residual = search.motions(label).cost.sum()
+    assert residual > (1e-3 * size)**2
+    assert search.energy(label) == pytest.approx(residual * (1 + 0.01 * border / size), rel=1e-9)
+    assert search.price(search.motions(label), 0.5) == pytest.approx(0.02 * residual / size)     # of half the surface
+    rigid = PartSearch(PosedSurface(mesh, mesh.vertices[None].repeat(3, axis=0)), SkeletonConfig(patches=120))
+    assert rigid.energy(label) == pytest.approx(0.01 * border / size * (1e-3 * size)**2, rel=1e-6)
+
+
 def test_a_group_in_pieces_keeps_them(search):
     moments = search.surface.moments(search.patch)
     half = halve(moments, np.array([[0, 1], [1, 2]]), np.zeros(len(moments.w), dtype=np.int64))

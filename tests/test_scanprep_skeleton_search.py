@@ -13,7 +13,7 @@ from scanprep.skeleton.motions import PosedSurface, closure, fit_motions, rigid_
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.sides import Sides, cover, mirror_pairs
-from scanprep.skeleton.symmetry import find_symmetry, mirrored_poses
+from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirrored_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import Person, mirrored_pose
 
@@ -111,6 +111,31 @@ def test_tied_labels_are_mirror_images(animal, poses):
     assert len(np.unique(joined)) == len(partner) - 1
     pairs = np.array([[0, 1], *np.sort(partner[[[0, 1]]])])
     assert mirror_pairs(pairs, partner).tolist() == [1, 0]
+
+
+def test_borders_of_one_side_stand_for_those_of_both():
+    """What a symmetric labelling costs on the side that is labelled is what it costs on the whole: a sheet in squares
+    of one metre, with borders of 7 m on either side and of 3 m on the plane; in the middle one part reaches over it.
+    """
+    x, y = (g.ravel() for g in np.meshgrid(np.arange(5), np.arange(5), indexing="ij"))
+    corner = np.flatnonzero((x < 4) & (y < 4))
+    side = np.concatenate([np.stack([corner, corner + 5, corner + 6], 1), np.stack([corner, corner + 6, corner + 1], 1)])
+    number = np.where(x == 0, np.arange(25), np.arange(25) + 20)             # of the mirrored vertices
+    sheet = Mesh(np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([-x, y, 0 * x], 1)[x > 0]]).astype(float),
+                 np.concatenate([side, number[side][:, ::-1]]))
+    F = len(side)
+    left, image = np.arange(2 * F) < F, sheet.vertices * [-1, 1, 1]
+    symmetry = Symmetry(np.array([1.0, 0, 0]), np.zeros(3), (np.arange(2 * F) + F) % (2 * F), left, 0.0, 1.0, image)
+    surface = PosedSurface(sheet, np.stack(2 * [sheet.vertices]))
+    sides = Sides(surface, symmetry)
+    at = sheet.corners[:F].mean(axis=1)
+    own = np.select([at[:, 1] < 1, at[:, 0] < 2], [2, 0], 1)                 # 2 reaches over the plane
+    label = np.concatenate([own, np.array([3, 4, 2])[own]])
+    partner, (a, b), (i, j) = sides.partners(label), surface.pairs.T, sides.pairs.T
+    assert partner.tolist() == [3, 4, 2, 0, 1]
+    whole = surface.pair_lengths[label[a] != label[b]].sum()
+    half = sides.lengths[own[i] != own[j]].sum() + sides.middle[partner[own] != own].sum()
+    assert half == pytest.approx(whole) and whole == pytest.approx(2 * (4 + 3) + 3)
 
 
 def test_pairs_join_together():
