@@ -106,6 +106,16 @@ def test_a_script_reads_only_options_that_it_has(script):
     assert {node.attr for node in used} <= options | added
 
 
+def test_every_mutation_has_its_place_in_the_code_and_its_tests(benchmarks):
+    """The table of `mutations.py` goes with the code: each text that it changes is found there, and once."""
+    from mutations import MUTATIONS, stands_once
+
+    assert [f"{m.path}: {m.name}" for m in MUTATIONS if not stands_once(m)] == []
+    names = [(m.path, m.name) for m in MUTATIONS]
+    assert len(set(names)) == len(names)
+    assert not {word for m in MUTATIONS for word in m.tests.split() if not (FOLDER.parent / f"test_{word}.py").exists()}
+
+
 def test_words_about_the_code_do_not_outdate_results(benchmarks):
     code = benchmarks.without_words(b'def f(x):\n    """Twice."""\n    return 2 * x\n')
     assert benchmarks.without_words(b'def f(x):\n    return 2 * x  # twice\n') == code

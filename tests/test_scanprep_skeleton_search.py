@@ -119,7 +119,7 @@ def test_borders_of_one_side_stand_for_those_of_both():
     """
     x, y = (g.ravel() for g in np.meshgrid(np.arange(5), np.arange(5), indexing="ij"))
     corner = np.flatnonzero((x < 4) & (y < 4))
-    side = np.concatenate([np.stack([corner, corner + 5, corner + 6], 1), np.stack([corner, corner + 6, corner + 1], 1)])
+    side = np.stack([corner, corner + 5, corner + 6, corner, corner + 6, corner + 1], 1).reshape(-1, 3)
     number = np.where(x == 0, np.arange(25), np.arange(25) + 20)             # of the mirrored vertices
     sheet = Mesh(np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([-x, y, 0 * x], 1)[x > 0]]).astype(float),
                  np.concatenate([side, number[side][:, ::-1]]))
