@@ -277,6 +277,25 @@ def test_a_triangle_is_split_where_the_surface_rises_inside_it_alone(control, pl
         assert (np.bincount(fine.face_parent)[77] == 4) == bool(more)
 
 
+@pytest.mark.parametrize("face", [77, 201])
+@pytest.mark.parametrize("whole", range(3))
+def test_between_two_split_sides_runs_the_shorter_diagonal(control, face, whole):
+    """Cones stand on the middles of two sides of a triangle; its side from corner `whole` to the next stays whole."""
+    a, b, top = np.roll(control.mesh.corners[face], -whole, axis=0)
+    feet = np.stack([a + top, b + top]) / 2
+
+    def displaced(faces, bary):
+        p, n = interpolate(control.mesh, faces, bary)
+        return p + np.maximum(0, 0.01 - np.linalg.norm(p[:, None] - feet, axis=2).min(axis=1))[:, None] * n
+    fine = subdivide_adaptive(control.mesh, control.chart, displaced, 0.005, 1)
+    mine, x = fine.faces[fine.face_parent == face], fine.points(control.mesh)
+    assert len(mine) == 3
+    sides, used = np.unique(np.sort(mine[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    inner = np.linalg.norm(x[sides[used == 2, 0]] - x[sides[used == 2, 1]], axis=1)
+    ways = [np.linalg.norm(feet[1] - a), np.linalg.norm(feet[0] - b)]
+    np.testing.assert_allclose(np.sort(inner), np.sort([np.linalg.norm(feet[0] - feet[1]), min(ways)]), atol=1e-9)
+
+
 def test_reconstruction_comes_nearer_to_the_scan_with_every_level(control, scan, baked):
     errors = [surface_error(Reconstruction(control, baked, subdivide(control.mesh, control.chart, level)).mesh(), scan,
                             20_000) for level in range(4)]
