@@ -79,6 +79,18 @@ def test_batch_is_the_loop(name):
         np.testing.assert_allclose(all_at_once.energy[b], (one.values[0]**2).sum())
 
 
+def test_what_is_expected_costs_nothing_and_what_is_off_its_weight():
+    """[SCAPE] Eq. 11 as damping: w d² for every unknown that is off by d."""
+    x, weights = np.arange(1.0, 6.0), np.array([0.0, 1, 2, 3, 4])
+    assert energy.stay_near(x, x, weights).energy == 0
+    assert energy.stay_near(x + 0.1, x, weights).energy == pytest.approx(0.01 * 10)
+
+
+def test_outliers_lose_all_but_a_quarter_of_their_weight_at_the_scale():
+    """1 / (1 + (d/s)²)², so that what an outlier costs, w d², falls beyond the scale."""
+    np.testing.assert_allclose(energy.geman_mcclure(np.array([0.0, 0.05, 0.1, 0.15]), 0.05), [1, 1 / 4, 1 / 25, 1 / 100])
+
+
 def test_a_target_that_was_not_seen_counts_nothing():
     x = unknowns(FIXED)[None]
     follow = FIXED.follow(IDS, x[0])

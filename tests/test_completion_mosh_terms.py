@@ -153,6 +153,19 @@ def test_wands_may_stand_off_and_bars_may_be_worn_without():
         np.testing.assert_array_equal(same, layout.distances)
 
 
+def test_what_both_sides_say_of_their_distance_counts_where_they_are_worn_alike():
+    """24 and 4 mm off the marker's usual distance are 14 mm together, within 16 mm: neither is on a wand. One alone is."""
+    off = np.array([0.024, 0.004, 0, 0, 0, 0])
+    for labels, named in ((("LTHI", "RTHI", *"ABCD"), True), (("LTHI", "LTIB", *"ABCD"), False)):
+        layout = MarkerLayout(labels, LAYOUT.vertices, 0.0095, wands=labels[:2])
+        fit = terms.LatentFit(MODEL, layout, beside(mean_mesh())[None], terms.PersonConfig(n_betas=K))
+        places = replace(layout, distances=0.0095 + off).place(mean_mesh())
+        state = fit._hung(np.zeros((1, 15)), np.zeros(K), places, layout, fit.reach, False)
+        np.testing.assert_allclose(fit._measured(state, False).layout.distances, 0.0095 + off, atol=1e-9)
+        last = np.asarray(fit._measured(state, True).layout.distances)
+        np.testing.assert_allclose(last[:2], [0.0095 if named else 0.0335, 0.0095], atol=1e-9)
+
+
 def test_loose_markers_are_held_by_twenty_centimetres():
     layout = replace(LAYOUT, loose=("B",))
     fit = terms.LatentFit(MODEL, layout, beside(mean_mesh())[None], terms.PersonConfig(n_betas=K, initial=1.0))

@@ -2,12 +2,22 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model, worm_skeleton
 
-from model.features import LinearLift, PoseFeatures, QuadraticLift, RadialLift, restored_features, twists
+from model.features import (
+    LinearLift,
+    PoseFeatures,
+    QuadraticLift,
+    QuaternionLift,
+    RadialLift,
+    RotationLift,
+    restored_features,
+    twists,
+)
 
 
 def lifts():
     rng = np.random.default_rng(0)
-    return [LinearLift(), QuadraticLift(), RadialLift(rng.normal(0, 0.5, (4, 5, 3)), rng.uniform(0.5, 1.5, 4))]
+    return [LinearLift(), QuadraticLift(), RadialLift(rng.normal(0, 0.5, (4, 5, 3)), rng.uniform(0.5, 1.5, 4)),
+            RotationLift(), QuaternionLift()]
 
 
 def features_of(lift):

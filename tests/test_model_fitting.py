@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
-from model.fitting import FitConfig, fit_pose, fit_shape, share_of_vertices, spread_vertices
+from model.fitting import FitConfig, _equations, fit_pose, fit_shape, share_of_vertices, spread_vertices
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.geometry import rotations
@@ -68,6 +68,21 @@ def test_shares_count_every_vertex_once(model):
     assert share.sum() == len(vertices) and share.min() >= 1
     at_least = ((far <= far.min(axis=1, keepdims=True) + 1e-12).sum(axis=1) == 1)      # those with one nearest
     assert (share >= np.bincount(far[at_least].argmin(axis=1), minlength=40)).all()
+
+
+def test_points_count_by_their_weights(model):
+    """The energy is the weighted sum of squared distances, and its derivative that of the finite difference."""
+    ids, rng = np.arange(0, 398, 40), np.random.default_rng(6)
+    x, target, weights = rng.normal(0, 0.3, 3 * 4 + 3 + model.n_betas), rng.normal(size=(10, 3)), rng.uniform(1, 9, 10)
+    equations = _equations(model.points(ids), target, weights)
+
+    def energy(x):
+        return weights @ ((model.vertices(x[:12].reshape(4, 3), x[15:], x[12:15])[ids] - target)**2).sum(axis=1)
+    found = equations(x[None])
+    np.testing.assert_allclose(found.energy, energy(x), rtol=1e-6)
+    for i, step in enumerate(1e-5 * np.eye(len(x))):
+        slope = (energy(x + step) - energy(x - step)) / 2e-5
+        assert 2 * found.gradient[0, i] == pytest.approx(slope, rel=1e-4, abs=1e-3)
 
 
 def test_shape_with_fewer_components(model):

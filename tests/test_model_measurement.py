@@ -10,7 +10,7 @@ from model import body_with_measurements, find_tapes, measure
 from model.measurement import reading
 from model.measurement.catalogue import CATALOGUE, named
 from model.measurement.path import shortest_path
-from model.measurement.reading import Standing
+from model.measurement.reading import Reading, Standing
 from model.measurement.section import around, bulge, direction, mean_of, section, tape
 from model.measurement.tapes import Girth, Span, Way
 from model.measurement.uncertainty import measured_error
@@ -237,6 +237,16 @@ def test_stated_errors(person, tapes):
     assert np.abs(waist.along(np.ones_like(person.mesh.vertices)[:, None, :].transpose(0, 2, 1))).max() < 1e-9
     near = measured_error(waist, 1e-6 * person.mesh.vertices, error)       # all errors the same
     assert near == pytest.approx(plain.errors["waist_girth"], abs=1e-7)
+
+
+@pytest.mark.parametrize("apart", [0.02, 0.1, 0.5])
+def test_errors_of_near_points_cancel_and_of_far_ones_add_up(apart):
+    """A distance whose ends are off by e in all directions: e²/3 at each, correlated as a bell of 10 cm says."""
+    ends = np.array([[0.0, 0, 0], [apart, 0, 0]])
+    reading = Reading(apart, ends, np.array([0, 1]), np.array([[-1.0, 0, 0], [1, 0, 0]]), slope=0.5)
+    e = 1e-4
+    square = 2 * e**2 / 3 * (1 - np.exp(-0.5 * (apart / 0.1)**2)) + (0.5 * 0.003)**2
+    assert measured_error(reading, ends, np.full(2, e))**2 == pytest.approx(square, rel=1e-9)
 
 
 def test_the_body_with_some_measurements(small_tapes):

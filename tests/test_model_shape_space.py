@@ -30,6 +30,7 @@ def test_betas_have_zero_mean_and_unit_variance(people):
     betas = np.linalg.lstsq(flat.T, (S - space.mean).reshape(40, -1).T, rcond=None)[0]
     np.testing.assert_allclose(betas.mean(axis=1), 0, atol=1e-5)
     np.testing.assert_allclose(betas @ betas.T / 40, np.eye(3), atol=1e-4)
+    np.testing.assert_allclose(space.betas_of(S), betas.T, atol=1e-4)
     np.testing.assert_allclose((flat**2).sum(axis=1), space.variances, rtol=1e-5)
     for i in (0, 17):
         np.testing.assert_allclose(space.gradients(betas[:, i]), S[i], atol=1e-5)
