@@ -88,7 +88,8 @@ def test_what_is_expected_costs_nothing_and_what_is_off_its_weight():
 
 def test_outliers_lose_all_but_a_quarter_of_their_weight_at_the_scale():
     """1 / (1 + (d/s)²)², so that what an outlier costs, w d², falls beyond the scale."""
-    np.testing.assert_allclose(energy.geman_mcclure(np.array([0.0, 0.05, 0.1, 0.15]), 0.05), [1, 1 / 4, 1 / 25, 1 / 100])
+    found = energy.geman_mcclure(np.array([0.0, 0.05, 0.1, 0.15]), 0.05)
+    np.testing.assert_allclose(found, [1, 1 / 4, 1 / 25, 1 / 100])
 
 
 def test_a_target_that_was_not_seen_counts_nothing():

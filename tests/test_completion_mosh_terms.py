@@ -154,7 +154,7 @@ def test_wands_may_stand_off_and_bars_may_be_worn_without():
 
 
 def test_what_both_sides_say_of_their_distance_counts_where_they_are_worn_alike():
-    """24 and 4 mm off the marker's usual distance are 14 mm together, within 16 mm: neither is on a wand. One alone is."""
+    """24 and 4 mm from the usual distance are 14 mm together, within 16 mm: neither is on a wand. One alone is."""
     off = np.array([0.024, 0.004, 0, 0, 0, 0])
     for labels, named in ((("LTHI", "RTHI", *"ABCD"), True), (("LTHI", "LTIB", *"ABCD"), False)):
         layout = MarkerLayout(labels, LAYOUT.vertices, 0.0095, wands=labels[:2])
