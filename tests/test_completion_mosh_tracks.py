@@ -8,7 +8,7 @@ from marker_faults import CONFIG, FRAMES, LABELS, RATE, exchanged
 
 from completion.mocap.artefacts.results import BadSpan, list_swaps
 from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
-from completion.mocap.pose.swaps import TORN, Tracks, _two_states, find_order
+from completion.mocap.pose.swaps import AWAY, TORN, Tracks, _two_states, find_order, marker_levels
 from scanprep.geometry import rotations
 
 
@@ -49,6 +49,24 @@ def test_links_tell_which_label_goes_on():
     positions[45:50, 1] = np.nan                                     # over a gap: not as sure, but still the best
     cost = Tracks(positions, RATE).links(np.array([50]), np.array([1]), np.array([4]))[0]
     assert 0 < cost < TORN - 2
+
+
+def test_over_a_gap_a_track_may_have_been_accelerated():
+    """Half squared deviations, and three times the logarithm by which they have grown: 2 mm a frame, 10 m/s² unseen."""
+    positions = np.zeros((60, 1, 3))
+    positions[40:] += [0.0, 0.01, 0.0]
+    for gap in (2, 6, 11):
+        holed = positions.copy()
+        holed[41 - gap:40] = np.nan
+        sd = 0.002 * (gap + 1) / 2 + 10 / 2 * ((gap - 1) / RATE)**2
+        cost = Tracks(holed, RATE).links(np.array([40]), np.array([0]), np.array([0]))[0]
+        assert cost == pytest.approx(min(0.01**2 / (2 * sd**2) + 3 * np.log(sd / 0.002), TORN))
+
+
+def test_labels_cost_half_squared_deviations_from_their_place_and_no_more_than_away():
+    places, sd = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [np.nan, 0, 0]]), 0.008
+    seen = np.array([[0.008, 0, 0], [0, -0.016, 0], [0, 0, 0.5], [np.nan, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(marker_levels(places, seen, np.array(sd)), [0.5, 2, AWAY, 0, AWAY])
 
 
 # ---- exchanges from tracks alone
