@@ -15,7 +15,7 @@ from model.statue.control.chart import make_chart
 from model.statue.control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from model.statue.detail.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
 from model.statue.detail.maps import read_map, write_map
-from model.statue.detail.normal_volume import from_normal_volume, interpolate, to_normal_volume
+from model.statue.detail.normal_volume import from_normal_volume, interpolate, limits, not_inverted, to_normal_volume
 from model.statue.detail.reconstruction import (
     Reconstruction,
     displaced_surface,
@@ -98,6 +98,25 @@ def test_the_least_height_over_all_triangles_is_found():
     assert np.mean(np.abs(np.abs(found.heights[upright]) - slow[upright]) < 1e-9) > 0.8
     assert np.isinf(slow).any() and not found.inside[np.isinf(slow)].any()
     assert np.isnan(found.heights[~found.inside]).all() and not found.solutions[~found.inside].any()
+
+
+def test_inside_a_flat_body_the_nearer_side_is_taken_and_the_other_one_is_the_limit():
+    """A disc 2 cm thick: from 4 mm above its middle 6 mm to the upper side; heights go 3/4 of the way to the other."""
+    ball, _ = globe(24, 40, 0.05)
+    disc = ball.with_vertices(ball.vertices * [1, 1, 0.2])
+    found = to_normal_volume(disc, np.array([[0.001, 0.002, 0.004]]), 0.03)
+    assert found.solutions.tolist() == [2] and found.heights[0] == pytest.approx(-0.006, abs=1e-4)
+    low, high = limits(disc, np.array([[0.001, 0.002, 0.01]]), np.array([[0.0, 0, 1]]), 0.03)
+    assert low[0] == pytest.approx(-0.75 * 0.02, rel=0.01) and high[0] == pytest.approx(0.03)
+
+
+def test_triangles_of_a_ball_are_inverted_near_its_middle():
+    """Moved inwards by a share s of the radius an area is (1 - s)² of itself: a twentieth at 0.776."""
+    ball, _ = globe(24, 40, 0.05)
+    faces = np.arange(200, 240)
+    for share, good in ((-0.9, False), (-0.8, False), (-0.7, True), (2.0, True)):
+        heights = np.full(40, share * 0.05)
+        assert (not_inverted(ball, faces, np.full((40, 3), 1 / 3), heights) == good).all(), share
 
 
 def test_heights_of_a_bumpy_sphere_are_those_of_its_formula(places, baked):

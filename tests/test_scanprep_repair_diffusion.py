@@ -65,6 +65,19 @@ def test_lines_of_sight_measure_how_far_space_is_empty():
     assert ahead[3] == -np.inf                                  # nothing was seen behind it
 
 
+def test_what_was_seen_to_be_empty_is_outside():
+    """Within a ball whose hole was looked into, which without that would be continued over it."""
+    class Pit:
+        def ahead(self, points):
+            return np.where(np.linalg.norm(points - [0, 0, 0.1], axis=1) < 0.035, 0.05, -np.inf)
+
+    holed = pierced(ball(4), [0, 0, 0.1], 0.05)
+    inside = np.array([[0, 0, 0.08], [0.01, 0, 0.085], [0, -0.01, 0.09]])
+    for seen, sign in ((None, -1), (Pit(), 1)):
+        found = diffused_surface(holed, holed.boundary_vertices, seen)
+        assert (np.sign(signed_distance(found, inside)[0]) == sign).all()
+
+
 def test_seen_space_stays_empty():
     dent, holed = dented()
     # A wall behind, seen by a camera that looks into the dent from the side and above: a line of sight is evidence.

@@ -10,17 +10,24 @@ from __future__ import annotations
 
 import argparse
 import ast
+import multiprocessing
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from protocols import machine, write_report
+import igl  # noqa: F401 -- these are loaded once for all processes, which takes longer than most tests
+import numpy  # noqa: F401
+import pytest
+import scipy.ndimage
+import scipy.optimize
+import scipy.sparse.linalg
+import scipy.spatial.transform
+import scipy.stats  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[2]
 LONGEST = 600                        # seconds for the tests of a mutation: one that hangs is noticed
@@ -477,6 +484,20 @@ def stands_once(mutation: Mutation, root: Path = ROOT) -> bool:
     return (root / mutation.path).read_text(encoding="utf-8").count(mutation.before) == 1
 
 
+def _run_pytest(root: Path, files: list[str], said: Path) -> None:
+    """In a process of its own, which has the libraries but nothing of the packages yet: the tests of a copy."""
+    os.chdir(root)
+    sys.path[:0] = paths = [str(root), str(root / "tests")]
+    os.environ["PYTHONPATH"] = os.pathsep.join(paths)            # of processes that tests start
+    os.environ.pop("SCAPEKIT_DATA", None)
+    with said.open("w") as out:
+        os.dup2(out.fileno(), 1)
+        os.dup2(out.fileno(), 2)
+    code = pytest.main(["-x", "-n0", "-q", "-p", "no:cacheprovider", "--tb=line", *files])
+    sys.stdout.flush()
+    os._exit(int(code))
+
+
 class Copy:
     """A copy of the checkout, in which mutations are made."""
 
@@ -487,17 +508,18 @@ class Copy:
 
     def run(self, tests: str) -> tuple[bool, str]:
         """Whether all of some tests pass, and the first that does not."""
+        said = self.root.parent / "said.txt"
         files = [f"tests/test_{word}.py" for word in tests.split()]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (self.root, self.root / "tests")))}
-        environment.pop("SCAPEKIT_DATA", None)
-        command = [sys.executable, "-m", "pytest", "-x", "-n0", "-q", "-p", "no:cacheprovider", "--tb=line", *files]
-        try:
-            done = subprocess.run(command, cwd=self.root, env=environment, capture_output=True, text=True,
-                                  timeout=LONGEST, check=False)
-        except subprocess.TimeoutExpired:
+        process = multiprocessing.get_context("fork").Process(target=_run_pytest, args=(self.root, files, said))
+        process.start()
+        process.join(LONGEST)
+        if process.is_alive():
+            process.kill()
+            process.join()
             return False, f"more than {LONGEST} s"
-        found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-        return done.returncode == 0, found[1] if found else "" if done.returncode == 0 else done.stdout[-300:]
+        text = said.read_text(errors="replace")
+        found = re.search(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)
+        return process.exitcode == 0, found[1] if found else "" if process.exitcode == 0 else text[-300:]
 
     def noticed(self, mutation: Mutation) -> dict[str, object]:
         """What the tests of a mutation say of it."""
@@ -536,6 +558,8 @@ def main() -> None:
     if args.show:
         print(*(f"{m.path}: {m.name}\n  - {m.before}\n  + {m.after}" for m in chosen), sep="\n")
         return
+    # the checkout's own packages must not be there when processes load those of the copy
+    sys.path[:] = [path for path in sys.path if Path(path or ".").resolve() not in (ROOT, ROOT / "tests")]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
@@ -546,6 +570,9 @@ def main() -> None:
     survived = [f"{row['file']}: {row['mutation']}" for row in known if not row["noticed"]]
     print(f"{len(known) - len(survived)} of {len(known)} noticed; survived: {'; '.join(survived) or 'none'}")
     if args.output:
+        sys.path.insert(0, str(ROOT))
+        from protocols import machine, write_report
+
         write_report(args.output, {"protocol": "mutations of the mathematics, each against the tests of its module",
                                    "machine": machine(), "noticed": len(known) - len(survived), "of": len(known),
                                    "survived": survived, "rows": rows})
