@@ -159,7 +159,7 @@ MUTATIONS = (
         ("a foot of the other kind decides", "against * min(CUT / below.max(), 1.0)",
          "against * min(below.max() / CUT, 1.0)"),
         ("floor of the side away", "normal *= np.sign(normal @ up)", "normal *= -np.sign(normal @ up)")),
-    *of("scanprep/skeleton/parts.py", "scanprep_skeleton_moves scanprep_skeleton_search scanprep_skeleton_find",
+    *of("scanprep/skeleton/parts.py", "scanprep_skeleton_moves scanprep_skeleton_search",
         ("borders between parts at twice the price", "self.width = 0.01 /", "self.width = 0.02 /"),
         ("borders between parts at half the price", "self.width = 0.01 /", "self.width = 0.005 /"),
         ("borders between parts for nothing", "self.width = 0.01 /", "self.width = 0 * 0.01 /"),
