@@ -30,7 +30,7 @@ import scipy.spatial.transform
 import scipy.stats  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[2]
-LONGEST = 600                        # seconds for the tests of a mutation: one that hangs is noticed
+LONGEST = 600                        # seconds for a file of tests: a mutation that hangs is noticed
 
 
 @dataclass(frozen=True)
@@ -484,8 +484,8 @@ def stands_once(mutation: Mutation, root: Path = ROOT) -> bool:
     return (root / mutation.path).read_text(encoding="utf-8").count(mutation.before) == 1
 
 
-def _run_pytest(root: Path, files: list[str], said: Path) -> None:
-    """In a process of its own, which has the libraries but nothing of the packages yet: the tests of a copy."""
+def _run_pytest(root: Path, name: str, said: Path) -> None:
+    """In a process of its own, which has the libraries but nothing of the packages yet: a file of tests of a copy."""
     os.chdir(root)
     sys.path[:0] = paths = [str(root), str(root / "tests")]
     os.environ["PYTHONPATH"] = os.pathsep.join(paths)            # of processes that tests start
@@ -493,7 +493,7 @@ def _run_pytest(root: Path, files: list[str], said: Path) -> None:
     with said.open("w") as out:
         os.dup2(out.fileno(), 1)
         os.dup2(out.fileno(), 2)
-    code = pytest.main(["-x", "-n0", "-q", "-p", "no:cacheprovider", "--tb=line", *files])
+    code = pytest.main(["-x", "-n0", "-q", "-p", "no:cacheprovider", "--tb=line", name])
     sys.stdout.flush()
     os._exit(int(code))
 
@@ -507,16 +507,22 @@ class Copy:
                                                                        "__pycache__"))
 
     def run(self, tests: str) -> tuple[bool, str]:
-        """Whether all of some tests pass, and the first that does not."""
+        """Whether all of some tests pass, file by file in this order, and the first that does not."""
+        for word in tests.split():
+            passed, failing = self._run_file(f"tests/test_{word}.py")
+            if not passed:
+                return False, failing
+        return True, ""
+
+    def _run_file(self, name: str) -> tuple[bool, str]:
         said = self.root.parent / "said.txt"
-        files = [f"tests/test_{word}.py" for word in tests.split()]
-        process = multiprocessing.get_context("fork").Process(target=_run_pytest, args=(self.root, files, said))
+        process = multiprocessing.get_context("fork").Process(target=_run_pytest, args=(self.root, name, said))
         process.start()
         process.join(LONGEST)
         if process.is_alive():
             process.kill()
             process.join()
-            return False, f"more than {LONGEST} s"
+            return False, f"{name}: more than {LONGEST} s"
         text = said.read_text(errors="replace")
         found = re.search(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)
         return process.exitcode == 0, found[1] if found else "" if process.exitcode == 0 else text[-300:]
