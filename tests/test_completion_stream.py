@@ -12,7 +12,7 @@ from completion.mocap.pose.follow import AnimateConfig, animate, low_pass
 from completion.mocap.pose.foot_contact import Floor, FootContact
 from completion.mocap.pose.marked_body import MarkedBody, supports
 from completion.mocap.pose.part_shapes import PartShapes
-from completion.mocap.pose.robust import LabelWatch, marker_weights
+from completion.mocap.pose.robust import LabelWatch, marker_speed, marker_weights
 from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.motion import Motion
 from model.features import linear_features
@@ -164,6 +164,13 @@ def test_the_watch_changes_its_mind_only_with_reason():
     assert (watch.update(places, stray) == np.arange(5)).all()
     weights, believed = marker_weights(places, stray, 0.01, 0.06)
     assert weights[2] < 1e-3 * weights[0] and believed.tolist() == [True, True, False, True, True]
+
+
+@pytest.mark.parametrize("rate", [25.0, 120.0])
+def test_the_speed_of_markers_is_in_metres_a_second(rate):
+    x = np.arange(40)[:, None, None] / rate * np.array([1.2, -1.6, 0.0]) + np.zeros((40, 3, 3))
+    x[5:9, 1] = np.nan
+    assert marker_speed(MarkerSequence(x, tuple("ABC"), rate)) == pytest.approx(2.0)
 
 
 def test_the_watch_swaps_late_and_puts_back_late():
