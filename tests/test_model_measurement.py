@@ -11,7 +11,7 @@ from model.measurement import reading
 from model.measurement.catalogue import CATALOGUE, named
 from model.measurement.path import shortest_path
 from model.measurement.reading import Reading, Standing
-from model.measurement.section import around, bulge, direction, mean_of, section, tape
+from model.measurement.section import Curve, around, bulge, direction, mean_of, section, tape
 from model.measurement.tapes import Girth, Span, Way
 from model.measurement.uncertainty import measured_error
 from scanprep.geometry.mesh import Mesh
@@ -237,6 +237,15 @@ def test_stated_errors(person, tapes):
     assert np.abs(waist.along(np.ones_like(person.mesh.vertices)[:, None, :].transpose(0, 2, 1))).max() < 1e-9
     near = measured_error(waist, 1e-6 * person.mesh.vertices, error)       # all errors the same
     assert near == pytest.approx(plain.errors["waist_girth"], abs=1e-7)
+
+
+def test_the_centroid_of_a_curve_counts_its_length_and_not_its_points():
+    """Of a square with five points on one side, and as a carried point on another body: there with the same weights."""
+    corners = np.array([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    edges = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [1, 2], [2, 3], [3, 0]])
+    square = Curve(edges, np.array([0.0, 0.1, 0.3, 0.6, 0.0, 0.0, 0.0]), True)
+    np.testing.assert_allclose(square.centroid(corners).at(corners), [0.5, 0.5, 1])
+    np.testing.assert_allclose(square.centroid(corners).at(2 * corners), [1, 1, 2])
 
 
 @pytest.mark.parametrize("apart", [0.02, 0.1, 0.5])

@@ -40,6 +40,14 @@ def test_a_point_projects_to_its_pixel():
     assert not picture.project(outside)[2].any()
 
 
+def test_a_pixel_of_a_halved_picture_is_the_middle_of_four():
+    picture = DepthPicture.of(np.full((240, 320), 2.0), K)
+    small = picture.halved()
+    row, column = np.indices((120, 160))
+    assert (small.depth == 2).all()
+    np.testing.assert_allclose(small.directions(column, row), picture.directions(2 * column + 0.5, 2 * row + 0.5))
+
+
 def test_normals_are_those_of_the_plane():
     normal = np.array([0.3, -0.2, -1])
     normal /= np.linalg.norm(normal)

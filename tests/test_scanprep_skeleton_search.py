@@ -136,6 +136,13 @@ def test_borders_of_one_side_stand_for_those_of_both():
     whole = surface.pair_lengths[label[a] != label[b]].sum()
     half = sides.lengths[own[i] != own[j]].sum() + sides.middle[partner[own] != own].sum()
     assert half == pytest.approx(whole) and whole == pytest.approx(2 * (4 + 3) + 3)
+    # one part over the plane, where what it costs more, on 64 triangles, is less than its 4 m of border there
+    split = np.where(left, 0, 3)
+    for more in (0.02, 0.09):
+        costs = np.full((2 * F, 5), 9.0)
+        costs[np.arange(2 * F), split], costs[:, 2] = 0, more
+        wanted = 2 if 2 * F * more < 4 else split
+        assert (sides.relabel(costs, 1.0, split, partner) == wanted).all()
 
 
 def test_pairs_join_together():
