@@ -24,6 +24,8 @@ from scanprep.registration.matches import (
     match_both_ways,
     path_anchors,
     path_lengths,
+    pull,
+    tukey,
 )
 from scanprep.registration.nonrigid import evidence, register
 from scanprep.registration.schedule import RegistrationConfig
@@ -51,6 +53,24 @@ def small() -> RegistrationConfig:
 
 
 # ---- paths --------------------------------------------------------------------------------------------------
+
+def test_what_draws_vertices_is_the_weighted_squared_distance_and_less_along_the_surface():
+    """Two targets of one vertex, one of another; across a surface all of the force, along it a share."""
+    rng = np.random.default_rng(0)
+    x, targets, weights = rng.normal(size=(4, 3)), rng.normal(size=(3, 3)), np.array([1.0, 2, 3])
+    normals = np.array([[0.0, 0, 1], [0, 1, 0], [0.6, 0, 0.8]])
+    off = x[[2, 2, 0]] - targets
+    across = np.einsum("nd,nd->n", off, normals)
+    for slide in (0.0, 0.1, 1.0):
+        drawn = pull(4, np.array([2, 2, 0]), targets, weights, normals, slide)
+        expected = weights @ (across**2 + slide * ((off**2).sum(axis=1) - across**2))
+        assert drawn.energy(x) == pytest.approx(expected)
+
+
+def test_matches_lose_their_weight_towards_their_reach():
+    """Tukey's (1 - (d/r)²)²: nine sixteenths at the half."""
+    np.testing.assert_allclose(tukey(np.array([0.0, 0.01, 0.02, 0.05]), 0.02), [1, 9 / 16, 0, 0])
+
 
 def test_path_lengths_are_those_along_the_surface():
     mesh = body()
