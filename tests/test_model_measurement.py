@@ -1,5 +1,6 @@
 """Measurements: known sections and ways, two derivations of a girth, derivatives, what is carried, what is missing."""
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -271,6 +272,8 @@ def test_the_body_with_some_measurements(small_tapes):
     mean = measure(model.vertices(pose, np.zeros(4)), tapes, tapes.axes).values
     usual = body_with_measurements(model, tapes, {"stature": mean["stature"]})
     assert usual.deviations < 1e-3 and usual.rarer > 0.999
+    tall = body_with_measurements(model, tapes, {"stature": mean["stature"] + 0.05})
+    assert tall.rarer == pytest.approx(math.erfc(tall.deviations / np.sqrt(2)))         # of one number: both tails
     apart = body_with_measurements(model, tapes, {"waist": 1.6, "hip": 0.7})
     assert set(apart.missed) == {"waist_girth", "hip_girth"} and np.isfinite(apart.betas).all()
 
