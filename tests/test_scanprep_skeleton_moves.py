@@ -5,6 +5,7 @@ from animal_bodies import Animal, Build, random_pose
 
 from scanprep.skeleton import joints
 from scanprep.skeleton.joints import dissolve_bands, passages, to_tree
+from scanprep.skeleton.labels import field_energy, relabel
 from scanprep.skeleton.motions import PosedSurface, agglomerate, halve, rigid_costs
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 
@@ -50,6 +51,22 @@ def test_a_border_as_long_as_the_body_costs_a_hundredth_of_its_residual(search, 
     assert search.price(search.motions(label), 0.5) == pytest.approx(0.02 * residual / size)     # of half the surface
     rigid = PartSearch(PosedSurface(mesh, mesh.vertices[None].repeat(3, axis=0)), SkeletonConfig(patches=120))
     assert rigid.energy(label) == pytest.approx(0.01 * border / size * (1e-3 * size)**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_labels_of_two_kinds_are_the_best_of_all_and_of_three_no_expansion_is_better(seed):
+    """Ten triangles with random costs, neighbours and prices, against all 1,024 labellings or expansions."""
+    rng = np.random.default_rng(seed)
+    pairs, every = np.argwhere(np.triu(rng.random((10, 10)) < 0.4, 1)), np.indices((2,) * 10).reshape(10, -1).T
+    prices = rng.uniform(0.1, 0.6, len(pairs))
+    for kinds in (2, 3):
+        costs = rng.uniform(0, 1, (10, kinds))
+        label = relabel(costs, pairs, prices, np.zeros(10, dtype=np.int64), rounds=20)
+        energy = field_energy(costs, pairs, prices, label)
+        differ = sum(price for (a, b), price in zip(pairs, prices, strict=True) if label[a] != label[b])
+        assert energy == pytest.approx(costs[np.arange(10), label].sum() + differ)
+        others = every if kinds == 2 else [np.where(turn, k, label) for turn in every for k in range(3)]
+        assert energy <= min(field_energy(costs, pairs, prices, other) for other in others) + 1e-3    # whole numbers
 
 
 def test_a_group_in_pieces_keeps_them(search):
