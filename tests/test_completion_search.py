@@ -74,6 +74,20 @@ def test_a_glance_tells_the_body_of_the_scan_from_others(model, scene):
     assert np.corrcoef(cost.argsort().argsort(), misfit.argsort().argsort())[0, 1] > 0.9
 
 
+def test_neighbouring_twists_are_damped_and_the_root_is_not(model, scene):
+    """[SCAPE] Eq. 11: with an endless weight no joint turns, and the body still moves to the scan as a whole."""
+    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
+    x = fit.body.join(POSE, TRANS + 0.02)
+    x[3:12] += np.random.default_rng(2).normal(0, 0.1, 9)
+    turned = []
+    for weight in (0.0, 1e9):
+        fit.config = replace(QUICK, twist_weight=weight)
+        ahead, _ = fit.step(x, fit.thin, 0.2)
+        assert np.abs(ahead[12:15] - x[12:15]).max() > 1e-3
+        turned.append(np.abs(ahead[3:12] - x[3:12]).max())
+    assert turned[0] > 1e-3 and turned[1] < 1e-3 * turned[0]
+
+
 def test_what_is_laid_on_the_scan_lies_there(model, scene):
     _, points = scene
     fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(points), *NOTHING, QUICK)

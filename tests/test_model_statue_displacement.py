@@ -198,6 +198,17 @@ def test_a_hole_is_told_and_filled_from_around_it(control, scan, places):
     assert filled.max() <= known.max() and filled.min() >= known.min()
 
 
+def test_a_hole_over_the_seam_is_filled_as_high_as_all_around_it(control, places):
+    """A sphere 8 mm outside of the control sphere, without its side at x > 5 cm, where the seam runs."""
+    ball, texels = globe(80, 120, R + 0.008)[0], places[0]
+    cut = ball.submesh(ball.corners.mean(axis=1)[:, 0] < 0.05)[0]
+    found = bake(control, cut, DisplacementConfig(size=SIZE))
+    kind, heights = (of.ravel()[texels.pixels[texels.inside]] for of in (found.coverage, found.heights))
+    known = heights[kind == MEASURED]
+    assert (kind == HOLE).mean() > 0.2 and known.min() > 0.007
+    assert (heights[kind == HOLE] >= known.min()).all() and (heights[kind == HOLE] <= known.max()).all()
+
+
 @pytest.fixture(scope="module")
 def with_vectors(control):
     return bake(control, mushroom(R), DisplacementConfig(size=384, vectors=True))
