@@ -19,7 +19,7 @@ from scanprep.batch.digests import Digests
 from scanprep.batch.opening import workspace
 from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
-from scanprep.batch.room import Job, attempt
+from scanprep.batch.room import Job, Room, attempt
 from scanprep.batch.values import load_value, save_value
 from scanprep.batch.workspace import Task
 from scanprep.console import Metric
@@ -141,6 +141,52 @@ def test_only_what_depends_on_a_change_is_done_anew(tmp_path, texts):
     record = tmp_path / "out" / HOME / "done" / "c.npz"
     record.write_bytes(record.read_bytes()[:-40])
     assert copied(tmp_path, texts, "?")[1] == 1                  # a result that is damaged
+
+
+def test_what_another_program_made_is_made_anew(tmp_path, texts, monkeypatch):
+    """Tasks, their steps and steps of commands; results stay those of their work, and files keep their digests."""
+    package = tmp_path / "installed" / "model"
+    (package / "layouts").mkdir(parents=True)
+    monkeypatch.setattr(digests_module, "INSTALLED", package.parent)
+
+    def made():
+        """How many tasks, steps of them, and steps of the output were made; digests of a model."""
+        digests_module._program_in.cache_clear()
+        (tmp_path / "count").write_text("")
+        steps = []
+        with workspace(tmp_path / "out") as space:
+            work = Copy(tmp_path / "count")
+            before = list(space.results(work))
+            space.run(work, [Task(p.stem, p, p.stem) for p in texts], Workers(1))
+            space.step("table", 1, lambda folder: steps.append(1))
+            Room(tmp_path, tmp_path / "steps").step("part of a task", 1, lambda: steps.append(1))
+            assert list(space.results(work)) == (before or ["a", "b", "c"])
+        return len((tmp_path / "count").read_text()), len(steps), Digests().of(TRIANGLE)
+
+    (package / "fit.py").write_text("ROUNDS = 3")
+    (package / "layouts" / "cmu41.json").write_text("{}")
+    first = made()
+    assert first[:2] == (3, 2) and made() == (0, 0, first[2])
+    (package / "__pycache__").mkdir()
+    (package / "__pycache__" / "fit.pyc").write_bytes(b"compiled")
+    assert made() == (0, 0, first[2])
+    (package / "fit.py").write_text("ROUNDS = 4")
+    assert made() == first and made() == (0, 0, first[2])
+    (package / "layouts" / "cmu41.json").write_text("[]")
+    assert made() == first
+    (package / "fit.py").rename(package / "fits.py")
+    assert made() == first
+
+
+def test_results_with_the_values_of_another_program_are_no_results(tmp_path, texts):
+    copied(tmp_path, texts)
+    record = tmp_path / "out" / HOME / "done" / "a.npz"
+    header, arrays = storage.load(record, "result", (1,))
+    header["value"] = {"class": "scanprep.console:Metric", "fields": {"title": "a field that has gone"}}
+    told = {name: value for name, value in header.items() if name not in ("kind", "version")}
+    storage.save(record, "result", 1, arrays, told)
+    with workspace(tmp_path / "out") as space:
+        assert list(space.results(Copy(tmp_path / "count"))) == ["b", "c"]
 
 
 def test_processes_change_nothing(tmp_path, texts):

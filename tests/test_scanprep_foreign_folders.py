@@ -199,7 +199,7 @@ def test_a_set_names_a_mesh_of_somebody_else(home, column, name):
 def test_a_worker_answers_with_the_name_of_a_file_of_somebody_else(home):
     class Future:
         exception = staticmethod(lambda: None)
-        result = staticmethod(lambda: (None, {"../profile": b"theirs"}))
+        result = staticmethod(lambda: (None, {"../profile": b"theirs"}, []))
 
     with pytest.raises(StorageError, match="tcp://there"):
         _outcome(Future, Job("in", None, home / "out"), "tcp://there")

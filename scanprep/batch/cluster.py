@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry import storage
-from .digests import paths_of, version
+from .digests import paths_of, program
 from .room import Failure, Job, attempt_elsewhere
 
 ANSWER = 10                    # seconds that a scheduler may take
@@ -169,7 +169,7 @@ def _unpacked(sent: dict[Path, bytes], folder: Path) -> dict[Path, Path]:
 
 
 def _versions() -> dict[str, str]:
-    return {"scapekit": version(), "numpy": np.__version__}
+    return {"scapekit": program(), "numpy": np.__version__}
 
 
 def _described(versions: dict[str, str]) -> str:

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import time
@@ -16,8 +17,12 @@ import numpy as np
 from scipy.sparse import sparray
 
 from ..geometry import storage
+from .values import PACKAGES
 
 DIGITS = 32
+INSTALLED = Path(__file__).parents[2]   # the folder of the three packages
+COMPUTES = {".py", ".json", ".npz"}     # endings of what changes results: modules, layouts, the humanoid, people
+UNUSED = "scanprep/viewer/source/"      # sources of viewer.js, which wheels do not have
 SETTLED = 2_000_000_000        # nanoseconds after which a file's time of change tells of every later change
 
 
@@ -47,10 +52,14 @@ class Digests:
 
     def of(self, *values: Any) -> str:
         """A digest of values: paths count as what the files hold, dataclasses as their fields."""
-        whole = hashlib.sha256(version().encode())
+        whole = hashlib.sha256()
         for value in values:
             self._update(whole, value)
         return whole.hexdigest()[:DIGITS]
+
+    def key(self, *values: Any) -> str:
+        """What a result depends on: some values, and the program that makes it of them."""
+        return self.of(program(), *values)
 
     def of_file(self, path: Path) -> str:
         """A digest of what a file holds; "missing" where there is none, and of a folder of all files in it."""
@@ -135,9 +144,23 @@ def paths_of(value: Any) -> Iterator[Path]:
         yield from paths_of([getattr(value, field.name) for field in dataclasses.fields(value)])
 
 
-def version() -> str:
-    """Of this project: results of another one are done anew."""
+def program() -> str:
+    """Version and sources of this project, in short: what another one made is made anew."""
+    return _program_in(INSTALLED)
+
+
+@functools.cache
+def _program_in(folder: Path) -> str:
+    """The same of the packages in a folder; they are read once, which takes less than a tenth of a second."""
     try:
-        return importlib.metadata.version("scapekit")
+        version = importlib.metadata.version("scapekit")
     except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+        version = "not installed"
+    sources = hashlib.sha256()
+    found = {path.relative_to(folder).as_posix(): path for name in PACKAGES for path in (folder / name).rglob("*")
+             if path.suffix in COMPUTES}
+    for name in sorted(found):
+        if not name.startswith(UNUSED):
+            content = found[name].read_bytes()
+            sources.update(f"{name} {len(content)} ".encode() + content)
+    return f"{version}, sources {sources.hexdigest()[:12]}"

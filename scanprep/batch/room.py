@@ -56,7 +56,7 @@ class Room:
         """What `make` returns, or returned when it was last called with the same inputs."""
         if self._steps is None:
             return make()
-        path, key = self._step_file(name), self._digests.of(inputs)
+        path, key = self._step_file(name), self._digests.key(inputs)
         if (not self._force or name in self._made) and (load_header(path) or {}).get("digest") == key:
             with contextlib.suppress(storage.StorageError):
                 return load_value(path)

@@ -131,7 +131,7 @@ class Workspace:
 
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
         """What `make` returns, or returned for the same inputs before; it gets a folder for files of the output."""
-        key = self.digests.of(inputs)
+        key = self.digests.key(inputs)
         kept = self._kept(name, key)
         if kept is not NOTHING:
             return kept
@@ -182,14 +182,15 @@ class Workspace:
             if name not in names:
                 self.drop(name)
 
-    def names(self, work: Any) -> list[str]:
-        """The results that are kept of some work, with all their files."""
+    def results(self, work: Any) -> dict[str, Any]:
+        """What is kept of some work, whichever program made it, by name: whole, with all its files."""
         common = self.digests.of(work)
-        found = []
+        found = {}
         for path in sorted((self.home / "done").glob("*.npz")):
             header = _read_record(path, self.folder)
             if header and header["work"] == common and all((self.folder / f).is_file() for f in header["files"]):
-                found.append(unquote(path.stem))
+                with contextlib.suppress(storage.StorageError):         # damaged, or of a program with other values
+                    found[unquote(path.stem)] = load_value(path)
         return found
 
     def is_ours(self, file: str) -> bool:
@@ -202,7 +203,7 @@ class Workspace:
 
     def _key(self, common: str, task: Task) -> str:
         """What a task depends on; `common` is the digest of the work."""
-        return self.digests.of(common, task.place, task.given)
+        return self.digests.key(common, task.place, task.given)
 
     def _kept(self, name: str, key: str) -> Any:
         """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""

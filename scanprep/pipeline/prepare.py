@@ -92,7 +92,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
         work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan, parts)
         tables = _Tables(space, work, tasks)
-        if not space.names(work):                   # the first call, or all is to be done anew
+        if not space.results(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
         tables.write({})
         failures: dict[str, str] = {}
@@ -147,7 +147,7 @@ class _Tables:
 
     def figures(self) -> dict[str, ScanFigures]:
         """Of every scan that the set holds, by name."""
-        return {name.removeprefix(SCANS): self.space.value(name) for name in self.space.names(self.work)
+        return {name.removeprefix(SCANS): found for name, found in self.space.results(self.work).items()
                 if name.startswith(SCANS)}
 
     def write(self, failures: Mapping[str, str]) -> RegisteredSet:
@@ -172,11 +172,11 @@ class _Tables:
             return ()
         names = {task.name for task in self.tasks}
         others = [entry for entry in RegisteredSet.load(self.space.folder).entries if entry.name not in names]
-        known = set(self.space.names(self.work))
+        known = self.space.results(self.work)
         lost = [entry.name for entry in others if SCANS + entry.name not in known]
         if lost:
             raise ValueError(f"{self.space.folder}: holds {len(lost)} other scans that were registered with another "
-                             f"template or other settings ({', '.join(lost[:5])}); name another folder")
+                             f"template, other settings or another scapekit ({', '.join(lost[:5])}); name another folder")
         return others
 
 
