@@ -175,8 +175,8 @@ class _Tables:
         known = self.space.results(self.work)
         lost = [entry.name for entry in others if SCANS + entry.name not in known]
         if lost:
-            raise ValueError(f"{self.space.folder}: holds {len(lost)} other scans that were registered with another "
-                             f"template, other settings or another scapekit ({', '.join(lost[:5])}); name another folder")
+            raise ValueError(f"{self.space.folder}: holds {len(lost)} other scans that were registered with "
+                             f"another template, settings or scapekit ({', '.join(lost[:5])}); name another folder")
         return others
 
 
