@@ -19,7 +19,7 @@ from typing import Any
 from . import config_files, ranges
 from .arguments import Argument, UsageError, make_parser, near, read_line, sentences
 from .config_files import Flag
-from .console import JUDGEMENT, Metric, Outcome, say, show, write_report
+from .console import JUDGEMENT, Metric, Outcome, keep_report, say, show, write_report
 from .interrupts import tidy_up
 from .threads import one_thread
 from .words import OUR_MODULES
@@ -229,10 +229,7 @@ class _Call:
                 outcome = self.judged(self.function(**self.given, space=space))
                 if outcome.failures and space.all_failed and space.is_new:
                     raise NothingMadeError(outcome.failures)
-                with space.staging("report") as staged:
-                    report = write_report(dataclasses.replace(outcome, output=staged.folder), self.command,
-                                          time.perf_counter() - start, notes)
-                return outcome, None if report is None else self.output / report.name
+                return outcome, keep_report(space, outcome, self.command, time.perf_counter() - start, notes)
         with beside(self.output, self.force) as space, space.staging("output") as staged:
             self._staged = staged.folder
             given = {**self.given, str(self.output_name): staged.folder / self.output.name}

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:               # imported where it is used: help answers at once
-    from .batch.workspace import Results
+    from .batch.workspace import Results, Workspace
     from .judgement import Judgement
 
 Progress = Callable[[int, int], None]
@@ -199,3 +199,10 @@ def write_report(outcome: Outcome, command: str, seconds: float, notes: Sequence
         "metrics": [{"metric": m.name, "value": m.value, "unit": m.unit} for m in outcome.metrics],
         **({} if written is None else {"written": dict(written)})})
     return path
+
+
+def keep_report(space: Workspace, outcome: Outcome, command: str, seconds: float, notes: Sequence[str] = ()) -> Path:
+    """`write_report` for an output folder that is open; its path."""
+    with space.staging("report") as staged:
+        write_report(dataclasses.replace(outcome, output=staged.folder), command, seconds, notes)
+    return space.folder / "report.json"

@@ -13,10 +13,11 @@ from config_files import config_file
 from completion.__main__ import main
 from completion.partial import report
 from completion.partial.completion import load_completion
-from completion.partial.folder import FolderCall, folder_page
+from completion.partial.folder import FolderCall
 from completion.partial.mend import CompletionsApp, mend_completions
 from completion.partial.work import MEANS
 from scanprep.batch.calls import RUN, command_of
+from scanprep.batch.workspace import Results
 from scanprep.console import Metric, judgement_row
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.landmarks import read_landmarks, write_landmarks
@@ -206,5 +207,5 @@ def test_the_page_has_the_failed_first_and_then_the_worst_explained(tmp_path):
 
     results = {"a": figures(98.0, "good"), "b": figures(99.0, "failed"), "c": figures(70.0, "check"),
                "d": figures(80.0, "good")}
-    html = folder_page(results, [], tmp_path, FolderCall(tmp_path)).html()
+    html = FolderCall(tmp_path).told(tmp_path, "model").page(Results(results, {}, ()), [], tmp_path).html()
     assert sorted("abcd", key=lambda name: html.index(f'href="{name}/report.html"')) == ["b", "c", "d", "a"]

@@ -10,13 +10,14 @@ from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, judgement_of, say
+from scanprep.folders import kept_results
 from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.judgement import judge_many
 from scanprep.pipeline.scans import find_scans
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig
-from .folder import FolderCall, body_of, kept_results, told, written
+from .folder import FolderCall, body_of
 from .settings import CompletionConfig
 from .work import Inputs, Work, marks_of_template
 
@@ -88,11 +89,9 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
 
 def _folder(call: FolderCall, space: Workspace, workers: Workers) -> Outcome:
     """Complete the scans of a folder."""
-    tasks = call.tasks()
-    _, work = call.work(any(task.given.landmarks for task in tasks.values()))
-    with bar("completing scans") as progress:
-        results = space.run(work, list(tasks.values()), workers, progress)
-    return written(call, work.model, results, space, len(tasks))
+    tasks = list(call.tasks().values())
+    _, work = call.work(any(task.given.landmarks for task in tasks))
+    return call.told(space.folder, work.model).carry_out("completing scans", space, work, tasks, workers)
 
 
 def _mended(call: FolderCall, space: Workspace) -> Outcome:
@@ -107,7 +106,7 @@ def _mended(call: FolderCall, space: Workspace) -> Outcome:
     saved = Metric("bodies saved", len(app.fresh))
     if not results.values and not results.failures:
         return Outcome(None, [saved], judgement=None)
-    outcome = told(call, app.plain.model, results, space, len(app.tasks))
+    outcome = call.told(space.folder, app.plain.model).outcome(space, results, len(app.tasks))
     return replace(outcome, metrics=[saved, *outcome.metrics])
 
 

@@ -1,9 +1,8 @@
 """A folder of scans for `scape complete`: what it was called with, its tasks, its page."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
 from typing import ClassVar
 
@@ -13,23 +12,17 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
-from scanprep.batch.workspace import HOME, Results, Task, Workspace
+from scanprep.batch.workspace import Results, Task
 from scanprep.cli import Unit
-from scanprep.console import Metric, Outcome, failures_of, judgement_of, judgement_of_many
+from scanprep.console import Metric
+from scanprep.folders import FolderCommand
 from scanprep.geometry.files import name_of
-from scanprep.pictures.page import Page, link_to
-from scanprep.pictures.scene import SCENE, worst_that_turn
-from scanprep.pictures.sheets import small_picture
 from scanprep.pipeline.scans import find_scans
-from scanprep.words import number_of
 
 from ..cli import read_model
 from .colors import ColorConfig
 from .settings import CompletionConfig
 from .work import EXPLAINED, MEANS, Inputs, Work, marks_of_template
-
-GRAVEST = ("failed", "check", "good", "new")                          # verdicts, and what was not completed yet
-PAGE = "page"                        # name of the result that keeps what failed, beside the page
 
 
 @dataclass(frozen=True)
@@ -60,6 +53,16 @@ class FolderCall(KeptCall):
                             ColorConfig(fill=self.config.fill_colors), f"scape complete {self.scans}")
 
 
+    def told(self, output: Path, model: str) -> FolderCommand:
+        """What is told of the scans in an output; `model` is its name."""
+        return FolderCommand(
+            ("scan",), "{} completed", summary, _unexplained,
+            lambda name, rows: [f"{m.name}: {m.text()} {m.unit}" for m in rows[:3]],
+            {"complete": self.config, "model": model},
+            "To mend some, run the same command with --interactive: it opens these results in the browser, worst "
+            f"first (scape complete {self.scans} ... -o {output} --interactive).", self)
+
+
 def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:
     """The model where the person's shape is to be found, else a body of known shape."""
     if subject is None and model.n_betas:
@@ -80,62 +83,17 @@ def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> d
     return found
 
 
-def written(call: FolderCall, model: str, results: Results, space: Workspace, count: int) -> Outcome:
-    """The page of what became of so many scans into a folder that is open, and what was called there."""
-    with space.staging(PAGE) as staged:
-        folder_page(results.values, list(results.failures.values()), space.folder, call).write(
-            staged.folder / "report.html")
-        call.write(staged.folder / HOME)
-        staged.value = results.failures
-    return told(call, model, results, space, count)
-
-
-def told(call: FolderCall, model: str, results: Results, space: Workspace, count: int) -> Outcome:
-    """The figures of so many scans; `model` is its name."""
-    return Outcome(space.folder, summary(results.values, len(results.fresh), count),
-                   {"complete": call.config, "model": model}, failures_of(results),
-                   judgement=judgement_of_many(results))
-
-
-def kept_results(space: Workspace, names: Sequence[str]) -> Results:
-    """What is known of scans by their names, from a folder that need not be open."""
-    kept = set(space.kept(""))
-    failures = (space.value(PAGE) if PAGE in kept else None) or {}
-    values = {name: space.value(name) for name in names if name in kept}
-    return Results(values, {name: line for name, line in failures.items() if name in names and name not in values}, ())
-
-
-def summary(metrics: Mapping[str, Sequence[Metric]], fresh: int, count: int) -> list[Metric]:
+def summary(results: Results, count: int) -> list[Metric]:
     """The rows of the closing table."""
-    rows = [Metric("scans completed", f"{len(metrics)} of {count}"), Metric("of them in this run", fresh)]
+    rows = [Metric("scans completed", f"{len(results.values)} of {count}"),
+            Metric("of them in this run", len(results.fresh))]
     for name in MEANS:
-        found = [m for of_one in metrics.values() for m in of_one if m.name == name]
+        found = [m for of_one in results.values.values() for m in of_one if m.name == name]
         if found:
             rows.append(Metric(f"{name}, mean", float(np.mean([float(m.value) for m in found])), found[0].unit))
     return rows
 
 
-def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str], folder: Path, call: FolderCall
-                ) -> Page:
-    """The page of all scans, worst first; what is told of them lies in the folder."""
-    page = Page(f"{number_of(len(metrics), 'scan')} completed", "Worst first; each name leads to the page of its scan.")
-    page.text("To mend some, run the same command with --interactive: it opens these results in the browser, worst "
-              f"first (scape complete {call.scans} ... -o {folder} --interactive).")
-    if failures:
-        page.section("Failed").table([(line,) for line in failures])
-    names = sorted(metrics, key=lambda name: gravity(metrics[name]))
-    turning = worst_that_turn([folder / name / SCENE for name in names])
-    for name, scene in zip(names, turning, strict=True):
-        told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
-        shown = f'<img src="{link_to(name)}/picture.png" alt="{escape(name)}, completed">' if scene is None else \
-            page.turning(scene, small_picture(folder / name / "picture.png"), height=300)
-        title = f'<a href="{link_to(name)}/report.html"><b>{escape(name)}</b></a>'
-        page.markup(f'<div class="entry"><div>{title}{told}</div>{shown}</div>')
-    return page
-
-
-def gravity(metrics: Sequence[Metric]) -> tuple[int, float]:
-    """By which scans are sorted: failed ones first, and among equals those whose points the body explains worst."""
-    judgement = judgement_of(metrics)
-    explained = next((float(m.value) for m in metrics if m.name == EXPLAINED), 0.0)
-    return GRAVEST.index("new" if judgement is None else judgement.verdict), explained
+def _unexplained(rows: Sequence[Metric]) -> float:
+    """The share of a scan that does not lie on the body, %."""
+    return 100 - next((float(m.value) for m in rows if m.name == EXPLAINED), 0.0)

@@ -4,23 +4,26 @@ Opened by `scape complete SCANS -o FOLDER --interactive`, or from the folder alo
 """
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.opening import workspace
-from scanprep.batch.workspace import HOME, Results, Workspace
-from scanprep.console import judgement_of, write_report
+from scanprep.batch.workspace import HOME, Workspace
+from scanprep.console import keep_report
+from scanprep.folders import judgement_on, kept_results
+from scanprep.judgement import Judgement
 from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
+from scanprep.viewer.results import ResultsApp
 
 from .clicked_landmarks import on_scan, pairs_of
 from .completion import Completion, load_completion
-from .folder import FolderCall, gravity, kept_results, written
+from .folder import FolderCall
 from .interactive import ENDING, CompleteApp, Made
 from .work import Inputs
 
@@ -30,7 +33,7 @@ def mend_completions(folder: Path) -> CompletionsApp:
     return CompletionsApp(FolderCall.read(folder), folder)
 
 
-class CompletionsApp(CompleteApp):
+class CompletionsApp(ResultsApp, CompleteApp):
     """The state of `scape complete SCANS -o FOLDER --interactive`.
 
     Parameters
@@ -40,15 +43,16 @@ class CompletionsApp(CompleteApp):
     output : the folder of results
     """
 
-    title = "Mend completions"
+    title, no_result = "Mend completions", "not completed yet"
 
     def __init__(self, call: FolderCall, output: Path) -> None:
         model, self.plain = call.work(True)
         self.call, self.tasks, self.fresh = call, call.tasks(), set[str]()
+        self.told = call.told(output, self.plain.model)
         self._space = Workspace(output, output / HOME)                      # only looked at here
         self.results = kept_results(self._space, list(self.tasks))
         self._name_of = {task.given.scans[0]: name for name, task in self.tasks.items()}
-        worst = sorted(self.tasks, key=lambda name: _gravity(name, self.results))
+        worst = self.told.worst_first(self.results, self.tasks)
         super().__init__(model, self.plain, [self.tasks[name].given.scans[0] for name in worst], output)
         self._bring()
 
@@ -108,10 +112,13 @@ class CompletionsApp(CompleteApp):
             self.note = str(error)
             return Message("scene", {}, pack_scene([self.template.pane("the model")]))
 
+    def judgements(self) -> Iterable[Judgement | None]:
+        """Of the scans."""
+        return (judgement_on(self._name_of[one.path], self.results) for one in self.scans)
+
     def more(self) -> dict[str, Any]:
-        """What is to be thought of each scan besides."""
-        return {**super().more(), "folder": str(self.output),
-                "verdicts": [_told(self._name_of[one.path], self.results) for one in self.scans]}
+        """The folder besides."""
+        return {**super().more(), "folder": str(self.output)}
 
     # what the page sends
 
@@ -144,10 +151,8 @@ class CompletionsApp(CompleteApp):
                 staged.value = self._write(scan, made, staged.folder / name)
             self.fresh.add(name)
             self.results = kept_results(space, list(self.tasks))
-            with space.staging("report") as staged:
-                outcome = written(self.call, self.plain.model, self.results, space, len(self.tasks))
-                write_report(replace(outcome, output=staged.folder), f"{self.plain.command} --interactive",
-                             made.seconds)
+            keep_report(space, self.told.write(space, self.results, len(self.tasks)),
+                        f"{self.plain.command} --interactive", made.seconds)
         self.saved[scan.path] = self.output / name
         self.note = f"saved in {self.output / name}; the page of the folder is new"
 
@@ -156,18 +161,3 @@ def _is_of(done: Completion, model: BodyModel) -> bool:
     """Whether a completion is of a model, and not of one with other vertices, parts or betas."""
     return len(done.completed.vertices) == len(model.template.vertices) \
         and len(done.pose) == len(model.skeleton.parents) and (done.betas is None or len(done.betas) == model.n_betas)
-
-
-def _gravity(name: str, results: Results) -> tuple[int, float, str]:
-    """Failed ones first, then those worst explained; at the end those that were not completed yet."""
-    return (*((0, 0.0) if name in results.failures else gravity(results.values.get(name, ()))), name)
-
-
-def _told(name: str, results: Results) -> dict[str, Any]:
-    """What is to be thought of a scan, in words."""
-    if name in results.failures:
-        return {"verdict": "failed", "reasons": [results.failures[name]]}
-    judgement = judgement_of(results.values.get(name, ()))
-    if judgement is None:
-        return {"verdict": "new", "reasons": ["not completed yet"]}
-    return {"verdict": judgement.verdict, "reasons": list(judgement.reasons)}

@@ -4,20 +4,20 @@ Built on the clicking of landmarks: a third pane shows the template as it lies o
 """
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..batch.opening import workspace
-from ..console import write_report
+from ..batch.room import Progress
+from ..batch.workspace import Workspace
+from ..console import Outcome
+from ..judgement import Judgement
 from ..viewer.app import Send
 from ..viewer.clicked import Clicked
 from ..viewer.messages import Message
-from ..viewer.pick import PickApp
+from ..viewer.results import ResultsApp
 from .again import Call
 from .cli import carried_out
 from .figures import Verdict
@@ -28,7 +28,7 @@ LEDS = ("best", "landmarks")             # ways to begin that landmarks lead
 WORK = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
 
 
-class MendApp(PickApp):
+class MendApp(ResultsApp):
     """The state of `scape pick SET`.
 
     Parameters
@@ -39,13 +39,14 @@ class MendApp(PickApp):
     """
 
     name, title = "mend", "Mend a set"
+    no_result = "not registered yet"
 
     def __init__(self, folder: Path, ending: str, names: tuple[str, ...] = ()) -> None:
         self.folder, self.call = folder, Call.read(folder)
         if self.call.config.scan.init not in LEDS:
             raise ValueError(f"{folder}: it was made with --init {self.call.config.scan.init}, which uses none: "
                              "there are no landmarks to mend")
-        self.verdicts = {verdict.name: verdict for verdict in judge_set(folder)}
+        self.verdicts = self.read_results()
         tasks = {task.name: task for task in self.call.tasks()}
         worst = [name for name in self.verdicts if name in tasks]
         self.scan_names = [*worst, *(name for name in tasks if name not in self.verdicts)]
@@ -69,13 +70,17 @@ class MendApp(PickApp):
         return Message("scene", {"first": len(plain.data)},
                        plain.data + (shown.read_bytes() if shown.is_file() else b""))
 
+    def judgements(self) -> Iterable[Judgement | None]:
+        """Of the scans; the path of one that is shown need not be said."""
+        for name, one in zip(self.scan_names, self.scans, strict=True):
+            verdict = self.verdicts.get(name)
+            yield None if verdict is None else Judgement(verdict.judgement.verdict, tuple(
+                reason.removeprefix(f"{one.path}: ") for reason in verdict.judgement.reasons))
+
     def more(self) -> dict[str, Any]:
-        """What is to be thought of each scan, and which have been changed."""
-        names = [self.scan_names[i] for i in sorted(self.changed) if i >= 0]
-        told = [_told(self.verdicts.get(name), one.path)
-                for name, one in zip(self.scan_names, self.scans, strict=True)]
-        return {"verdicts": told,
-                "changed": names, "template_changed": -1 in self.changed, "set": str(self.folder)}
+        """Which scans have been changed, besides."""
+        return {**super().more(), "changed": [self.scan_names[i] for i in sorted(self.changed) if i >= 0],
+                "template_changed": -1 in self.changed, "set": str(self.folder)}
 
     # what the page sends
 
@@ -89,44 +94,25 @@ class MendApp(PickApp):
             return
         before, self.changed = self.changed, set()
 
-        def telling(what: str) -> Any:
+        def telling(what: str) -> Progress:
             def tell(done: int, total: int) -> None:
                 self.working = (what, done, total)
                 send(self.state())
             return tell
 
-        def work(tell: Any) -> str:
-            try:
-                note = self._again([telling(what) for what in WORK])
-            except Exception:
-                with self._lock:
-                    self.changed |= before
-                raise
-            verdicts = {verdict.name: verdict for verdict in judge_set(self.folder)}
-            with self._lock:
-                self.verdicts = verdicts
-                scene = self.scene()
-            send(scene)
-            return note
+        def do(space: Workspace, _: Progress) -> tuple[Outcome, str]:
+            given = self.call.inputs(lambda line: None)
+            outcome = carried_out(self.call, given, space, *map(telling, WORK))
+            fresh = next(metric.value for metric in outcome.metrics if metric.name == "of them in this run")
+            return outcome, f"{fresh} of {len(given[0])} scans registered again; the page of the set is new"
 
-        self.beside(WORK[0], work, send, "nothing was registered")
+        self.do_again(WORK[0], f"scape pick {self.folder}", do, send, "nothing was registered",
+                      lambda: self.changed.update(before))
 
-    def _again(self, tell: list[Any]) -> str:
-        """The run itself; the set is open, and closed to other runs, only meanwhile."""
-        begin = time.perf_counter()
-        given = self.call.inputs(lambda line: None)
-        with workspace(self.folder) as space:
-            outcome = carried_out(self.call, given, space, *tell)
-            with space.staging("report") as staged:
-                write_report(replace(outcome, output=staged.folder), f"scape pick {self.folder}",
-                             time.perf_counter() - begin)
-        fresh = next(metric.value for metric in outcome.metrics if metric.name == "of them in this run")
-        return f"{fresh} of {len(given[0])} scans registered again; the page of the set is new"
+    def read_results(self) -> dict[str, Verdict]:
+        """The verdicts on the scans of the set, worst first."""
+        return {verdict.name: verdict for verdict in judge_set(self.folder)}
 
-
-def _told(verdict: Verdict | None, scan: Path) -> dict[str, Any]:
-    """A verdict in words; the path of a scan that is shown need not be said."""
-    if verdict is None:
-        return {"verdict": "new", "reasons": ["not registered yet"]}
-    reasons = [reason.removeprefix(f"{scan}: ") for reason in verdict.judgement.reasons]
-    return {"verdict": verdict.judgement.verdict, "reasons": reasons}
+    def show_results(self, results: dict[str, Verdict]) -> None:
+        """The scans keep their order."""
+        self.verdicts = results

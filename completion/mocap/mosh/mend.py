@@ -1,8 +1,7 @@
 """A result of `scape mosh` in the browser: the markers on the body, those worst first, put right, and run again."""
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,18 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.batch.opening import workspace
 from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import HOME, Workspace
-from scanprep.console import Metric, judgement_of, write_report
+from scanprep.console import Metric, Outcome, judgement_of
+from scanprep.folders import GRAVEST
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.app import Send
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.messages import Message
-from scanprep.viewer.pick import SCAN, PickApp
+from scanprep.viewer.pick import SCAN
+from scanprep.viewer.results import ResultsApp
 from scanprep.viewer.surface_clicks import Clickable
 
 from ..marker_sets.layout import MarkerLayout
@@ -33,7 +34,6 @@ from .work import ERRORS, FIXED
 MENDED = "scape mosh, mended in the browser"
 TOLD = "markers in the mean distance"
 LEAST = 3                            # markers that a person needs
-GRAVEST = ("failed", "check", "good")
 
 
 def mend_mosh(folder: Path) -> MoshApp:
@@ -72,7 +72,7 @@ class Result:
                 *(m for m in self.rows[name] if m.name in (*ERRORS, TOLD))]
 
 
-class MoshApp(PickApp):
+class MoshApp(ResultsApp):
     """The state of the page on which a result of `scape mosh` is mended.
 
     The first pane is the layout on the model's template, the second a person at rest with the markers where they were
@@ -84,11 +84,25 @@ class MoshApp(PickApp):
     def __init__(self, folder: Path) -> None:
         self.folder, self.frame = folder, 0
         self.before: dict[str, list[Metric]] = {}
-        self._show(Result.read(folder, MoshCall.read(folder)))
+        self._begin_with(self.read_results())
         super().__init__(self.template, self.scans, (), fixed=self.template.places)
 
-    def _show(self, result: Result) -> None:
-        """Begin with a result, and with corrections that were not run yet."""
+    def read_results(self) -> Result:
+        """What the folder holds now, of the call that was made last."""
+        return Result.read(self.folder, MoshCall.read(self.folder))
+
+    def show_results(self, results: Result) -> None:
+        """The same person and marker as before, with nothing to undo."""
+        person = self.person.name
+        self._begin_with(results)
+        self.done.clear()
+        self.undone.clear()
+        self.current = next((i for i, one in enumerate(results.people) if one.name == person), 0)
+        self.frame = 0
+        self.choose_next(self.chosen)
+
+    def _begin_with(self, result: Result) -> None:
+        """A result, and corrections that were not run yet."""
         self.result, self.file = result, next_file(self.folder, result.call.layout)
         self.spots = changes(result.usual, MarkerLayout.load(self.file)) if self.file.exists() else {}
         self.template = Clicked(Path("layout"), self.file, surface=Clickable(result.template))
@@ -112,12 +126,16 @@ class MoshApp(PickApp):
                  self.scan.pane(f"{self.person.name}: where they were found"), self.person.pane(frame)]
         return Message("scene", {}, pack_scene(panes))
 
+    def judgements(self) -> Iterable[Judgement | None]:
+        """Of the people."""
+        return (judgement_of(self.result.rows[one.name]) or Judgement() for one in self.result.people)
+
     def more(self) -> dict[str, Any]:
         """What is to be thought of people, markers and frames; and the figures of the run before."""
         person = self.person
         before = {m.name: m.text() for m in self.before.get(person.name, [])}
         changed = [label for label in person.names if self._own(label) in self.spots]
-        return {"verdicts": [_told(self.result.rows[one.name]) for one in self.result.people],
+        return {**super().more(),
                 "off": {label: 1000 * far for label, far in person.off.items() if np.isfinite(far)},
                 "doubts": person.doubts, "changed": changed, "frame": self.frame,
                 "frames": [one.told for one in person.worst], "corrected": self.file.name,
@@ -176,30 +194,18 @@ class MoshApp(PickApp):
         if not self.spots:
             raise ValueError("nothing was corrected: move, exchange or take away a marker first")
         call = replace(self.result.call, layout=str(self.file))
-        before = {one.name: self.result.figures(one.name) for one in self.result.people}
         worn = {label for one in self.result.people for label in one.names}
         mended(self.result.usual, self.spots).matched(sorted(worn), LEAST)
+        # now, as they are worked out from files that the run writes anew
+        before = {one.name: self.result.figures(one.name) for one in self.result.people}
 
-        def work(tell: Progress) -> str:
-            begin = time.perf_counter()
-            with workspace(self.folder) as space:
-                outcome = carried_out(call, space, Workers(workers=1), MENDED, lambda done, total: None, tell)
-                with space.staging("report") as staged:
-                    write_report(replace(outcome, output=staged.folder), MENDED, time.perf_counter() - begin)
-            result, person = Result.read(self.folder, call), self.person.name
-            with self._lock:
-                self.before, self.frame = before, 0
-                self._show(result)
-                self.done.clear()
-                self.undone.clear()
-                self.current = next((i for i, one in enumerate(result.people) if one.name == person), 0)
-                self.choose_next(self.chosen)
-                scene = self.scene()
-            send(scene)
+        def do(space: Workspace, tell: Progress) -> tuple[Outcome, str]:
+            outcome = carried_out(call, space, Workers(workers=1), MENDED, lambda done, total: None, tell)
+            self.before = before
             failed = f"; failed: {'; '.join(outcome.failures)}" if outcome.failures else ""
-            return f"run again with {Path(str(call.layout)).name}{failed}"
+            return outcome, f"run again with {Path(str(call.layout)).name}{failed}"
 
-        self.beside("finding shape, markers and motion", work, send, "it could not be run again")
+        self.do_again("finding shape, markers and motion", MENDED, do, send, "it could not be run again")
 
     # the state itself
 
@@ -254,10 +260,4 @@ def _usual(call: MoshCall, model: BodyModel, people: list[Found]) -> MarkerLayou
 def _gravity(rows: list[Metric]) -> tuple[int, float]:
     """Failed people first, then those with the largest error."""
     error = next((float(m.value) for m in rows if m.name == FIXED), 0.0)
-    return GRAVEST.index(_told(rows)["verdict"]), -error
-
-
-def _told(rows: list[Metric]) -> dict[str, Any]:
-    judgement = judgement_of(rows)
-    return {"verdict": "good", "reasons": []} if judgement is None else \
-        {"verdict": judgement.verdict, "reasons": list(judgement.reasons)}
+    return GRAVEST.index((judgement_of(rows) or Judgement()).verdict), -error

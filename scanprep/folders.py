@@ -1,0 +1,134 @@
+"""Commands that work through many things, each into a folder of its own: what is told of all, and mended again.
+
+    OUTPUT/NAME/...               one of them: its files, its page, its report
+    OUTPUT/report.html            all of them, worst first
+    OUTPUT/.scapekit/run.json     what the command was called with, where results can be mended
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .batch.calls import KeptCall
+from .batch.pool import Workers
+from .batch.workspace import HOME, Results, Task, Workspace
+from .console import Metric, Outcome, bar, failures_of, judgement_of, judgement_of_many
+from .judgement import Judgement
+from .pictures.page import Page, link_to
+from .pictures.scene import SCENE, worst_that_turn
+from .pictures.sheets import small_picture
+from .words import number_of
+
+PAGE = "page"                        # name of the result that keeps what failed, beside the page
+PICTURE = "picture.png"              # of one of the things, in its folder
+GRAVEST = ("failed", "check", "good", "new")                          # verdicts, and what was not done yet
+
+
+@dataclass(frozen=True)
+class FolderCommand:
+    """What a command tells of the things that it works through.
+
+    Attributes
+    ----------
+    things : tuple of str
+        One of them, and several where that is no s at the end.
+    title : str
+        Of the page; {} stands for the number of things.
+    figures : callable
+        The rows of the closing table, from the results and how many things there are.
+    error : callable
+        From the rows of one: of those with the same verdict the one with the largest comes first.
+    lines : callable
+        What the page says of one, from its name and rows.
+    settings : mapping
+        For the report.
+    hint : str
+        What the page says of all.
+    call : KeptCall, optional
+        What the command was called with, where results can be mended.
+    """
+
+    things: tuple[str, ...]
+    title: str
+    figures: Callable[[Results, int], list[Metric]]
+    error: Callable[[Sequence[Metric]], float]
+    lines: Callable[[str, Sequence[Metric]], Iterable[str]]
+    settings: Mapping[str, Any]
+    hint: str = ""
+    call: KeptCall | None = None
+
+    def carry_out(self, doing: str, space: Workspace, work: Any, tasks: Sequence[Task], workers: Workers) -> Outcome:
+        """Work through the things, with a bar that says what is done, and write of all."""
+        with bar(doing) as progress:
+            results = space.run(work, tasks, workers, progress)
+        return self.write(space, results, len(tasks))
+
+    def write(self, space: Workspace, results: Results, count: int, failed: Sequence[str] = ()) -> Outcome:
+        """The page of results in an output that is open, and what was called there; what is told of so many things.
+
+        `failed` are lines on what failed within results that were made.
+        """
+        outcome = self.outcome(space, results, count, failed)
+        with space.staging(PAGE) as staged:
+            self.page(results, outcome.failures, space.folder).write(staged.folder / "report.html")
+            if self.call is not None:
+                self.call.write(staged.folder / HOME)
+            staged.value = results.failures
+        return outcome
+
+    def outcome(self, space: Workspace, results: Results, count: int, failed: Sequence[str] = ()) -> Outcome:
+        """What is told of so many things."""
+        return Outcome(space.folder, self.figures(results, count), self.settings, [*failures_of(results), *failed],
+                       judgement=judgement_of_many(results))
+
+    def page(self, results: Results, failures: Sequence[str], folder: Path) -> Page:
+        """All results, worst first, each with the way to its own page in the folder."""
+        page = Page(self.title.format(number_of(len(results.values), *self.things)),
+                    f"Worst first; each name leads to the page of its {self.things[0]}.").text(self.hint)
+        if failures:
+            page.section("Failed").table([(line,) for line in failures])
+        names = self.worst_first(results, results.values)
+        for name, scene in zip(names, worst_that_turn([folder / name / SCENE for name in names]), strict=True):
+            add_entry(page, folder, name, self.lines(name, results.values[name]), scene)
+        return page
+
+    def worst_first(self, results: Results, names: Iterable[str]) -> list[str]:
+        """Failures first, then by verdict and error; at the end what was not done yet."""
+        def gravity(name: str) -> tuple[int, float, str]:
+            judgement = judgement_on(name, results)
+            error = self.error(results.values[name]) if name in results.values else np.inf
+            return GRAVEST.index("new" if judgement is None else judgement.verdict), -error, name
+
+        return sorted(names, key=gravity)
+
+
+def add_entry(page: Page, folder: Path, name: str, lines: Iterable[str], scene: bytes | None = None) -> None:
+    """One result, leading to its own page: a scene that turns, else its picture, if there is one."""
+    address = f"{link_to(name)}/report.html"
+    told = "".join(f"<p>{escape(line)}</p>" for line in lines)
+    shown = ""
+    if scene is not None:
+        shown = page.turning(scene, small_picture(folder / name / PICTURE), height=300)
+    elif (folder / name / PICTURE).exists():
+        shown = f'<a href="{address}"><img src="{link_to(name)}/{PICTURE}" alt="{escape(name)}"></a>'
+    page.markup(f'<div class="entry"><div><a href="{address}"><b>{escape(name)}</b></a>{told}</div>{shown}</div>')
+
+
+def kept_results(space: Workspace, names: Sequence[str]) -> Results:
+    """What is known of things by their names, from a folder that need not be open."""
+    kept = set(space.kept(""))
+    failures = (space.value(PAGE) if PAGE in kept else None) or {}
+    values = {name: space.value(name) for name in names if name in kept}
+    return Results(values, {name: line for name, line in failures.items() if name in names and name not in values}, ())
+
+
+def judgement_on(name: str, results: Results) -> Judgement | None:
+    """What one result is worth; None for what was not done yet."""
+    if name in results.failures:
+        return Judgement("failed", (results.failures[name],))
+    return judgement_of(results.values[name]) or Judgement() if name in results.values else None
