@@ -43,10 +43,10 @@ class FolderCommand:
         The rows of the closing table, from the results and how many things there are.
     error : callable
         From the rows of one: of those with the same verdict the one with the largest comes first.
-    lines : callable
-        What the page says of one, from its name and rows.
     settings : mapping
         For the report.
+    lines : callable, optional
+        What the page says of one, from its name and rows.
     hint : str
         What the page says of all.
     call : KeptCall, optional
@@ -57,8 +57,8 @@ class FolderCommand:
     title: str
     figures: Callable[[Results, int], list[Metric]]
     error: Callable[[Sequence[Metric]], float]
-    lines: Callable[[str, Sequence[Metric]], Iterable[str]]
     settings: Mapping[str, Any]
+    lines: Callable[[str, Sequence[Metric]], Iterable[str]] = lambda name, rows: map(as_line, rows[:3])
     hint: str = ""
     call: KeptCall | None = None
 
@@ -94,7 +94,10 @@ class FolderCommand:
             page.section("Failed").table([(line,) for line in failures])
         names = self.worst_first(results, results.values)
         for name, scene in zip(names, worst_that_turn([folder / name / SCENE for name in names]), strict=True):
-            add_entry(page, folder, name, self.lines(name, results.values[name]), scene)
+            picture = folder / name / PICTURE
+            shown = "" if not picture.exists() else None if scene is None else \
+                page.turning(scene, small_picture(picture), height=300)
+            add_entry(page, name, self.lines(name, results.values[name]), shown)
         return page
 
     def worst_first(self, results: Results, names: Iterable[str]) -> list[str]:
@@ -107,14 +110,21 @@ class FolderCommand:
         return sorted(names, key=gravity)
 
 
-def add_entry(page: Page, folder: Path, name: str, lines: Iterable[str], scene: bytes | None = None) -> None:
-    """One result, leading to its own page: a scene that turns, else its picture, if there is one."""
+def as_line(metric: Metric) -> str:
+    """A figure in words."""
+    return f"{metric.name}: {metric.text()} {metric.unit}"
+
+
+def figure(rows: Sequence[Metric], *names: str) -> float:
+    """The first figure of these names; 0 where there is none."""
+    return next((float(m.value) for m in rows if m.name in names), 0.0)
+
+
+def add_entry(page: Page, name: str, lines: Iterable[str], shown: str | None = None) -> None:
+    """One result, leading to its own page: what is said of it, and the HTML of what is shown, else its picture."""
     address = f"{link_to(name)}/report.html"
     told = "".join(f"<p>{escape(line)}</p>" for line in lines)
-    shown = ""
-    if scene is not None:
-        shown = page.turning(scene, small_picture(folder / name / PICTURE), height=300)
-    elif (folder / name / PICTURE).exists():
+    if shown is None:
         shown = f'<a href="{address}"><img src="{link_to(name)}/{PICTURE}" alt="{escape(name)}"></a>'
     page.markup(f'<div class="entry"><div><a href="{address}"><b>{escape(name)}</b></a>{told}</div>{shown}</div>')
 

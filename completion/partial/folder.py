@@ -1,7 +1,6 @@
 """A folder of scans for `scape complete`: what it was called with, its tasks, its page."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -15,7 +14,7 @@ from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import Results, Task
 from scanprep.cli import Unit
 from scanprep.console import Metric
-from scanprep.folders import FolderCommand
+from scanprep.folders import FolderCommand, figure
 from scanprep.geometry.files import name_of
 from scanprep.pipeline.scans import find_scans
 
@@ -56,11 +55,10 @@ class FolderCall(KeptCall):
     def told(self, output: Path, model: str) -> FolderCommand:
         """What is told of the scans in an output; `model` is its name."""
         return FolderCommand(
-            ("scan",), "{} completed", summary, _unexplained,
-            lambda name, rows: [f"{m.name}: {m.text()} {m.unit}" for m in rows[:3]],
+            ("scan",), "{} completed", summary, lambda rows: -figure(rows, EXPLAINED),
             {"complete": self.config, "model": model},
-            "To mend some, run the same command with --interactive: it opens these results in the browser, worst "
-            f"first (scape complete {self.scans} ... -o {output} --interactive).", self)
+            hint="To mend some, run the same command with --interactive: it opens these results in the browser, worst "
+            f"first (scape complete {self.scans} ... -o {output} --interactive).", call=self)
 
 
 def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:
@@ -92,8 +90,3 @@ def summary(results: Results, count: int) -> list[Metric]:
         if found:
             rows.append(Metric(f"{name}, mean", float(np.mean([float(m.value) for m in found])), found[0].unit))
     return rows
-
-
-def _unexplained(rows: Sequence[Metric]) -> float:
-    """The share of a scan that does not lie on the body, %."""
-    return 100 - next((float(m.value) for m in rows if m.name == EXPLAINED), 0.0)

@@ -14,16 +14,8 @@ from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.cli import MM, Output, ScanArg, Unit
-from scanprep.console import (
-    Metric,
-    Outcome,
-    bar,
-    failures_of,
-    judgement_of,
-    judgement_of_many,
-    judgement_row,
-    write_report,
-)
+from scanprep.console import Metric, Outcome, bar, judgement_of, judgement_row, write_report
+from scanprep.folders import FolderCommand, figure
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
@@ -77,6 +69,7 @@ LEFT = 0.001
 # metres, RMS, from features to the posed control model: right ones have up to 0.022, those in coats 0.043, left and
 # right exchanged 0.039 of the joints and 0.096 of the points
 AMISS = 0.03
+LEFT_BY_MAP = "error left by the map where it is one-to-one, mean"
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
@@ -114,10 +107,10 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         raise UsageError(f"--features: expected a folder for a folder of scans, got {features}")
     work = replace(work, command=f"scape statue fit {scan}")
     found = [one if features else replace(one, landmarks=None) for one in find_scans(scan, features)]
-    with bar("fitting statues") as progress:
-        results = space.run(work, [Task(one.name, one, one.name) for one in found], workers, progress)
-    return Outcome(output, [Metric("scans", len(found)), Metric("statues", len(results.values))], {"statue": config},
-                   failures_of(results), judgement=judgement_of_many(results))
+    folder = FolderCommand(
+        ("scan",), "{} fitted", lambda results, count: [Metric("scans", count), Metric("statues", len(results.values))],
+        lambda rows: figure(rows, LEFT_BY_MAP), {"statue": config})
+    return folder.carry_out("fitting statues", space, work, [Task(one.name, one, one.name) for one in found], workers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +247,7 @@ def _of_the_map(statue: Statue, scan: Mesh, levels: list[Level], adaptive: Level
             Metric("folded", 100 * shares["folded"], "% of the surface"),
             Metric("holes", 100 * shares["hole"], "% of the surface"),
             *([Metric("parts without data", ", ".join(lacking))] if lacking else []),
-            Metric("error left by the map where it is one-to-one, mean", MM * left.mean, "mm"),
+            Metric(LEFT_BY_MAP, MM * left.mean, "mm"),
             *(Metric(f"{one.name} to the scan, {what}", MM * value, "mm") for one in [*levels, adaptive]
               for what, value in (("mean", one.mean), ("RMS", one.rms))),
             Metric("triangles of the adaptive subdivision", len(adaptive.mesh.faces)),

@@ -1,7 +1,7 @@
 """The command `scape animate`."""
 from __future__ import annotations
 
-from html import escape
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,11 +14,10 @@ from scanprep.arguments import Place
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, judgement_of_many
+from scanprep.console import Metric, Outcome, bar, judgement_of
+from scanprep.folders import FolderCommand, as_line, figure
 from scanprep.geometry.storage import read_json
-from scanprep.pictures.page import Page, link_to
 from scanprep.ranges import BETAS, Positive
-from scanprep.words import number_of
 
 from ...cli import ModelOrNone, read_model
 from ..files.markers import READERS
@@ -28,6 +27,7 @@ from ..subject.person import PersonConfig
 from .motions import ENDINGS, MEAN_DISTANCE, is_motion, motion_among
 from .work import MEAN_ERROR, BetasTo, Work
 
+ERRORS = (MEAN_ERROR, MEAN_DISTANCE)         # of markers, or of the joint centres of another skeleton
 MarkersArg = Annotated[Path, Place("MARKERS")]
 
 
@@ -91,12 +91,9 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             done = space.run(work, [Task("motion", markers)], inside=following).only
         return Outcome(output, done, settings, judgement=judgement_of(done),
                        following=f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
-    with bar("files") as progress:
-        results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
-    with space.staging("page") as staged:
-        _folder_page(results).write(staged.folder / "report.html")
-    return Outcome(output, _summary(results, len(found)), settings, failures_of(results),
-                   judgement=judgement_of_many(results))
+    folder = FolderCommand(("file",), "{} followed", _summary, _error, settings,
+                           lambda name, rows: [as_line(m) for m in rows if m.name in ERRORS])
+    return folder.carry_out("files", space, work, [Task(path.stem, path, path.stem) for path in found], workers)
 
 
 def _summary(results: Results, count: int) -> list[Metric]:
@@ -111,22 +108,9 @@ def _summary(results: Results, count: int) -> list[Metric]:
     return rows
 
 
-def _error(metrics: list[Metric]) -> float:
+def _error(metrics: Sequence[Metric]) -> float:
     """Millimetres; 0 for a motion that was copied."""
-    return next((float(m.value) for m in metrics if m.name in (MEAN_ERROR, MEAN_DISTANCE)), 0.0)
-
-
-def _folder_page(results: Results) -> Page:
-    """The files, worst first."""
-    page = Page(f"{number_of(len(results.values), 'file')} followed",
-                "Worst first; each name leads to the page of its file.")
-    if results.failures:
-        page.section("Failed").table([(line,) for line in results.failures.values()])
-    page.section("Distance of markers or joint centres to where the body puts them, mean")
-    for name in sorted(results.values, key=lambda name: -_error(results.values[name])):
-        page.markup(f'<p><a href="{link_to(name)}/report.html">{escape(name)}</a>: '
-                    f'{_error(results.values[name]):.1f} mm</p>')
-    return page
+    return figure(metrics, *ERRORS)
 
 
 def _files(markers: Path) -> list[Path]:

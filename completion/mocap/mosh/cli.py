@@ -3,7 +3,8 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,19 +12,16 @@ import numpy as np
 
 from scanprep.arguments import Alias, Called, Place
 from scanprep.batch.pool import Progress, Workers
-from scanprep.batch.workspace import HOME, Task, Workspace
+from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, details, judgement_of, say
-from scanprep.judgement import Judgement, judge_many
-from scanprep.pictures.page import Page
+from scanprep.folders import FolderCommand, as_line, figure
 from scanprep.ranges import Positive
-from scanprep.words import number_of
 
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .mosh import MoshConfig
 from .recordings import TABLE, Actor, Grouping, write_table
-from .report import add_entry
 from .work import ERRORS, FIXED, Work
 
 MarkersArg = Annotated[tuple[Path, ...], Place("MARKERS [MARKERS ...]")]
@@ -93,19 +91,29 @@ def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str
     _keep_table(space, actors, call.subjects)
     _tell(actors)
     done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *tell)
-    failures = [line if line.startswith(f"{name}: ") else f"{name}: {line}" for name, line in done.failures.items()]
-    judged = {name: judgement_of(rows) or Judgement() for name, (rows, _) in done.values.items()}
-    for name, (_, failed) in done.values.items():
-        failures += [f"{name}: {line}" for line in [*judged[name].problems, *failed]]
-    metrics = {name: [m for m in rows if m.name != JUDGEMENT] for name, (rows, _) in done.values.items()}
-    with space.staging("page") as staged:
-        _page(actors, metrics, failures).write(staged.folder / "report.html")
-        call.write(staged.folder / HOME)
-    settings = {"mosh": call.config, "model": loaded.name, "layout": call.layout, "held out": call.hold_out}
-    return Outcome(space.folder, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures,
-                   judgement=judge_many(judged, len(done.failures)) if len(actors) > 1 or not judged else
-                   next(iter(judged.values())),
+    results = Results({name: rows for name, (rows, _) in done.values.items()},
+                      {name: line if line.startswith(f"{name}: ") else f"{name}: {line}"
+                       for name, line in done.failures.items()}, done.fresh)
+    lost = [f"{name}: {line}" for name, (_, failed) in done.values.items() for line in failed]
+    outcome = told(call, loaded.name, actors).write(space, results, len(actors), lost)
+    judged = [judgement_of(rows) for rows in results.values.values()]
+    return replace(outcome, judgement=judged[0] if judged and len(actors) == 1 else outcome.judgement,
                    following=f"open {space.folder / 'report.html'}")
+
+
+def told(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
+    """What is told of the people of a call; `model` is its name."""
+    rules = {actor.name: actor.rule for actor in actors}
+
+    def lines(name: str, rows: Sequence[Metric]) -> list[str]:
+        shown = [as_line(m) for m in rows if m.name in (*ERRORS, "sequences", "frames", "sex")]
+        return [*shown, f"recordings put together: {rules[name]}"]
+
+    return FolderCommand(
+        ("person", "people"), "{} from markers", _summary, lambda rows: figure(rows, FIXED),
+        {"mosh": call.config, "model": model, "layout": call.layout, "held out": call.hold_out}, lines,
+        "A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should not be "
+        "used: open this folder with `scape view` and press `mend` to put them right and run again.", call)
 
 
 def _keep_table(space: Workspace, actors: Sequence[Actor], subjects: str) -> None:
@@ -130,38 +138,22 @@ def _tell(actors: list[Actor], most: int = 20) -> None:
         say(f"and {len(actors) - most} more people")
 
 
-def _summary(metrics: Mapping[str, Sequence[Metric]], count: int, before: int) -> list[Metric]:
+def _summary(results: Results, count: int) -> list[Metric]:
     """The rows of the closing table: those of one person, or means over several."""
-    if count == 1 and metrics:
-        only = next(iter(metrics.values()))
-        return [*only, *details([Metric("person", next(iter(metrics))), Metric("done before", before)])]
-    values = [{m.name: m for m in rows} for rows in metrics.values()]
+    before = len(results.values) - len(results.fresh)
+    if count == 1 and results.values:
+        (name, only), = results.values.items()
+        return [*(m for m in only if m.name != JUDGEMENT),
+                *details([Metric("person", name), Metric("done before", before)])]
+    values = {person: {m.name: m for m in rows} for person, rows in results.values.items()}
     rows = list[Metric]()
     for name in ERRORS:
-        found = {person: v[name] for person, v in zip(metrics, values, strict=True) if name in v}
+        found = {person: float(v[name].value) for person, v in values.items() if name in v}
         if found:
-            worst = max(found, key=lambda person: float(found[person].value))
-            rows += [Metric(f"{name}, mean of the people", float(np.mean([float(m.value) for m in found.values()])),
-                            "mm"),
-                     Metric(f"the same, worst ({worst})", float(found[worst].value), "mm")]
-    counts = [Metric(name, sum(int(v[name].value) for v in values))
+            worst = max(found, key=found.__getitem__)
+            rows += [Metric(f"{name}, mean of the people", float(np.mean(list(found.values()))), "mm"),
+                     Metric(f"the same, worst ({worst})", found[worst], "mm")]
+    counts = [Metric(name, sum(int(v[name].value) for v in values.values()))
               for name in ("sequences", "frames", "swaps", "bad spans")]
-    return [*rows, Metric("people", count), Metric("failed", count - len(metrics)),
+    return [*rows, Metric("people", count), Metric("failed", count - len(results.values)),
             *details([Metric("done before", before), *counts])]
-
-
-def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]) -> Page:
-    """All people, those with the largest error first."""
-    page = Page(f"{number_of(len(metrics), 'person', 'people')} from markers, worst first",
-                "Each picture leads to the page of the person, and that to the sequences.")
-    page.text("A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should "
-              "not be used: open this folder with `scape view` and press `mend` to put them right and run again.")
-    if failures:
-        page.section("Failed").table([(line,) for line in failures])
-    error = {name: float(next(m.value for m in rows if m.name == FIXED)) for name, rows in metrics.items()}
-    rules = {actor.name: actor.rule for actor in actors}
-    for name in sorted(metrics, key=lambda name: (-error[name], name)):
-        told = [f"{m.name}: {m.text()} {m.unit}" for m in metrics[name]
-                if m.name in (*ERRORS, "sequences", "frames", "sex")]
-        add_entry(page, name, (*told, f"recordings put together: {rules[name]}"))
-    return page

@@ -10,9 +10,8 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.batch.pool import Progress, Workers
-from scanprep.batch.workspace import HOME, Workspace
+from scanprep.batch.workspace import HOME, Results, Workspace
 from scanprep.console import Metric, Outcome, judgement_of
-from scanprep.folders import GRAVEST
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 from scanprep.pictures.scene import pack_scene
@@ -26,10 +25,10 @@ from scanprep.viewer.surface_clicks import Clickable
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
-from .cli import carried_out
+from .cli import carried_out, told
 from .mended_layout import Spot, changes, mended, next_file
 from .people import Found, found_people
-from .work import ERRORS, FIXED
+from .work import ERRORS
 
 MENDED = "scape mosh, mended in the browser"
 TOLD = "markers in the mean distance"
@@ -58,7 +57,8 @@ class Result:
         names = set(kept.kept(""))
         actors = [actor for actor in call.actors(folder) if actor.name in names]
         rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
-        people = found_people(folder, sorted(actors, key=lambda actor: _gravity(rows[actor.name])), models, call.unit,
+        order = told(call, models.name, actors).worst_first(Results(rows, {}, ()), rows)
+        people = found_people(folder, sorted(actors, key=lambda actor: order.index(actor.name)), models, call.unit,
                               call.rate)
         return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
 
@@ -255,9 +255,3 @@ def _usual(call: MoshCall, model: BodyModel, people: list[Found]) -> MarkerLayou
                          "scape mosh for each of them into a folder of its own")
     labels = tuple(dict.fromkeys(label for one in people for label in one.labels))
     return choose_layout(model, names[0], labels)[0]
-
-
-def _gravity(rows: list[Metric]) -> tuple[int, float]:
-    """Failed people first, then those with the largest error."""
-    error = next((float(m.value) for m in rows if m.name == FIXED), 0.0)
-    return GRAVEST.index((judgement_of(rows) or Judgement()).verdict), -error

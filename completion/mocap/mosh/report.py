@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -12,8 +12,9 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.cli import MM
 from scanprep.console import Metric
+from scanprep.folders import add_entry, as_line
 from scanprep.geometry import storage
-from scanprep.pictures.page import Page, link_to
+from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
 from scanprep.pictures.sheets import webp_bytes
@@ -26,7 +27,6 @@ from .mosh import MoshResult
 from .pictures import chart_artefacts, chart_frames, chart_map, chart_timeline
 from .takes import Take
 
-PICTURE = "picture.png"
 SOME = 56                            # frames that changes of the body are measured in
 COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
           "green for held-out markers, which no stage has seen.")
@@ -48,7 +48,7 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
                 "has them, with a rod from the one to the other", 520)
     page.section("Sequences")
     for take in takes:
-        add_entry(page, take.name, (f"{m.name}: {m.text()} {m.unit}" for m in _main(figures[take.name])))
+        add_entry(page, take.name, map(as_line, _main(figures[take.name])))
     _worn_section(page, result)
     page.section("Markers before and after", "From where the layout has each marker to where it was found.")
     page.table(_moved_rows(result, before, moved, takes),
@@ -135,14 +135,6 @@ def _drawn(figure: Any) -> bytes:
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=130)
     return out.getvalue()
-
-
-def add_entry(page: Page, name: str, lines: Iterable[str]) -> None:
-    """A person, or a sequence, leading to its own page."""
-    link, label = link_to(name), escape(name)
-    told = "".join(f"<p>{escape(line)}</p>" for line in lines)
-    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{label}</b></a>{told}</div>'
-                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{label}"></a></div>')
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:

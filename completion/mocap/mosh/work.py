@@ -17,6 +17,7 @@ from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
 from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
+from scanprep.folders import PICTURE
 from scanprep.geometry import storage, tables
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import upright
@@ -37,7 +38,7 @@ from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, wr
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
 from .pictures import standing
 from .recordings import Actor, Recording
-from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
+from .report import closing, person_page, person_picture, take_page, take_picture
 from .takes import LightMesh, Take, held_out
 
 # held out first; what soft tissue was fitted to is no error: its heads stay rigid, and little is left over
