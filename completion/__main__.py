@@ -11,7 +11,7 @@ COMMANDS = {
     "view": ("Meshes, scans, models, motions and results in the browser.", "completion.viewing.cli:view_files"),
     "measure": ("Stature, girths, lengths and widths of bodies; or a body that has them.",
                 "completion.measuring.cli:measure_bodies"),
-    "pick": ("Landmarks of scans, clicked in the browser.", "scanprep.viewer.cli:pick_landmarks"),
+    "pick": ("Landmarks of scans, clicked in the browser.", "scanprep.pipeline.pick:pick_landmarks"),
     "learn": ("Registered meshes -> a body model.", "model.learning.cli:learn"),
     "model": ("Look into a body model and pose it.", "model.cli:group"),
     "complete": ("A partial scan, or several views -> the whole body.", "completion.partial.cli:complete_scan"),

@@ -11,9 +11,9 @@ from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import sphere
+from scanprep.pipeline.pick import pick_landmarks
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import Person
-from scanprep.viewer.cli import pick_landmarks
 from scanprep.viewer.clicked import KEPT, Clicked, camera_like, camera_of, predict_landmarks
 from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
 from scanprep.viewer.messages import Message

@@ -7,8 +7,8 @@ from typing import Annotated
 from scanprep.arguments import Alias, Place
 from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, say
+from scanprep.pipeline.pick import Port
 from scanprep.ranges import Positive
-from scanprep.viewer.cli import Port
 
 from ..cli import ModelOrNone
 

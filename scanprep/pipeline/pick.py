@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 from ..arguments import Place
 from ..cli import MeshArg, Unit
 from ..console import Metric, Outcome, bar
-from ..pipeline.scans import find_scans
 from ..ranges import Range
-from .clicked import Clicked
-from .landmark_names import read_names
-from .pick import PickApp
+from ..viewer.clicked import Clicked
+from ..viewer.landmark_names import read_names
+from ..viewer.pick import PickApp
+from .scans import find_scans
 
 ScansArg = Annotated[tuple[Path, ...], Place("[SCAN ...]")]
 Port = Annotated[int, Range(0, 65535)]
@@ -55,7 +55,7 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
 def _mended(folder: Path, scans: tuple[Path, ...], ending: str, names: str, unit: Unit | None, serve: Port | None
             ) -> Outcome:
     """The same for the scans of a set, which are registered again there."""
-    from ..pipeline.mend import MendApp
+    from .mend import MendApp
 
     if scans or unit:
         raise ValueError(f"{folder}: a registered set knows its scans and their unit; name nothing but the set")
@@ -68,7 +68,7 @@ def _mended(folder: Path, scans: tuple[Path, ...], ending: str, names: str, unit
 
 def _shown(app: PickApp, serve: Port | None) -> Outcome:
     """An app in the browser until it is ended, and what was clicked."""
-    from .server import serve as show
+    from ..viewer.server import serve as show
 
     all_bodies = (app.template, *app.scans)
     before = {one.path: len(one.places) for one in all_bodies}
