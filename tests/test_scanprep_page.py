@@ -13,7 +13,10 @@ from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.judgement import Judgement
 from scanprep.pipeline import page as pictures
-from scanprep.pipeline.figures import (
+from scanprep.pipeline.page import judge_whole, write_set_page
+from scanprep.pipeline.prepare import prepare
+from scanprep.pipeline.scans import find_scans
+from scanprep.registration.figures import (
     Limits,
     ScanFigures,
     read_doubts,
@@ -24,9 +27,6 @@ from scanprep.pipeline.figures import (
     write_failures,
     write_figures,
 )
-from scanprep.pipeline.page import judge_whole, write_set_page
-from scanprep.pipeline.prepare import prepare
-from scanprep.pipeline.scans import find_scans
 from scanprep.registration.limbs import Doubt
 from scanprep.registration.nonrigid import principal_stretches, stretched_share, uncovered_share
 

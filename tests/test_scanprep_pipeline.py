@@ -242,7 +242,7 @@ def test_other_settings_or_template_do_all_anew(scans, template, tmp_path):
     prepare(tasks, wider, moved, tmp_path / "fresh", clean)
     assert contents(tmp_path / "set") == {name: data.replace(b"Scans of fresh", b"Scans of set")
                                           for name, data in contents(tmp_path / "fresh").items()}
-    with pytest.raises(ValueError, match="1 other scans that were registered with another template, settings or scapekit"):
+    with pytest.raises(ValueError, match="1 other scans that were registered with another template"):
         prepare(tasks[:1], template, MARKS, tmp_path / "set", clean)
 
 

@@ -17,8 +17,8 @@ from ..cli import MM, Output, Person, SetArg
 from ..console import Metric, Outcome, bar, say
 from ..dataset import RegisteredSet
 from ..geometry.mesh import Mesh
+from ..registration.figures import Limits, Verdict
 from .again import LISTED, Call
-from .figures import Limits, Verdict
 from .page import PAGE, judge_set, judge_whole, write_set_page
 from .prepare import PrepareConfig, Prepared, Progress, prepare
 from .scans import ScanTask

@@ -14,13 +14,13 @@ from ..batch.room import Progress
 from ..batch.workspace import Workspace
 from ..console import Outcome
 from ..judgement import Judgement
+from ..registration.figures import Verdict
 from ..viewer.app import Send
 from ..viewer.clicked import Clicked
 from ..viewer.messages import Message
 from ..viewer.results import ResultsApp
 from .again import Call
 from .cli import carried_out
-from .figures import Verdict
 from .page import PICTURES, judge_set
 from .scans import ScanTask
 

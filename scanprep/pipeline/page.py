@@ -21,11 +21,20 @@ from ..pictures.page import Page, data_uri
 from ..pictures.scene import Pane, carried, small_scene, worst_that_turn
 from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
+from ..registration.figures import (
+    UNSEEN,
+    Limits,
+    ScanFigures,
+    Verdict,
+    read_doubts,
+    read_failures,
+    read_figures,
+    review,
+)
 from ..registration.nonrigid import Registration
 from ..skeleton.names import skeleton_doubts
 from ..skeleton.tree import Skeleton
 from ..words import number_of
-from .figures import UNSEEN, Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
 WIDTH, HEIGHT, TALL = 150, 216, 300

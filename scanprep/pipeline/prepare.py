@@ -18,12 +18,12 @@ from ..geometry.files import write_mesh
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
+from ..registration.figures import ScanFigures, write_doubts, write_failures, write_figures
 from ..registration.person import PersonParts, person_parts
 from ..registration.schedule import RegistrationConfig
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
-from .figures import ScanFigures, write_doubts, write_failures, write_figures
 from .page import PICTURES, write_set_page
 from .scan import ScanSettings, register_scan
 from .scans import ScanTask

@@ -16,16 +16,16 @@ from ..geometry.landmarks import check_on_surface, read_landmarks, shared_landma
 from ..geometry.mesh import Mesh
 from ..judgement import beyond_people, extent
 from ..ranges import FLAG, Settings
+from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
 from ..registration.limbs import Doubt, exchanged_sides, limb_doubts
-from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
+from ..registration.nonrigid import Registration, register, registration_problem
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
 from ..registration.unmarked import register_unmarked
 from ..threads import one_thread
 from ..words import number_of
-from .figures import ScanFigures
 from .scans import ScanTask
 
 Init = Literal["best", "landmarks", "automatic", "pose"]
@@ -154,11 +154,3 @@ def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: Clean
         return scan, 0.0
     found = clean_scan(scan, config, None if landmarks is None else landmarks[1])
     return found.scan, 1 - float(found.kept.mean())
-
-
-def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanFigures:
-    """How well a template lies on a scan of some name; `init` is what led it there."""
-    return ScanFigures(
-        name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
-        float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)

@@ -28,8 +28,7 @@ from ..geometry.landmarks import (
 )
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement, beyond_people, size
-from ..pipeline.figures import UNSEEN, review
-from ..pipeline.scan import figures_of
+from .figures import UNSEEN, figures_of, review
 from .ground import soles_row, with_soles
 from .limbs import exchanged_sides, limb_doubts
 from .nonrigid import Registration, register, registration_problem

@@ -21,8 +21,7 @@ from protocols import RealData, load_real, machine, write_report
 from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES, TestScan, errors, test_scan
 
 from scanprep.judgement import size
-from scanprep.pipeline.figures import ScanFigures, review
-from scanprep.pipeline.scan import figures_of
+from scanprep.registration.figures import ScanFigures, figures_of, review
 from scanprep.registration.limbs import Doubt, limb_doubts
 from scanprep.registration.nonrigid import Registration, register, registration_problem
 from scanprep.registration.person import PersonParts, person_parts

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from ..geometry import tables
+from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from ..ranges import Settings
-from ..registration.limbs import Doubt
 from ..words import number_of
+from .limbs import Doubt
+from .nonrigid import Registration, stretched_share
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 CROWDED = 0.3                  # share of a scan off the template that may be a second person, who is half of it
@@ -40,6 +42,14 @@ class ScanFigures:
     seconds: float = np.nan         # in `times.csv`, as it is the one figure that differs from run to run
     rolled: bool = False    # limbs are rolled otherwise than they were found first, as no person's lie so
     doubts: tuple[Doubt, ...] = ()  # in `limbs.csv`: what no person can do, the gravest first
+
+
+def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanFigures:
+    """How well a template lies on a scan of some name; `init` is what led it there."""
+    return ScanFigures(
+        name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
+        float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)
 
 
 _TABLED = [f for f in fields(ScanFigures) if f.name not in ("seconds", "doubts")]
