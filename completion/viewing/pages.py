@@ -7,11 +7,12 @@ from typing import Any
 
 from model.body import BodyModel
 from scanprep.batch.calls import command_of
+from scanprep.command_line import load
 from scanprep.viewer.app import App
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.dropped import Dropped
 
-from ..partial.interactive import ENDING, CompleteApp, Made
+from ..partial.interactive import CompleteApp, Made
 from ..partial.settings import CompletionConfig
 from ..partial.work import Work, marks_of_template
 from .files import Entry, Files
@@ -22,28 +23,11 @@ Progress = Callable[[int, int], None]
 SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
 
-def _set(folder: Path) -> App:
-    from scanprep.pipeline.mend import MendApp
-
-    return MendApp(folder, ENDING)
-
-
-def _completions(folder: Path) -> App:
-    from ..partial.mend import mend_completions
-
-    return mend_completions(folder)
-
-
-def _people(folder: Path) -> App:
-    from ..mocap.mosh.mend import mend_mosh
-
-    return mend_mosh(folder)
-
-
 # What commands wrote that can be mended: what the button says, and the app of such a folder.
-MENDED: Mapping[str, tuple[str, Callable[[Path], App]]] = {
-    "scape prep run": ("mend landmarks of", _set), "scape complete": ("mend landmarks of", _completions),
-    "scape mosh": ("mend markers of", _people)}
+MENDED: Mapping[str, tuple[str, str]] = {
+    "scape prep run": ("mend landmarks of", "scanprep.pipeline.mend:MendApp"),
+    "scape complete": ("mend landmarks of", "completion.partial.mend:mend_completions"),
+    "scape mosh": ("mend markers of", "completion.mocap.mosh.mend:MoshApp")}
 
 
 class CompletePage(CompleteApp):
@@ -110,7 +94,7 @@ class Inside:
         if what != "mend" or folder is None or command not in MENDED:
             raise ValueError(f"page: expected one that the list of things offers, got {what} of {wanted['folder']}")
         if (what, folder) not in self.opened:
-            self.opened[what, folder] = MENDED[command][1](folder)
+            self.opened[what, folder] = load(MENDED[command][1])(folder)
         return self.opened[what, folder]
 
     def _completion(self, scan: Entry, model: str, progress: Progress) -> App:

@@ -41,7 +41,7 @@ class MendApp(ResultsApp):
     name, title = "mend", "Mend a set"
     no_result = "not registered yet"
 
-    def __init__(self, folder: Path, ending: str, names: tuple[str, ...] = ()) -> None:
+    def __init__(self, folder: Path, ending: str = ".landmarks.json", names: tuple[str, ...] = ()) -> None:
         self.folder, self.call = folder, Call.read(folder)
         if self.call.config.scan.init not in LEDS:
             raise ValueError(f"{folder}: it was made with --init {self.call.config.scan.init}, which uses none: "

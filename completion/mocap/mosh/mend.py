@@ -35,11 +35,6 @@ TOLD = "markers in the mean distance"
 LEAST = 3                            # markers that a person needs
 
 
-def mend_mosh(folder: Path) -> MoshApp:
-    """The app of a folder that `scape mosh` made; ValueError for one that does not tell."""
-    return MoshApp(folder)
-
-
 @dataclass(frozen=True, eq=False)
 class Result:
     """What a folder holds: figures of the people, those worst first, and the layout as it was used."""
@@ -76,7 +71,8 @@ class MoshApp(ResultsApp):
     """The state of the page on which a result of `scape mosh` is mended.
 
     The first pane is the layout on the model's template, the second a person at rest with the markers where they were
-    found, which are moved, exchanged or taken away; the third a frame of the person.
+    found, which are moved, exchanged or taken away; the third a frame of the person. ValueError for a folder that
+    does not tell what it was made from.
     """
 
     name, title = "mosh", "Mend markers"
