@@ -15,11 +15,11 @@ from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.judgement import judge_many
 from scanprep.pipeline.scans import find_scans
 
-from ..cli import ModelOrNone, read_model
+from ..cli import ModelOrNone, body_of, marks_of_template, read_model
 from .colors import ColorConfig
-from .folder import FolderCall, body_of
+from .folder import FolderCall
 from .settings import CompletionConfig
-from .work import Inputs, Work, marks_of_template
+from .work import Inputs, Work
 
 ScansArg = Annotated[tuple[Path, ...], Place("SCAN [SCAN ...]")]
 AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),

@@ -8,7 +8,6 @@ from typing import ClassVar
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import Subject
 from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
 from scanprep.batch.workspace import Results, Task
@@ -18,10 +17,10 @@ from scanprep.folders import FolderCommand, figure
 from scanprep.geometry.files import name_of
 from scanprep.pipeline.scans import find_scans
 
-from ..cli import read_model
+from ..cli import body_of, marks_of_template, read_model
 from .colors import ColorConfig
 from .settings import CompletionConfig
-from .work import EXPLAINED, MEANS, Inputs, Work, marks_of_template
+from .work import EXPLAINED, MEANS, Inputs, Work
 
 
 @dataclass(frozen=True)
@@ -59,15 +58,6 @@ class FolderCall(KeptCall):
             {"complete": self.config, "model": model},
             hint="To mend some, run the same command with --interactive: it opens these results in the browser, worst "
             f"first (scape complete {self.scans} ... -o {output} --interactive).", call=self)
-
-
-def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:
-    """The model where the person's shape is to be found, else a body of known shape."""
-    if subject is None and model.n_betas:
-        return model
-    from model.posing.cli import read_subject  # with all that makes models
-
-    return read_subject(model, None if subject in (None, "template") else Path(str(subject)), unit)
 
 
 def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> dict[str, Inputs]:

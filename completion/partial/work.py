@@ -18,7 +18,7 @@ from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, common_unit, read_view
 from scanprep.geometry.format_common import UNITS
-from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks, shared_landmarks
+from scanprep.geometry.landmarks import read_landmarks, shared_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
@@ -209,16 +209,3 @@ def person_in(picture: DepthPicture, template: Mesh, landmarks: tuple[np.ndarray
     """The person in a depth picture, as a view; `landmarks` are those of `complete`."""
     person = prepare_picture(picture, size(template), np.zeros((0, 3)) if landmarks is None else landmarks[1])
     return ScanFiles((PointCloud(person.points, person.normals),), (None,))
-
-
-def marks_of_template(model: BodyModel, given: Path | None, name: str, wanted: bool = True) -> dict[str, int]:
-    """Vertices of a model's template by name, from a file or the model itself; `name` is the model's.
-
-    ValueError where there are none and they are wanted.
-    """
-    if given is not None:
-        return read_landmark_vertices(given, model.template)
-    kept = model.info.get("landmarks") or {}
-    if wanted and not kept:
-        raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
-    return {name: int(vertex) for name, vertex in kept.items()}

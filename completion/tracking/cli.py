@@ -7,10 +7,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from model.body import BodyModel
 from model.linear import Subject
 from model.people import person_judgement
-from model.posing.cli import read_subject
 from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
@@ -18,7 +16,7 @@ from scanprep.console import Metric, Outcome, bar, say
 from scanprep.judgement import Judgement, extent, unit_problem
 from scanprep.ranges import Positive
 
-from ..cli import ModelOrNone, read_landmark_pairs, read_model
+from ..cli import ModelOrNone, body_of, read_landmark_pairs, read_model
 from ..motion import Motion
 from .folder import FrameFolder, follow_folder
 from .sequence import Tracker, as_motion, tracking_doubts, tracking_problem
@@ -60,9 +58,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
 
     found = FrameFolder(frames, cameras, unit)
     loaded, name = read_model(model)
-    body: BodyModel | Subject = loaded
-    if subject is not None or not loaded.n_betas:
-        body = read_subject(loaded, None if subject in (None, "template") else Path(str(subject)), unit)
+    body = body_of(loaded, subject, unit)
     marked = None if landmarks is None else read_landmark_pairs(loaded, name, landmarks, template_landmarks, unit)
     whose = Path(subject) if subject not in (None, "template") else subject
     key = space.digests.of(model or loaded, whose, marked, unit, replace(config, smoothing=0), rate, surfaces)

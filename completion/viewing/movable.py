@@ -38,11 +38,6 @@ class MovableBody:
         self._pose = np.zeros((0, 3))
         self._products: dict[int, np.ndarray] = {}                # at `_pose`; -1 is the body itself
 
-    @property
-    def n_parts(self) -> int:
-        """J."""
-        return len(self.skeleton.parents)
-
     def vertices(self, betas: np.ndarray | None, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """(N, 3) float32, metres, relative to the root's joint, of betas (K,), or None, and a pose (J, 3); plus trans.
 

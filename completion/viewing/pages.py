@@ -12,9 +12,10 @@ from scanprep.viewer.app import App
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.dropped import Dropped
 
+from ..cli import marks_of_template
 from ..partial.interactive import CompleteApp, Made
 from ..partial.settings import CompletionConfig
-from ..partial.work import Work, marks_of_template
+from ..partial.work import Work
 from .files import Entry, Files
 from .saving import free_name
 

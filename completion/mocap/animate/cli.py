@@ -19,7 +19,7 @@ from scanprep.folders import FolderCommand, as_line, figure
 from scanprep.geometry.storage import read_json
 from scanprep.ranges import BETAS, Positive
 
-from ...cli import ModelOrNone, read_model
+from ...cli import ModelOrNone, body_of, read_model
 from ..files.markers import READERS
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
@@ -130,11 +130,8 @@ def _files(markers: Path) -> list[Path]:
 
 def _subject(model: BodyModel, given: str | None, unit: Unit | None) -> Subject | None:
     """Whose body it is; None when it is to be found from the markers."""
-    if given is None:
-        return None if model.n_betas else model.subject(None)
-    if given == "markers":
-        return None
-    return read_subject(model, None if given == "template" else Path(given), unit)
+    body = model if given == "markers" else body_of(model, given, unit)
+    return body if isinstance(body, Subject) else None
 
 
 def read_betas_to(path: Path, n_betas: int) -> BetasTo:
