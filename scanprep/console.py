@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:               # imported where it is used: help answers at once
-    from .batch.workspace import Results, Workspace
+    from .batch.workspace import Workspace
     from .judgement import Judgement
 
 Progress = Callable[[int, int], None]
@@ -76,21 +76,6 @@ def judgement_of(metrics: Iterable[Metric]) -> Judgement | None:
     from .judgement import Judgement
 
     return next((Judgement.read(str(m.value)) for m in metrics if m.name == JUDGEMENT), None)
-
-
-def judgement_of_many(results: Results) -> Judgement:
-    """What many results are worth together."""
-    from .judgement import judge_many
-
-    judged = {name: judgement_of(rows) for name, rows in results.values.items()}
-    return judge_many({name: one for name, one in judged.items() if one is not None}, len(results.failures))
-
-
-def failures_of(results: Results) -> list[str]:
-    """One line a task that failed, or of which the result means nothing."""
-    judged = {name: judgement_of(rows) for name, rows in results.values.items()}
-    told = [f"{name}: {one.why}" for name, one in judged.items() if one is not None and one.verdict == "failed"]
-    return [*results.failures.values(), *told]
 
 
 @contextlib.contextmanager

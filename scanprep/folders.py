@@ -17,8 +17,8 @@ import numpy as np
 from .batch.calls import KeptCall
 from .batch.pool import Workers
 from .batch.workspace import HOME, Results, Task, Workspace
-from .console import Metric, Outcome, bar, failures_of, judgement_of, judgement_of_many
-from .judgement import Judgement
+from .console import Metric, Outcome, bar, judgement_of
+from .judgement import Judgement, judge_many
 from .pictures.page import Page, link_to
 from .pictures.scene import SCENE, worst_that_turn
 from .pictures.sheets import small_picture
@@ -83,8 +83,11 @@ class FolderCommand:
 
     def outcome(self, space: Workspace, results: Results, count: int, failed: Sequence[str] = ()) -> Outcome:
         """What is told of so many things."""
-        return Outcome(space.folder, self.figures(results, count), self.settings, [*failures_of(results), *failed],
-                       judgement=judgement_of_many(results))
+        judged = {name: judgement_of(rows) or Judgement() for name, rows in results.values.items()}
+        worthless = [f"{name}: {one.why}" for name, one in judged.items() if one.problems]
+        return Outcome(space.folder, self.figures(results, count), self.settings,
+                       [*results.failures.values(), *worthless, *failed],
+                       judgement=judge_many(judged, len(results.failures)))
 
     def page(self, results: Results, failures: Sequence[str], folder: Path) -> Page:
         """All results, worst first, each with the way to its own page in the folder."""

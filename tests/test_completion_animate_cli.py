@@ -150,5 +150,6 @@ def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):
 
 
 def test_an_empty_folder_is_refused(place, tmp_path, capsys):
+    (tmp_path / "._walk.c3d").write_bytes(b"what a Mac leaves beside a file on a foreign disk")
     assert run(place, tmp_path, "-o", tmp_path / "out") == 1
-    assert "expected files ending in .c3d, .trc, .csv, .tsv, found none" in capsys.readouterr().err
+    assert "expected files ending in .c3d, .trc, .csv, .tsv, or motions (.bvh, .npz), found none" in capsys.readouterr().err

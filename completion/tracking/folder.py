@@ -17,6 +17,7 @@ from scanprep.geometry.files import (
     PointCloud,
     common_unit,
     ending_of,
+    list_files,
     name_of,
     read_points,
     write_mesh,
@@ -102,8 +103,7 @@ def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")
-                  and ending_of(path) in ENDINGS)
+    return list_files(folder, lambda path: ending_of(path) in ENDINGS)
 
 
 def _numbered(paths: list[Path]) -> dict[int, Path]:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, TypeVar
 from .. import config_files
 from ..geometry import storage
 from ..ranges import Settings
+from .digests import with_paths
 from .ownership import HOME
 
 RUN, VERSION, CALL = "run.json", 1, "call of "
@@ -31,7 +32,7 @@ class KeptCall:
 
     def write(self, folder: Path) -> None:
         """Keep it in a folder."""
-        given: dict[str, Any] = {f.name: _absolute(getattr(self, f.name)) for f in fields(self)}
+        given: dict[str, Any] = {f.name: with_paths(getattr(self, f.name), Path.absolute) for f in fields(self)}
         given |= {name: str(Path(given[name]).absolute()) for name in self.may_be_files
                   if given[name] is not None and Path(given[name]).exists()}
         given["config"] = config_files.write({"config": given["config"]})
@@ -71,13 +72,6 @@ def _file(folder: Path) -> Path | None:
 
 def _kind(call: KeptCall | type[KeptCall]) -> str:
     return CALL + call.command
-
-
-def _absolute(value: Any) -> Any:
-    """A value with absolute paths."""
-    if isinstance(value, tuple):
-        return tuple(map(_absolute, value))
-    return value.absolute() if isinstance(value, Path) else value
 
 
 def _as(value: Any, kind: Any) -> Any:

@@ -2,11 +2,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import pickle
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry import storage
-from .digests import paths_of, program
+from .digests import paths_of, program, with_paths
 from .room import Failure, Job, attempt_elsewhere
 
 ANSWER = 10                    # seconds that a scheduler may take
@@ -50,7 +49,7 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
         def submit() -> None:
             """The next job; few at a time, so that shipped files do not pile up at the scheduler."""
             for job in waiting:
-                given = _with_paths(job.given, Path.absolute)
+                given = with_paths(job.given, Path.absolute)
                 sent = job.name, job.place, given, _files(given) if ship else None
                 future = client.submit(there, shared, pickle.dumps(sent), pure=False)
                 job_of[future] = job
@@ -119,7 +118,7 @@ def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[
     with tempfile.TemporaryDirectory() as temporary:
         here = Path(temporary)
         paths = {} if sent is None else _unpacked(sent, here / "sent")
-        job = Job(name, _with_paths(given, lambda path: paths.get(path, path)), here / "made", place, here / "steps")
+        job = Job(name, with_paths(given, lambda path: paths.get(path, path)), here / "made", place, here / "steps")
         outcome, notes = attempt_elsewhere(work, job)
         for theirs, mine in paths.items():
             notes = [note.replace(str(mine), str(theirs)) for note in notes]
@@ -130,22 +129,6 @@ def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[
         made = {path.relative_to(here / "made").as_posix(): path.read_bytes()
                 for path in sorted((here / "made").rglob("*")) if path.is_file()}
     return outcome, made, notes
-
-
-def _with_paths(value: Any, change: Callable[[Path], Path]) -> Any:
-    """The same value with other paths in it."""
-    if isinstance(value, Path):
-        return change(value)
-    if isinstance(value, list | tuple):
-        return type(value)(_with_paths(v, change) for v in value)
-    if isinstance(value, Mapping):
-        return {k: _with_paths(v, change) for k, v in value.items()}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-        changed = {name: _with_paths(v, change) for name, v in fields.items()}
-        if any(changed[name] is not v for name, v in fields.items()):
-            return dataclasses.replace(value, **changed)
-    return value
 
 
 def _files(given: Any) -> dict[Path, bytes]:

@@ -8,7 +8,7 @@ import hashlib
 import importlib.metadata
 import time
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from stat import S_ISREG
 from typing import Any
@@ -142,6 +142,22 @@ def paths_of(value: Any) -> Iterator[Path]:
             yield from paths_of(each)
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield from paths_of([getattr(value, field.name) for field in dataclasses.fields(value)])
+
+
+def with_paths(value: Any, change: Callable[[Path], Path]) -> Any:
+    """The same value with other paths in it."""
+    if isinstance(value, Path):
+        return change(value)
+    if isinstance(value, list | tuple):
+        return type(value)(with_paths(v, change) for v in value)
+    if isinstance(value, Mapping):
+        return {k: with_paths(v, change) for k, v in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+        changed = {name: with_paths(v, change) for name, v in fields.items()}
+        if any(changed[name] is not v for name, v in fields.items()):
+            return dataclasses.replace(value, **changed)
+    return value
 
 
 def program() -> str:

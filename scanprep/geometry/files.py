@@ -43,8 +43,8 @@ from .seams import merged_mean, seams_closed
 from .thinning import thin_scan
 
 __all__ = ["ENDINGS", "SCAN_ENDINGS", "UNITS", "EmptyFileError", "MeshFileError", "PointCloud", "Registered",
-           "common_unit", "ending_of", "list_meshes", "name_of", "read_mesh", "read_points", "read_registered",
-           "read_scan", "read_scan_mesh", "read_view", "write_mesh", "write_points"]
+           "common_unit", "ending_of", "list_files", "list_meshes", "name_of", "read_mesh", "read_points",
+           "read_registered", "read_scan", "read_scan_mesh", "read_view", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
@@ -292,15 +292,22 @@ def is_scan(path: Path) -> bool:
 
 def list_meshes(folder: str | Path) -> list[Path]:
     """The mesh files of a folder, sorted by name, at least one; of a RegisteredSet those in its `meshes`."""
-    folder = Path(folder)
+    inside = Path(folder) / "meshes" if (Path(folder) / "set.json").is_file() else Path(folder)
+    return list_files(inside, lambda path: ending_of(path) in _MESHES, f"meshes ({', '.join(_MESHES)})")
+
+
+def list_files(folder: Path, wanted: Callable[[Path], bool], least_one_of: str = "") -> list[Path]:
+    """The files of a folder that are wanted, sorted by name; hidden ones never are.
+
+    MeshFileError for what is no folder, and where none is found of what `least_one_of` names.
+    """
     if not folder.is_dir():
         problem = "expected a folder, found a file" if folder.exists() else "no such folder"
         raise MeshFileError(f"{folder}: {problem}")
-    inside = folder / "meshes" if (folder / "set.json").is_file() else folder
-    paths = sorted(p for p in inside.glob("*") if not p.name.startswith(".") and ending_of(p) in _MESHES)
-    if not paths:
-        raise MeshFileError(f"{inside}: expected meshes ({', '.join(_MESHES)}), found none")
-    return paths
+    found = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".") and wanted(p))
+    if least_one_of and not found:
+        raise MeshFileError(f"{folder}: expected {least_one_of}, found none")
+    return found
 
 
 class Registered(NamedTuple):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..console import visible
 from ..geometry import storage, tables
-from ..geometry.files import SCAN_ENDINGS, MeshFileError, is_scan, name_of
+from ..geometry.files import SCAN_ENDINGS, MeshFileError, is_scan, list_files, name_of
 from ..geometry.landmarks import landmarks_beside
 
 TABLE = "scans.csv"
@@ -52,11 +52,8 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
 
 def _list_scans(folder: Path) -> dict[str, Path]:
     """Name -> file."""
-    if not folder.is_dir():
-        problem = "expected a folder, found a file" if folder.exists() else "no such folder"
-        raise MeshFileError(f"{folder}: {problem}")
     found: dict[str, Path] = {}
-    for path in sorted(filter(_is_scan, folder.iterdir())):
+    for path in list_files(folder, is_scan):
         name = name_of(path)
         if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
             raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
@@ -66,14 +63,10 @@ def _list_scans(folder: Path) -> dict[str, Path]:
                              f"of the name '{name}'; rename one, or merge them where they are views of one scan")
         found[name] = path
     if not found:
-        inner = sorted({path.parent.name for path in folder.glob("*/*") if _is_scan(path)})
+        inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir() and list_files(place, is_scan)]
         hint = f"; there are some in its folders {', '.join(inner[:5])}: name one of them" if inner else ""
         raise MeshFileError(f"{folder}: expected scans ({', '.join(SCAN_ENDINGS)}), found none{hint}")
     return found
-
-
-def _is_scan(path: Path) -> bool:
-    return is_scan(path) and not path.name.startswith(".") and path.is_file()
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:

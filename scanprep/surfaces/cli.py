@@ -21,6 +21,7 @@ from ..geometry.files import (
     PointCloud,
     common_unit,
     is_scan,
+    list_files,
     list_meshes,
     name_of,
     read_mesh,
@@ -98,11 +99,8 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
 
 def _files_of(folder: Path) -> list[Path]:
     """The meshes and point clouds of a folder of views, by name."""
-    found = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and is_scan(path)
-                   and ".landmarks." not in path.name)
-    if not found:
-        raise ValueError(f"{folder}: expected views, meshes or point clouds, found none")
-    return found
+    return list_files(folder, lambda path: is_scan(path) and ".landmarks." not in path.name,
+                      "views, meshes or point clouds")
 
 
 def _read_body(path: Path, unit: Unit | None) -> Mesh | PointCloud:

@@ -16,6 +16,7 @@ from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, judgement_of
 from scanprep.folders import FolderCommand, as_line, figure
+from scanprep.geometry.files import list_files
 from scanprep.geometry.storage import read_json
 from scanprep.ranges import BETAS, Positive
 
@@ -117,10 +118,8 @@ def _files(markers: Path) -> list[Path]:
     """The file, or the files of markers and motions in a folder; those of one name would be written over each other."""
     if not markers.is_dir():
         return [markers]
-    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in READERS or motion_among(p))
-    if not found:
-        raise ValueError(f"{markers}: expected files ending in {', '.join(READERS)}, found none, nor "
-                         f"motions ({', '.join(ENDINGS)})")
+    found = list_files(markers, lambda path: path.suffix.lower() in READERS or motion_among(path),
+                       f"files ending in {', '.join(READERS)}, or motions ({', '.join(ENDINGS)})")
     names = [p.stem for p in found]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
