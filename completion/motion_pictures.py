@@ -13,7 +13,7 @@ from scanprep.decimation.registered_set import decimate_set
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, stance
-from scanprep.pictures.scene import Pane, picture_pane
+from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots, Moving, Shape, Solid, render, side_by_side
 
 from .motion import Motion, spread_frames
@@ -110,6 +110,13 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
     return Pane(shapes, camera, label)
 
 
+def dotted_pane(motion: Motion, subject: Subject, places: np.ndarray, name: str, labels: Sequence[str],
+                on_top: bool = False) -> Pane:
+    """A body in motion with the places (T, L, 3), metres, that it follows."""
+    at = places[played(motion)[0]]
+    return moving_pane(motion, subject, [(Dots(at[0], MARKER, 0.013, on_top, name=name, labels=labels), at)])
+
+
 def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray | None, frames: np.ndarray, turn: float = TURN
                 ) -> list[Pane]:
     """Some frames, the measured markers (T, L, 3), metres, as dots."""
@@ -120,14 +127,6 @@ def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray | None, fr
             shapes.append(Dots(markers[t], MARKER, radius=0.013))
         panes.append(Pane(shapes, facing(subject, motion.poses[t], vertices, turn, vertical), told))
     return panes
-
-
-def picture_frames(motion: Motion, subject: Subject, markers: np.ndarray | None, count: int = 8, height: int = 360,
-                   turn: float = TURN) -> np.ndarray:
-    """So many frames side by side, each as large as fits, the measured markers (T, L, 3), metres, as dots."""
-    panes = frame_panes(motion, subject, markers, spread_frames(len(motion.poses), count), turn)
-    return side_by_side([picture_pane(pane, int(0.62 * height), height) for pane in panes],
-                        [pane.label for pane in panes])
 
 
 def seconds(motion: Motion, frames: np.ndarray) -> list[str]:

@@ -16,12 +16,12 @@ from scanprep.judgement import Judgement
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
-from scanprep.pictures.shading import CLAY, Dots, Heat, Solid, part_colors
+from scanprep.pictures.shading import CLAY, Heat, Solid, part_colors
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.thinning import thinned
 
 from ..mocap.files.motion_files import write_glb
-from ..motion_pictures import MARKER, chart_residuals, moving_pane, played
+from ..motion_pictures import chart_residuals, dotted_pane
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
 from .chain import Demo
 from .figures import distance
@@ -170,8 +170,7 @@ def _animation(demo: Demo, page: Page, to: Path) -> None:
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
                  "that follows them.")
     write_glb(to / "animation" / "walk.glb", motion, subject)
-    at = sequence.positions[played(motion)[0]]
-    dots = Dots(at[0], MARKER, 0.013, name="measured markers", labels=sequence.labels)
-    page.bodies([moving_pane(motion, subject, [(dots, at)])], "the walk with the measured markers", 480)
+    page.bodies([dotted_pane(motion, subject, sequence.positions, "measured markers", sequence.labels)],
+                "the walk with the measured markers", 480)
     page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.text("animation/walk.glb, beside this page, plays in any viewer of glTF.")

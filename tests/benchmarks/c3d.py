@@ -52,15 +52,16 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, shap
 def picture(model: BodyModel, found: PersonFit, motion: Motion, markers: MarkerSequence, every: int, path: Path
             ) -> None:
     """Every so many frames with the markers as dots, from two sides."""
-    from completion.motion_pictures import picture_frames
+    from completion.motion_pictures import frame_panes
+    from scanprep.pictures.scene import picture_panes
     from scanprep.pictures.sheets import save_png
 
     few = Motion(motion.poses[::every], motion.trans[::every], motion.betas, motion.rate / every,
                  motion.residuals[::every], motion.labels)
     some = markers.frames(slice(None, None, every))
-    sides = [picture_frames(few, model.subject(found.betas), some.positions, len(few.poses), 300, turn)
-             for turn in (35.0, 215.0)]
-    save_png(path, np.concatenate(sides))
+    body, frames = model.subject(found.betas), np.arange(len(few.poses))
+    panes = [pane for turn in (35.0, 215.0) for pane in frame_panes(few, body, some.positions, frames, turn)]
+    save_png(path, picture_panes(panes, 300, len(frames)))
 
 
 def main() -> None:

@@ -125,7 +125,8 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, conf
 def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: int, path: Path, columns: int = 10
             ) -> None:
     """Every so many frames with the markers as dots."""
-    from completion.motion_pictures import picture_frames
+    from completion.motion_pictures import frame_panes
+    from scanprep.pictures.scene import picture_panes
     from scanprep.pictures.sheets import save_png
 
     subject, rows, step = model.subject(motion.betas), [], every * columns
@@ -133,7 +134,7 @@ def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: in
         some = slice(start, start + step, every)
         few = Motion(motion.poses[some], motion.trans[some], motion.betas, motion.rate / every,
                      motion.residuals[some], motion.labels)
-        rows.append(picture_frames(few, subject, markers.positions[some], columns, 300))
+        rows.append(picture_panes(frame_panes(few, subject, markers.positions[some], np.arange(len(few.poses))), 300))
     width = max(row.shape[1] for row in rows)
     white = 255 if rows[0].dtype == np.uint8 else 1
     save_png(path, np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=white)

@@ -17,10 +17,9 @@ from scanprep.console import Metric, judgement_row
 from scanprep.geometry.storage import StorageError
 from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Dots
 
 from ...motion import Motion
-from ...motion_pictures import MARKER, chart_residuals, frame_panes, moving_pane, played, worst_frames
+from ...motion_pictures import chart_residuals, dotted_pane, frame_panes, moving_pane, worst_frames
 from ..files.motion_files import write_glb, write_motion, write_residuals
 from .keys import holds_keys, judge_keys, read_keys
 
@@ -103,10 +102,7 @@ def figures(found: BodyMotion) -> list[Metric]:
 
 def _joints(page: Page, motion: Motion, body: Subject, fit: Followed, folder: Path) -> None:
     """The body with the joint centres that it follows; the residuals of `motion` are their distances."""
-    at = fit.wanted[played(motion)[0]]
-    dots = Dots(at[0], MARKER, 0.013, on_top=True, name="joint centres of the motion",
-                labels=tuple(map(_words, fit.names)))
-    page.bodies([moving_pane(motion, body, [(dots, at)])],
+    page.bodies([dotted_pane(motion, body, fit.wanted, "joint centres of the motion", [*map(_words, fit.names)], True)],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Joint centres").chart(chart_residuals(motion, "joint centres"),
                                         "distance of the body's joint centres from those of the motion")

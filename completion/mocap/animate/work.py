@@ -16,17 +16,15 @@ from scanprep.console import Metric, details, judgement_row
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Dots
 
 from ...motion import Motion
 from ...motion_pictures import (
-    MARKER,
     chart_residuals,
     chart_states,
+    dotted_pane,
     frame_panes,
     marker_rows,
     moving_pane,
-    played,
     worst_frames,
 )
 from ..files.markers import MarkerSequence, read_markers
@@ -181,9 +179,7 @@ def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name:
                 metrics: list[Metric]) -> Page:
     """The page of `scape animate`."""
     page = Page(f"{name}, animated", "The body in motion, with the markers that were measured as dots.")
-    at = markers.positions[played(motion)[0]]
-    dots = Dots(at[0], MARKER, 0.013, name="measured markers", labels=markers.labels)
-    page.bodies([moving_pane(motion, subject, [(dots, at)])],
+    page.bodies([dotted_pane(motion, subject, markers.positions, "measured markers", markers.labels)],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.bodies(frame_panes(motion, subject, markers.positions, worst_frames(motion, 5)),
