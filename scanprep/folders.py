@@ -94,7 +94,7 @@ class FolderCommand:
         page = Page(self.title.format(number_of(len(results.values), *self.things)),
                     f"Worst first; each name leads to the page of its {self.things[0]}.").text(self.hint)
         if failures:
-            page.section("Failed").table([(line,) for line in failures])
+            page.section("Failed").table([(line,) for line in failures]).section("Results")
         names = self.worst_first(results, results.values)
         for name, scene in zip(names, worst_that_turn([folder / name / SCENE for name in names]), strict=True):
             picture = folder / name / PICTURE
@@ -108,7 +108,8 @@ class FolderCommand:
         def gravity(name: str) -> tuple[int, float, str]:
             judgement = judgement_on(name, results)
             error = self.error(results.values[name]) if name in results.values else np.inf
-            return GRAVEST.index("new" if judgement is None else judgement.verdict), -error, name
+            return (GRAVEST.index("new" if judgement is None else judgement.verdict),
+                    -np.inf if np.isnan(error) else -error, name)
 
         return sorted(names, key=gravity)
 

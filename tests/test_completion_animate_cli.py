@@ -152,4 +152,5 @@ def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):
 def test_an_empty_folder_is_refused(place, tmp_path, capsys):
     (tmp_path / "._walk.c3d").write_bytes(b"what a Mac leaves beside a file on a foreign disk")
     assert run(place, tmp_path, "-o", tmp_path / "out") == 1
-    assert "expected files ending in .c3d, .trc, .csv, .tsv, or motions (.bvh, .npz), found none" in capsys.readouterr().err
+    wanted = "expected files ending in .c3d, .trc, .csv, .tsv, or motions (.bvh, .npz), found none"
+    assert wanted in capsys.readouterr().err

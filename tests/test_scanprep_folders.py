@@ -38,6 +38,8 @@ RESULTS = Results({"a": rows("good", 2.0), "b": rows("failed", 1.0), "c": rows("
 def test_worst_first():
     """What has no result, then by verdict, then by error, then by name; at the end what was not done yet."""
     assert SHEEP.worst_first(RESULTS, ["new", "a", "b", "c", "d e", "f"]) == ["f", "b", "c", "d e", "a", "new"]
+    unknown = Results({"a": rows("good", 2.0), "b": rows("good", np.nan), "c": rows("good", 3.0)}, {}, ())
+    assert SHEEP.worst_first(unknown, "abc") == ["b", "c", "a"]
     assert judgement_on("new", RESULTS) is None and judgement_on("f", RESULTS).reasons == ("f.ply: no sheep",)
 
 

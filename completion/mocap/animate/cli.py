@@ -14,7 +14,7 @@ from scanprep.arguments import Place
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, judgement_of
+from scanprep.console import JUDGEMENT, Metric, Outcome, bar, judgement_of
 from scanprep.folders import FolderCommand, as_line, figure
 from scanprep.geometry.files import list_files
 from scanprep.geometry.storage import read_json
@@ -93,7 +93,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         return Outcome(output, done, settings, judgement=judgement_of(done),
                        following=f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
     folder = FolderCommand(("file",), "{} followed", _summary, _error, settings,
-                           lambda name, rows: [as_line(m) for m in rows if m.name in ERRORS])
+                           lambda name, rows: [as_line(m) for m in rows if m.name in (JUDGEMENT, *ERRORS)])
     return folder.carry_out("files", space, work, [Task(path.stem, path, path.stem) for path in found], workers)
 
 

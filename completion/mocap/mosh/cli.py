@@ -106,7 +106,7 @@ def told(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
     rules = {actor.name: actor.rule for actor in actors}
 
     def lines(name: str, rows: Sequence[Metric]) -> list[str]:
-        shown = [as_line(m) for m in rows if m.name in (*ERRORS, "sequences", "frames", "sex")]
+        shown = [as_line(m) for m in rows if m.name in (JUDGEMENT, *ERRORS, "sequences", "frames", "sex")]
         return [*shown, f"recordings put together: {rules[name]}"]
 
     return FolderCommand(
