@@ -202,7 +202,7 @@ def _changed(config: Settings, tree: Any, table: Path_, place: _Place) -> Settin
             new = _changed(inner, value, (*table, name), place) if inner is not None else _converted(value, hints[name])
             config = dataclasses.replace(config, **{name: new})
         except OutOfRange as error:
-            raise place.error(name, table, str(error).partition(": ")[2] or str(error)) from None
+            raise place.error(name, table, error.args[1]) from None
         except TypeError as error:
             raise place.error(name, table, str(error)) from None
     return config

@@ -18,7 +18,10 @@ TINY, LARGE = 1e-12, 1e9                # nearer to 0, or larger, is no setting 
 
 
 class OutOfRange(ValueError):
-    """A number that a user chose is not in its range."""
+    """A number that a user chose is not in its range; its arguments are whose number, and what is wrong with it."""
+
+    def __str__(self) -> str:
+        return ": ".join(self.args)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Range:
         for part in value if isinstance(value, tuple | list) else ():
             self.check(part, name)
         if isinstance(value, int | float | np.number) and not self.low <= value <= self.high:
-            raise OutOfRange(f"{name}: expected {self}, got {value}")
+            raise OutOfRange(name, f"expected {self}, got {value}")
 
     def __str__(self) -> str:
         if self.low == TINY:
