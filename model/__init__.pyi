@@ -14,7 +14,6 @@ from .evaluation.sampling import specificity as specificity
 from .export.bvh import write_bvh as write_bvh
 from .export.correctives import write_body_npz as write_body_npz
 from .export.glb import write_skinned_glb as write_skinned_glb
-from .export.rig import make_rig as make_rig
 from .files import load_model as load_model
 from .fitting import FitConfig as FitConfig
 from .fitting import PoseFit as PoseFit
@@ -48,6 +47,7 @@ from .posing.transfer import subject_from_body as subject_from_body
 from .priors import sample_poses as sample_poses
 from .resolution.change import ResolutionConfig as ResolutionConfig
 from .resolution.change import change_resolution as change_resolution
+from .rig import make_rig as make_rig
 from .scape import BlendScapeModel as BlendScapeModel
 from .scape import ScapeModel as ScapeModel
 from .skinning import SkinningModel as SkinningModel

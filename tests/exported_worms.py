@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
-from model.export.rig import make_rig
+from model.rig import make_rig
 
 BETAS = np.array([0.5, -1.0])
 

@@ -7,8 +7,8 @@ import numpy as np
 from people_bodies import small_people
 
 from model.export.bvh import write_bvh
-from model.export.rig import joint_places, make_rig
 from model.motion import amass
+from model.rig import joint_places, make_rig
 from scanprep.geometry import rotations
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import random_pose

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from completion.synthetic_people import _decimated
 from model.blend_weights import skin_weights, strongest
 from model.export.correctives import pose_directions
-from model.export.rig import Rig
+from model.rig import Rig
 from scanprep.dataset import Skeleton
 from scanprep.synthetic.data_set import SUBJECT, near_rest
 from scanprep.synthetic.people import PARTS, BodyShape, Person, random_pose

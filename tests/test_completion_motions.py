@@ -12,8 +12,8 @@ from completion.__main__ import main
 from completion.motion import Motion
 from completion.viewing.files import Files
 from model.export.bvh import write_bvh
-from model.export.rig import joint_places, make_rig
 from model.motion.onto import read_motion
+from model.rig import joint_places, make_rig
 from scanprep import write_mesh
 from scanprep.geometry.storage import StorageError
 

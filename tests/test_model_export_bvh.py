@@ -7,8 +7,8 @@ from bvh_reader import Bvh
 from exported_worms import worm, worm_motion, worm_rig  # noqa: F401 -- fixtures
 
 from model.export.bvh import part_ends, write_bvh
-from model.export.rig import joint_places, turn_up
 from model.motion.bvh import read_bvh
+from model.rig import joint_places, turn_up
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 
@@ -121,11 +121,11 @@ def test_bvh_without_motion_is_one_frame_at_rest(rig, tmp_path):
 
 
 @pytest.mark.parametrize(("names", "how", "words"), [
-    (None, {"unit": "ft"}, "unit: expected one of m, cm, mm, in, got 'ft'"),
+    (None, {"unit": "ft"}, "unit: expected one of m, mm, cm, in, got 'ft'"),
     (("a", "b", "c", "left arm"), {}, "without white space"), (None, {"rate": -1.0}, "rate")])
 def test_bad_bvh_is_refused(rig, tmp_path, names, how, words):
     with pytest.raises(ValueError, match=words):
         write_bvh(tmp_path / "a.bvh", replace(rig.skeleton, names=names or rig.skeleton.names), **how)
-    with pytest.raises(ValueError, match="unit: expected one of m, cm, mm, in, got 'ft'"):
+    with pytest.raises(ValueError, match="unit: expected one of m, mm, cm, in, got 'ft'"):
         read_bvh(tmp_path / "no.bvh", "ft")
     assert not list(tmp_path.iterdir())

@@ -15,8 +15,8 @@ from model.export.conventions import aimed, for_programs
 from model.export.correctives import motion_correctives
 from model.export.glb import skinned_glb, write_skinned_glb
 from model.export.names import names_of
-from model.export.rig import carried, joint_places, make_rig, rerooted
 from model.posing.cli import mesh
+from model.rig import carried, joint_places, make_rig, rerooted
 from model.statue.control.files import humanoid, read_control
 from scanprep.command_line import run
 from scanprep.geometry import rotations

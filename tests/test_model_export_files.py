@@ -12,8 +12,8 @@ from model_bodies import random_poses, worm_model
 from model.export.cli import export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
-from model.export.rig import turn_up
 from model.motion.onto import BodyMotion
+from model.rig import turn_up
 from scanprep.command_line import run
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh

@@ -8,8 +8,8 @@ from model_bodies import random_poses, worm, worm_skeleton
 from model.blend_weights import skin_weights, strongest
 from model.export import correctives
 from model.export.correctives import motion_correctives, rest_corrections
-from model.export.rig import Rig, joint_places, make_rig, turn_up
 from model.features import linear_features
+from model.rig import Rig, joint_places, make_rig, turn_up
 from model.skinning import SkinningModel
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh

@@ -13,8 +13,8 @@ from model.export.cli import export
 from model.export.conventions import aimed
 from model.export.correctives import motion_correctives
 from model.export.glb import write_skinned_glb
-from model.export.rig import joint_places, make_rig
 from model.export.usd import USD, write_points_usd, write_skinned_usd
+from model.rig import joint_places, make_rig
 from scanprep.command_line import run
 from scanprep.geometry.format_glb import turn_up
 

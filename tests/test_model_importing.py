@@ -12,7 +12,6 @@ from scipy.sparse import csc_array, csr_array
 
 from model.cli import import_file
 from model.export.correctives import write_body_npz
-from model.export.rig import joint_places, make_rig
 from model.features import QuaternionLift, RotationLift, lifted, lifted_slopes
 from model.files import load_model
 from model.fitting import fit_shape
@@ -21,6 +20,7 @@ from model.linear import check_pose
 from model.makehuman import part_of, regressor_of
 from model.products import Products, Terms
 from model.resolution.change import change_resolution, resample
+from model.rig import joint_places, make_rig
 from scanprep.batch.digests import Digests
 from scanprep.command_line import run
 from scanprep.geometry import rotations

@@ -9,7 +9,7 @@ import pytest
 from glb_reader import Glb
 from PIL import Image
 
-from model.export.rig import turn_up
+from model.rig import turn_up
 from model.statue.control.chart import Chart
 from model.statue.control.files import humanoid
 from model.statue.detail.subdivision import subdivide

@@ -6,11 +6,11 @@ import pytest
 from model_bodies import worm, worm_model
 
 from model.export.bvh import write_bvh
-from model.export.rig import joint_places
 from model.features import linear_features
 from model.motion.bvh import read_bvh
 from model.motion.moving import MovingSkeleton
 from model.motion.onto import read_motion
+from model.rig import joint_places
 from model.skinning import SkinningModel
 from model.statue.control.files import humanoid
 from model.statue.motion.motions import Follower, _bound, bvh_motion, own_motion, people_motion, write_motion

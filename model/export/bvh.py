@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.geometry.tables import number_lines
 from scanprep.skeleton.tree import Skeleton
 
-from .rig import check_motion, turn_up
+from ..rig import check_motion, turn_up
 
-UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "in": 1 / 0.0254}
 _DIGITS = 8                          # after the point: in any unit finer than a tenth of a micrometre
 _ORDER = "ZXY"                       # R = R_z R_x R_y, about axes that turn with the part
 _TURNS = " ".join(f"{axis}rotation" for axis in _ORDER)
@@ -60,7 +60,7 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
         poses, trans = np.zeros((1, len(skeleton.parents), 3)), None
     poses, trans = check_motion(skeleton, poses, trans, rate)
     U = turn_up(up).T
-    scale = UNITS[unit]
+    scale = 1 / UNITS[unit]
     lines = ["HIERARCHY", *_hierarchy(skeleton, scale * skeleton.joints @ U, scale * part_ends(skeleton, body) @ U),
              "MOTION", f"Frames: {len(poses)}", f"Frame Time: {1 / rate:.9f}"]
     places = scale * (skeleton.joints[0] + trans) @ U

@@ -24,12 +24,12 @@ from ..linear import Subject
 from ..motion.amass import write_amass
 from ..motion.onto import BodyMotion, read_motion
 from ..people import ASKED, person_judgement
+from ..rig import Rig, joint_places, make_rig
 from .bvh import write_bvh
 from .conventions import for_programs, standing
 from .correctives import motion_correctives, off_exact, pose_features, spaced, write_body_npz
 from .glb import write_skinned_glb
 from .names import Names, names_of
-from .rig import Rig, joint_places, make_rig
 from .usd import USD, write_points_usd, write_skinned_usd
 
 MEASURED = 40                        # poses in which the files are compared with the exact model

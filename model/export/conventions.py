@@ -9,9 +9,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sides import side_of
 from scanprep.pictures.camera import stance, upright
 
+from ..rig import Rig, carried, rerooted, turn_up
 from .bvh import part_ends
 from .names import Names, renamed
-from .rig import Rig, carried, rerooted, turn_up
 
 FRAMES = 200                         # of a motion, in which its lowest point is looked for
 _SOME = 20                           # of them at a time

@@ -19,8 +19,8 @@ from scanprep.geometry.storage import save_arrays
 from ..body import BodyModel
 from ..features import RotationLift
 from ..linear import Subject
+from ..rig import Correctives, Rig, make_rig
 from ..skinning import SkinningModel
-from .rig import Correctives, Rig, make_rig
 
 AT_ONCE = 256                        # frames that are held at a time, of a few points
 SEEN = 100                           # frames whose whole bodies say what is lacking: 200 say the same to 0.02 mm

@@ -16,7 +16,7 @@ from scanprep.pictures.gltf import skin_material
 from scanprep.pictures.sheets import png_bytes
 
 from ..blend_weights import CARRIERS
-from .rig import Rig, check_motion
+from ..rig import Rig, check_motion
 
 
 @dataclass(frozen=True, eq=False)

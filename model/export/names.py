@@ -7,7 +7,7 @@ from typing import Literal
 from scanprep.skeleton.roles import numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
-from .rig import Rig
+from ..rig import Rig
 
 Names = Literal["mixamo", "vrm", "h-anim", "opensim"]
 

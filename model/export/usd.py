@@ -16,8 +16,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.pictures.gltf import skin_material
 
+from ..rig import Rig, check_motion
 from .glb import continuous_quaternions, four_carriers
-from .rig import Rig, check_motion
 
 USD = (".usd", ".usda", ".usdc", ".usdz")
 _AT_ONCE = 32                        # frames whose bounds are looked for at a time

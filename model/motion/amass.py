@@ -12,7 +12,7 @@ import numpy as np
 from scanprep.geometry.storage import save_arrays
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.rig import turn_up
+from ..rig import turn_up
 from .files import StoredMotion
 from .moving import MovingSkeleton
 

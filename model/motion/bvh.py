@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import tables
+from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.storage import LARGEST, StorageError, read_bytes, taking_apart
 
-from ..export.bvh import UNITS
 from .moving import MovingSkeleton
 
 _DEEPEST = 500                       # joints below each other: more is no skeleton
@@ -54,7 +54,7 @@ def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSk
     data = read_bytes(path, "a BVH file")
     with taking_apart(path, "a BVH file"):
         lines = tables.decoded(data).splitlines()
-    words, metre = _Words(path, lines), 1 / UNITS[unit]
+    words, metre = _Words(path, lines), UNITS[unit]
     joints, ends = _read_hierarchy(words)
     table, own_rate = _read_motion(words, joints, rate)
     R, places = _posed(joints, table, metre)

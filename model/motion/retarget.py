@@ -17,7 +17,7 @@ from scanprep.geometry import rotations
 from scanprep.skeleton.roles import NEEDED, above, numbered_roles, trunk, way
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.rig import check_motion, joint_places
+from ..rig import check_motion, joint_places
 from .moving import MovingSkeleton
 from .trunks import grouped, heights, nearest_starts, spread
 

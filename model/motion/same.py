@@ -8,7 +8,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import upright
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.rig import joint_places, turn_up
+from ..rig import joint_places, turn_up
 from .moving import MovingSkeleton
 from .retarget import Retargeted, Vertices, lift
 

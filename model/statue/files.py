@@ -16,9 +16,9 @@ from scanprep.synthetic import people
 
 from ..blend_weights import strongest
 from ..export.glb import Material, write_skinned_glb
-from ..export.rig import Rig, turn_up
 from ..features import linear_features
 from ..motion.retarget import Retargeted
+from ..rig import Rig, turn_up
 from ..skinning import SkinningModel
 from .control.chart import Chart
 from .control.files import humanoid, humanoid_markers, read_control, write_control

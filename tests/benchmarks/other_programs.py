@@ -53,8 +53,8 @@ def cases(model_file, motion_file, folder):
     from model.export.conventions import for_programs
     from model.export.correctives import motion_correctives
     from model.export.glb import write_skinned_glb
-    from model.export.rig import joint_places, make_rig, subject_rig
     from model.files import load_model
+    from model.rig import joint_places, make_rig, subject_rig
     from scanprep.geometry.files import write_mesh
     from scanprep.geometry.format_glb import tallest, turn_up
     from scanprep.pictures.camera import upright

@@ -51,8 +51,8 @@ from completion.mocap.mosh.mosh import MoshConfig, mosh
 from completion.mocap.pose.marked_body import MarkedBody
 from completion.mocap.subject.person import spread_frames
 from model.body import BodyModel
-from model.export.rig import make_rig
 from model.files import load_model
+from model.rig import make_rig
 from scanprep.geometry import rotations
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import upright

@@ -11,8 +11,8 @@ from model.export.bvh import write_bvh
 from model.export.conventions import aimed
 from model.export.correctives import body_correctives, motion_correctives, off_exact
 from model.export.glb import write_skinned_glb
-from model.export.rig import subject_rig
 from model.linear import Subject
+from model.rig import subject_rig
 from scanprep.console import Metric, details
 from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import upright

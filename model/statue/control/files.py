@@ -16,7 +16,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from ...blend_weights import strongest
-from ...export.rig import turn_up
+from ...rig import turn_up
 from .chart import Chart, automatic_chart, chart_problem
 from .model import ControlModel, control_problem, surface_problem
 

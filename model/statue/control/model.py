@@ -10,7 +10,7 @@ from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.skeleton.tree import Skeleton
 
 from ...blend_weights import CARRIERS
-from ...export.rig import Rig
+from ...rig import Rig
 from .chart import Chart, chart_problem
 
 

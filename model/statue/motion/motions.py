@@ -19,7 +19,6 @@ from scanprep.registration.nonrigid import Registration, register, registration_
 from scanprep.skeleton.tree import Skeleton
 
 from ...body import BodyModel
-from ...export.rig import check_motion, joint_places
 from ...fitting import fit_shape
 from ...linear import Subject
 from ...motion.amass import moving_body
@@ -28,6 +27,7 @@ from ...motion.files import read_motion_file
 from ...motion.moving import MovingSkeleton
 from ...motion.retarget import Pairing, Retargeted, retargeted
 from ...motion.same import copied
+from ...rig import check_motion, joint_places
 from ..control.model import ControlModel, Statue
 from ..detail.reconstruction import Reconstruction
 from ..detail.subdivision import subdivide

@@ -11,10 +11,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import TURNS
 from scanprep.skeleton.tree import Skeleton, reorder
 
-from ..blend_weights import CARRIERS, skin_weights, strongest
-from ..body import BodyModel
-from ..linear import Subject
-from ..skinning import SkinningModel
+from .blend_weights import CARRIERS, skin_weights, strongest
+from .body import BodyModel
+from .linear import Subject
+from .skinning import SkinningModel
 
 SLIDER = 3.0                         # standard deviations that a morph target of a beta reaches at weight 1
 
