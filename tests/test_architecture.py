@@ -1,6 +1,7 @@
 """The structure of the project holds: imports point down, tags name known papers, libraries do not print."""
 import ast
 import functools
+import graphlib
 import importlib
 import re
 import subprocess
@@ -30,55 +31,65 @@ def name(path):
     return str(path.relative_to(ROOT))
 
 
-def imports(tree, only_top=False):
+@functools.cache
+def imports(path, only_top=False):
+    """What a file imports, by full names, with the lines."""
+    tree, here, found = parsed(path), path.relative_to(ROOT).parts, []
     for node in (tree.body if only_top else ast.walk(tree)):
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name.split(".")[0], node.lineno
-        elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
-            yield node.module.split(".")[0], node.lineno
+            found += [(alias.name, node.lineno) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = here[:len(here) - node.level] if node.level else ()
+            stem = ".".join([*above, *filter(None, [node.module])])
+            found += [(f"{stem}.{alias.name}", node.lineno) for alias in node.names]
+    return found
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name)
-def test_imports_point_down(path):
-    package = path.relative_to(ROOT).parts[0]
-    above = PACKAGES[PACKAGES.index(package) + 1:]
-    wrong = [f"{name(path)}:{line} imports {module}" for module, line in imports(parsed(path))
-             if module in above or module == "tests"]
+def test_imports_point_down():
+    wrong = []
+    for path in MODULES:
+        above = PACKAGES[PACKAGES.index(path.relative_to(ROOT).parts[0]) + 1:]
+        wrong += [f"{name(path)}:{line} imports {module}" for module, line in imports(path)
+                  if module.split(".")[0] in (*above, "tests")]
     assert not wrong
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name)
-def test_heavy_libraries_load_late(path):
-    wrong = [f"{name(path)}:{line} imports {module} at the top"
-             for module, line in imports(parsed(path), only_top=True) if module in HEAVY]
-    assert not wrong or path.name in SPEAKS
+def test_no_files_import_each_other_in_a_circle():
+    files = {name(path).removesuffix(".py").removesuffix("/__init__").replace("/", "."): path for path in MODULES}
+    arrows = {one: {other if other in files else other.rpartition(".")[0] for other, _ in imports(path)} - {one}
+              for one, path in files.items() if path.name != "__init__.py"}
+    graphlib.TopologicalSorter(arrows).prepare()            # CycleError names the circle
 
 
-@pytest.mark.parametrize("library", sorted(ONE_FILE_EACH))
-def test_one_file_a_foreign_library(library):
-    users = [name(p) for p in MODULES if library in {m for m, _ in imports(parsed(p))}]
-    assert len(users) <= 1, users
-
-
-@pytest.mark.parametrize("path", [p for p in MODULES if p.name not in SPEAKS], ids=name)
-def test_libraries_do_not_print_or_exit(path):
-    calls = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
-    wrong = [f"{name(path)}:{node.lineno}" for node in calls
-             if ast.unparse(node.func) in ("print", "exit", "quit", "sys.exit", "os._exit")]
+def test_heavy_libraries_load_late():
+    wrong = [f"{name(path)}:{line} imports {module} at the top" for path in MODULES if path.name not in SPEAKS
+             for module, line in imports(path, only_top=True) if module.split(".")[0] in HEAVY]
     assert not wrong
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name)
-def test_equation_tags_name_known_papers(path):
-    text = path.read_text()
-    for key, equations in re.findall(r"\[([A-Za-z-]+)\](?: Eq\. ([\d, and-]+))?", text):
-        if equations:
-            assert key in WITH_EQUATIONS, f"[{key}] Eq. {equations}: an equation of a paper that is not at hand"
-            for number in re.findall(r"\d+", equations):
-                assert 1 <= int(number) <= WITH_EQUATIONS[key], f"[{key}] has no Eq. {number}"
-    for key in re.findall(r"^\s*(?:.*\s)?\[([A-Z][A-Za-z-]+)\](?=\s|\.|,|;|\)|$)", text, re.MULTILINE):
-        assert key in PAPERS, f"{name(path)}: [{key}] is not a known paper"
+def test_one_file_a_foreign_library():
+    users = {library: {name(path) for path in MODULES for module, _ in imports(path) if module.split(".")[0] == library}
+             for library in ONE_FILE_EACH}
+    assert all(len(files) <= 1 for files in users.values()), users
+
+
+def test_libraries_do_not_print_or_exit():
+    wrong = [f"{name(path)}:{node.lineno}" for path in MODULES if path.name not in SPEAKS
+             for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)
+             and ast.unparse(node.func) in ("print", "exit", "quit", "sys.exit", "os._exit")]
+    assert not wrong
+
+
+def test_equation_tags_name_known_papers():
+    wrong = []
+    for path in MODULES:
+        text = path.read_text(encoding="utf-8")
+        for key, equations in re.findall(r"\[([A-Za-z-]+)\] Eq\. ([\d, and-]+)", text):
+            if not all(1 <= int(number) <= WITH_EQUATIONS.get(key, 0) for number in re.findall(r"\d+", equations)):
+                wrong.append(f"{name(path)}: [{key}] Eq. {equations}: no equation of a paper that is at hand")
+        keys = re.findall(r"^\s*(?:.*\s)?\[([A-Z][A-Za-z-]+)\](?=\s|\.|,|;|\)|$)", text, re.MULTILINE)
+        wrong += [f"{name(path)}: [{key}] is not a known paper" for key in keys if key not in PAPERS]
+    assert not wrong
 
 
 def test_the_papers_of_the_project_are_listed():
@@ -98,18 +109,17 @@ def test_top_level_is_as_agreed():
     assert not list(ROOT.glob("*/utils.py"))
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_packages_import_without_heavy_libraries(package):
+def test_packages_import_without_heavy_libraries():
     blocked = "open3d,pymeshlab,matplotlib,PIL,trimesh,ezc3d"
-    code = (f"import sys\nfor m in {blocked.split(',')!r}: sys.modules[m] = None\n"
-            f"import {package}\nfor name in {package}.__all__: getattr({package}, name)")
+    code = (f"import importlib, sys\nfor m in {blocked.split(',')!r}: sys.modules[m] = None\n"
+            f"for package in map(importlib.import_module, {PACKAGES}):\n"
+            "    for name in package.__all__: getattr(package, name)")
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_every_public_name_loads_from_one_room(package):
-    module = importlib.import_module(package)
-    assert sorted(module.__all__) == sorted(set(module.__all__))
-    for public in module.__all__:
-        assert getattr(module, public) is not None
+def test_every_public_name_loads_from_one_room():
+    for package in map(importlib.import_module, PACKAGES):
+        assert len(package.__all__) == len(set(package.__all__)), package
+        missing = [public for public in package.__all__ if getattr(package, public, None) is None]
+        assert not missing, package
