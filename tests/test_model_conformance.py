@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from completion_bodies import half_view
 from conformance_bodies import KINDS, stiff_bodies
+from derivatives import differences
 from model_bodies import random_poses
 
 from completion.mocap.files.markers import MarkerSequence
@@ -28,16 +29,6 @@ def model(request):
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
-
-
-def differences(function, x, h=1e-6):
-    """Central differences of `function` by every entry of x, in a last axis."""
-    slopes = []
-    for i in range(x.size):
-        step = np.zeros(x.size)
-        step[i] = h
-        slopes.append((function(x + step.reshape(x.shape)) - function(x - step.reshape(x.shape))) / (2 * h))
-    return np.stack(slopes, axis=-1)
 
 
 def at_random(model, rng, count, size=0.5):

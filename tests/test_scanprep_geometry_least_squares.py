@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from derivatives import differences
 from scipy.sparse import csc_array
 
 from scanprep.geometry import rotations
@@ -134,12 +135,11 @@ def test_steps_are_rotations_where_derivatives_are_by_rotation_vectors():
         return np.concatenate([R[:, 0] @ [1, 2, 3] + x[:, 6:], (R[:, 0] @ R[:, 1]).reshape(-1, 9)], axis=1) - goal
 
     def equations(x):
-        by_x = np.stack([(residual(x + d) - residual(x - d)) / 2e-6 for d in 1e-6 * np.eye(9)], axis=-1)
+        by_x = differences(lambda step: residual(x + step), np.zeros(9))
         return Arrow(normal_equations([Residual(residual(x), by_x)]), 3)
 
     found, retract = by_rotations(equations(x), x, 6).rows, retract_pose(6)
-    J = np.stack([(residual(retract(x, d)) - residual(retract(x, -d))) / 2e-6
-                  for d in 1e-6 * np.eye(9)[:, None] * np.ones((2, 1))], axis=-1)
+    J = differences(lambda step: residual(retract(x, np.tile(step, (2, 1)))), np.zeros(9))
     expected = normal_equations([Residual(residual(x), J)])
     np.testing.assert_allclose(found.gradient, expected.gradient, atol=1e-7)
     np.testing.assert_allclose(found.hessian, expected.hessian, atol=1e-7)

@@ -1,6 +1,7 @@
 """Rotations: group axioms, scipy as oracle, finite differences."""
 import numpy as np
 import pytest
+from derivatives import slope
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -75,19 +76,15 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
 
 @given(twists(3.0), direction)
 def test_right_jacobian_is_the_derivative(t, d):
-    step = 1e-5 * d
-    plus = rotations.log(rotations.exp(t).T @ rotations.exp(t + step))
-    minus = rotations.log(rotations.exp(t).T @ rotations.exp(t - step))
-    np.testing.assert_allclose(rotations.right_jacobian(t) @ d, (plus - minus) / 2e-5, atol=1e-8)
+    change = slope(lambda s: rotations.log(rotations.exp(t).T @ rotations.exp(t + s * d)), 1e-5)
+    np.testing.assert_allclose(rotations.right_jacobian(t) @ d, change, atol=1e-8)
 
 
 @given(twists(3.0), direction)
 def test_inverse_right_jacobian_is_the_inverse_and_the_derivative_of_log(t, d):
     J, inverse = rotations.right_jacobian(t), rotations.inverse_right_jacobian(t)
     np.testing.assert_allclose(inverse @ J, np.eye(3), atol=1e-8)
-    step = 1e-6 * d
-    change = (rotations.log(rotations.exp(t) @ rotations.exp(step))
-              - rotations.log(rotations.exp(t) @ rotations.exp(-step))) / 2e-6
+    change = slope(lambda s: rotations.log(rotations.exp(t) @ rotations.exp(s * d)))
     np.testing.assert_allclose(inverse @ d, change, atol=1e-6)
 
 
