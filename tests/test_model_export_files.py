@@ -9,12 +9,13 @@ from exported_worms import BETAS, worm, worm_motion, worm_rig  # noqa: F401 -- f
 from glb_reader import Glb
 from model_bodies import random_poses, worm_model
 
-from model.export.cli import export, read_motion, write_frames
+from model.export.cli import WRITERS, Writer, export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
 from model.motion.onto import BodyMotion
 from model.rig import turn_up
 from scanprep.command_line import run
+from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
@@ -232,6 +233,17 @@ def test_the_command_refuses_in_one_line(files, arguments, code, words, capsys, 
     assert run(export, "scape model export", ["model.npz", *arguments]) == code
     assert words in capsys.readouterr().err
     assert not list(files.glob("b.*")) and not (files / "nothing").exists()
+
+
+def test_a_new_kind_of_file_is_one_line_of_the_table(files, monkeypatch):
+    """Joints at rest as text: a writer that gets what was asked for, and says what it wrote."""
+    def write_joints(asked):
+        np.savetxt(asked.output, asked.model.subject(asked.person).joints(np.zeros((4, 3))))
+        return [Metric("joints", len(asked.model.skeleton.parents))]
+
+    monkeypatch.setitem(WRITERS, ".joints.txt", Writer("joint list", {"betas"}, write_joints))
+    assert exported(files, "a.joints.txt", "--betas", "1") == {"joints": 4}
+    assert np.loadtxt(files / "a.joints.txt").shape == (4, 3)
 
 
 @pytest.mark.parametrize("rate", [24.0, 30.0, 48.0, 120.0])

@@ -1,10 +1,11 @@
 """`scape model export`: a model in the files of other programs."""
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -33,15 +34,6 @@ from .names import Names, names_of
 from .usd import USD, write_points_usd, write_skinned_usd
 
 MEASURED = 40                        # poses in which the files are compared with the exact model
-_MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
-_PLACED = {"betas", "own_body", "up", "ground", "front"}
-_BONES = _PLACED | {"motion", "fps", "rate", "root", "names"}
-_TAKES = {"glb": _BONES | {"morphs", "correctives"}, "usd": _BONES | {"morphs", "correctives"},
-          "point cache": {"betas", "own_body", "motion", "fps", "rate", "up"}, "bvh": _BONES | {"unit"},
-          "npz": {"motion", "fps", "rate"},
-          "mesh": _PLACED, "folder": {"betas", "own_body", "motion", "fps", "rate"}}
-
-
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
            motion: Path | None = None, shapes: Annotated[int | None, Called("--morphs")] = None,
            correctives: int | None = None, unit: Unit | None = None, up: Literal["x", "y", "z"] | None = None,
@@ -79,49 +71,49 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
         rate: Frames a second of the motion's file, where it does not say or says it wrongly.
     """
-    kind, axis = _kind(output), None if up is None else "xyz".index(up)
-    _refuse_the_rest(kind, {"betas": betas, "own_body": own_body, "motion": motion, "morphs": shapes,
-                            "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root,
-                            "names": names, "ground": ground, "front": front, "fps": fps, "rate": rate})
+    writer = _writer(output)
+    given = {"betas": betas, "own_body": own_body, "motion": motion, "morphs": shapes,
+             "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root, "names": names,
+             "ground": ground, "front": front, "fps": fps, "rate": rate}
+    wrong = [name for name, value in given.items() if value and name not in writer.takes]
+    if wrong:
+        hint = "; name a folder for the meshes of a motion" if (writer.kind, wrong[0]) == ("mesh", "motion") else ""
+        raise UsageError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {writer.kind}{hint}")
     loaded = load_model(model)
     judgement = person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement()
-    if kind == "npz" and motion is None:
-        return Outcome(output, _npz(output, loaded), judgement=judgement)
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
     moves = None if motion is None else read_motion(motion, loaded, chosen, rate=rate)
     if moves is not None and fps is not None:
         moves = moves.at_rate(fps)
-    if kind == "npz":
-        assert moves is not None
-        return Outcome(output, _amass(output, model, loaded, moves), judgement=judgement)
-    person = _person(model, loaded, betas, own_body, moves)
-    if kind == "folder":
-        return Outcome(output, _folder(output, loaded, person, moves), judgement=judgement)
-    if kind == "point cache":
-        return Outcome(output, _points(output, loaded, person, moves, axis), judgement=judgement)
-    if kind == "mesh":
-        rest = np.zeros((len(loaded.skeleton.parents), 3))
-        body = loaded.template.with_vertices(loaded.vertices(rest, person))
-        body = standing(body, body, axis, ground, front)
-        write_mesh(output, body)
-        return Outcome(output, [Metric("vertices", len(body.vertices)), _size(output)], judgement=judgement)
-    if shapes is None:
-        # morph targets where nobody says how many
-        shapes = 0 if person is None or kind == "bvh" else min(10, loaded.n_betas)
-    rig = make_rig(loaded, person, shapes)
-    axis = upright(rig.mesh)[0] if axis is None else axis
-    rig, told = _measured_rig(kind, loaded, person, rig, moves, correctives)
-    moves = moves or BodyMotion(np.zeros((0, len(loaded.skeleton.parents), 3)), np.zeros((0, 3)), person, 30.0)
-    ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, root, names, ground, front)
-    if kind == "bvh":
-        write_bvh(output, ready.skeleton, poses, trans, moves.rate, unit or "cm", axis, ready.mesh)
-        told.insert(0, Metric("unit", unit or "cm"))
-    elif kind == "usd":
-        write_skinned_usd(output, ready, poses, trans, moves.rate, axis)
-    else:
-        write_skinned_glb(output, ready, poses if len(poses) else None, trans, moves.rate, axis)
-    return Outcome(output, [_size(output), *moves.told, *_bones(rig, ready, names), Metric("up", "xyz"[axis]),
-                            Metric("frames", len(poses)), *told], judgement=judgement)
+    person = _person(model, loaded, betas, own_body, moves) if "betas" in writer.takes else None
+    asked = Asked(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
+                  None if up is None else "xyz".index(up), root, names, ground, front)
+    return Outcome(output, writer.write(asked), judgement=judgement)
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is to be written, as the arguments of `export` say."""
+
+    output: Path
+    path: Path                       # of the model
+    model: BodyModel
+    person: np.ndarray | None        # betas; None is the template's own body
+    moves: BodyMotion | None
+    shapes: int | None
+    correctives: int | None
+    unit: str                        # of a BVH file
+    up: int | None                   # axis
+    root: str | None
+    names: Names | None
+    ground: bool
+    front: bool
+
+    def motion(self, what: str) -> BodyMotion:
+        """The motion, without which there is nothing to write."""
+        if self.moves is None:
+            raise ValueError(f"{self.output}: expected a motion for {what}; name it with --motion")
+        return self.moves
 
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
@@ -137,27 +129,6 @@ def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans:
     return paths
 
 
-def _kind(output: Path) -> str:
-    name = output.name.lower()
-    if name.endswith(_MESHES):
-        return "mesh"
-    if output.suffix.lower() in USD:
-        return "point cache" if name_of(name).endswith(".points") else "usd"
-    if output.suffix.lower() in (".glb", ".bvh", ".npz"):
-        return output.suffix.lower()[1:]
-    if name_of(output) != output.name and not output.is_dir():
-        raise ValueError(f"{output}: expected a name ending in .glb, .bvh, .npz, .usd, {', '.join(_MESHES)}, "
-                         "or a folder")
-    return "folder"
-
-
-def _refuse_the_rest(kind: str, given: dict[str, object]) -> None:
-    wrong = [name for name, value in given.items() if value and name not in _TAKES[kind]]
-    if wrong:
-        hint = "; name a folder for the meshes of a motion" if (kind, wrong[0]) == ("mesh", "motion") else ""
-        raise UsageError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {kind}{hint}")
-
-
 def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: BodyMotion | None
             ) -> np.ndarray | None:
     """Betas of the body that is asked for; None is the template's own."""
@@ -170,14 +141,28 @@ def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bo
     return np.array(betas) if betas else moves.betas if moves is not None else np.zeros(1)
 
 
-def _npz(output: Path, model: BodyModel) -> list[Metric]:
-    arrays = write_body_npz(output, model)
+def _mesh(asked: Asked) -> list[Metric]:
+    """The body at rest."""
+    model = asked.model
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    body = model.template.with_vertices(model.vertices(rest, asked.person))
+    write_mesh(asked.output, standing(body, body, asked.up, asked.ground, asked.front))
+    return [Metric("vertices", len(body.vertices)), _size(asked.output)]
+
+
+def _npz(asked: Asked) -> list[Metric]:
+    """The model as linear blend skinning; with a motion, that motion as AMASS has it."""
+    if asked.moves is not None:
+        return _amass(asked, asked.moves)
+    model = asked.model
+    arrays = write_body_npz(asked.output, model)
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean)
     poses = sample_poses(model, MEASURED, np.random.default_rng(1))      # not those of the fit
     exact = model.subject(mean).vertices(poses)
     changes = np.tensordot(pose_features(poses), arrays["posedirs"], axes=(1, 2))
-    return [_size(output), Metric("joints", len(model.skeleton.parents)), Metric("shape directions", model.n_betas),
+    return [_size(asked.output), Metric("joints", len(model.skeleton.parents)),
+            Metric("shape directions", model.n_betas),
             Metric("pose directions", arrays["posedirs"].shape[-1]),
             Metric("measured on", f"{MEASURED} poses of the prior"),
             *_distances("exact body, skinning alone", np.linalg.norm(rig.vertices(poses) - exact, axis=-1)),
@@ -185,73 +170,94 @@ def _npz(output: Path, model: BodyModel) -> list[Metric]:
                         np.linalg.norm(rig.vertices(poses, changes=changes) - exact, axis=-1))]
 
 
-def _amass(output: Path, path: Path, model: BodyModel, moves: BodyMotion) -> list[Metric]:
-    family = str(model.info.get("family") or "")
+def _amass(asked: Asked, moves: BodyMotion) -> list[Metric]:
+    family = str(asked.model.info.get("family") or "")
     if not family:
-        raise ValueError(f"{path}: a motion under the names of AMASS is one of an imported model of the SMPL family "
-                         f"(scape model import); write {output.stem}.bvh, .glb or a folder")
-    write_amass(output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
-    return [_size(output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+        raise ValueError(f"{asked.path}: a motion under the names of AMASS is one of an imported model of the SMPL "
+                         f"family (scape model import); write {asked.output.stem}.bvh, .glb or a folder")
+    write_amass(asked.output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+    return [_size(asked.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
             Metric("surface_model_type", family)]
 
 
-def _folder(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None) -> list[Metric]:
-    if moves is None:
-        raise ValueError(f"{output}: expected a motion for a folder of meshes; name it with --motion")
+def _folder(asked: Asked) -> list[Metric]:
+    """The exact mesh of every frame, in a file of its own."""
+    subject, moves = asked.model.subject(asked.person), asked.motion("a folder of meshes")
     with bar("writing meshes") as progress:
-        paths = write_frames(output, model.subject(person), moves.poses, moves.trans, progress=progress)
+        paths = write_frames(asked.output, subject, moves.poses, moves.trans, progress=progress)
     return [Metric("meshes", len(paths)), *moves.told, Metric("rate", moves.rate, "1/s"),
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
 
 
-def _points(output: Path, model: BodyModel, person: np.ndarray | None, moves: BodyMotion | None, up: int | None
-            ) -> list[Metric]:
-    if moves is None:
-        raise ValueError(f"{output}: expected a motion for the points of its frames; name it with --motion")
-    subject, count = model.subject(person), len(moves.poses)
-    rest = model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
-    axis = upright(rest)[0] if up is None else up
+def _points(asked: Asked) -> list[Metric]:
+    """The exact mesh of every frame, in one file."""
+    subject, moves = asked.model.subject(asked.person), asked.motion("the points of its frames")
+    count = len(moves.poses)
+    rest = asked.model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
+    axis = upright(rest)[0] if asked.up is None else asked.up
     with bar("writing meshes") as progress:
         def frames() -> Iterator[np.ndarray]:
             for t in range(count):
                 yield subject.vertices(moves.poses[t], moves.trans[t])
                 progress(t + 1, count)
 
-        write_points_usd(output, rest, frames(), count, moves.rate, axis)
-    return [_size(output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
+        write_points_usd(asked.output, rest, frames(), count, moves.rate, axis)
+    return [_size(asked.output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
 
 
-def _bones(rig: Rig, ready: Rig, names: Names | None) -> list[Metric]:
-    """What became of the skeleton; parts that keep their names although others were asked for."""
-    known = {} if names is None else names_of(rig.skeleton, names)
-    kept = [name for name in rig.skeleton.names if name not in known]
-    return [Metric("joints", len(ready.skeleton.names)), Metric("root", ready.skeleton.names[0]),
-            *([Metric(f"parts without a name of {names}", ", ".join(kept))] if names and kept else [])]
+def _bvh(asked: Asked) -> list[Metric]:
+    """The skeleton and its motion."""
+    rig = make_rig(asked.model, asked.person)
+    where, poses, frames = _measured_poses(asked)
+    off = joint_places(rig.skeleton, poses[frames]) - asked.model.subject(asked.person).joints(poses[frames])
+    told = _write_rig(asked, rig, lambda ready, poses, trans, rate, up: write_bvh(
+        asked.output, ready.skeleton, poses, trans, rate, asked.unit, up, ready.mesh))
+    return [*told, Metric("unit", asked.unit), where,
+            *_distances("joints of the exact body", np.linalg.norm(off, axis=-1))]
 
 
-def _measured_rig(kind: str, model: BodyModel, person: np.ndarray | None, rig: Rig, moves: BodyMotion | None,
-                  count: int | None) -> tuple[Rig, list[Metric]]:
-    """The rig, for GLB with the correctives of the motion, and how far it is from the exact body."""
-    subject = model.subject(person)
-    if moves is None:
-        if count:
-            raise UsageError("--correctives: expected the motion that they belong to; name it with --motion")
-        poses, frames = sample_poses(model, MEASURED, np.random.default_rng(0)), np.arange(MEASURED)
-        where = f"{MEASURED} poses of the prior"
-    else:
-        poses, frames = moves.poses, spaced(len(moves.poses), MEASURED)
-        where = f"{len(frames)} frames of the motion"
-    exact = subject.vertices(poses[frames])
-    told = [Metric("measured on", where)]
-    if kind == "bvh":
-        joints = subject.joints(poses[frames])
-        off = np.linalg.norm(joint_places(rig.skeleton, poses[frames]) - joints, axis=-1)
-        return rig, [*told, *_distances("joints of the exact body", off)]
-    if moves is not None and count != 0:
-        rig = replace(rig, correctives=motion_correctives(rig, subject, poses, count))
+def _skin(asked: Asked, write: Callable[..., None]) -> list[Metric]:
+    """A body that hangs on joints, with morph targets of betas and, in a motion, of what skinning lacks."""
+    shapes, moves = asked.shapes, asked.moves
+    if shapes is None:
+        # morph targets where nobody says how many
+        shapes = 0 if asked.person is None else min(10, asked.model.n_betas)
+    rig, subject = make_rig(asked.model, asked.person, shapes), asked.model.subject(asked.person)
+    if moves is None and asked.correctives:
+        raise UsageError("--correctives: expected the motion that they belong to; name it with --motion")
+    where, poses, frames = _measured_poses(asked)
+    if moves is not None and asked.correctives != 0:
+        rig = replace(rig, correctives=motion_correctives(rig, subject, moves.poses, asked.correctives))
     extra = 0 if rig.correctives is None else len(rig.correctives.shapes)
-    return rig, [Metric("shape targets", 2 * len(rig.shapes)), Metric("corrective targets", extra), *told,
-                 *_distances("exact body", off_exact(rig, poses, None, exact, frames))]
+    off = off_exact(rig, poses, None, subject.vertices(poses[frames]), frames)
+    return [*_write_rig(asked, rig, partial(write, asked.output)), Metric("shape targets", 2 * len(rig.shapes)),
+            Metric("corrective targets", extra), where, *_distances("exact body", off)]
+
+
+def _measured_poses(asked: Asked) -> tuple[Metric, np.ndarray, np.ndarray]:
+    """Where a rig is compared with the exact body: of which poses (T, J, 3), and in which frames (n,) of them."""
+    if asked.moves is None:
+        poses = sample_poses(asked.model, MEASURED, np.random.default_rng(0))
+        return Metric("measured on", f"{MEASURED} poses of the prior"), poses, np.arange(MEASURED)
+    frames = spaced(len(asked.moves.poses), MEASURED)
+    return Metric("measured on", f"{len(frames)} frames of the motion"), asked.moves.poses, frames
+
+
+def _write_rig(asked: Asked, rig: Rig, write: Callable[..., None]) -> list[Metric]:
+    """Write a rig and its motion as other programs want them, and say what became of the skeleton."""
+    axis = upright(rig.mesh)[0] if asked.up is None else asked.up
+    rest = np.zeros((0, len(rig.skeleton.parents), 3))
+    moves = asked.moves or BodyMotion(rest, rest[:, 0], asked.person, 30.0)
+    ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, asked.root, asked.names, asked.ground,
+                                       asked.front)
+    write(ready, poses if len(poses) else None, trans, moves.rate, up=axis)
+    # parts that keep their names although others were asked for
+    known = {} if asked.names is None else names_of(rig.skeleton, asked.names)
+    kept = [name for name in rig.skeleton.names if name not in known]
+    return [_size(asked.output), *moves.told, Metric("joints", len(ready.skeleton.names)),
+            Metric("root", ready.skeleton.names[0]),
+            *([Metric(f"parts without a name of {asked.names}", ", ".join(kept))] if asked.names and kept else []),
+            Metric("up", "xyz"[axis]), Metric("frames", len(poses))]
 
 
 def _distances(what: str, off: np.ndarray) -> list[Metric]:
@@ -263,3 +269,34 @@ def _distances(what: str, off: np.ndarray) -> list[Metric]:
 
 def _size(path: Path) -> Metric:
     return Metric("size", path.stat().st_size / 1e6, "MB")
+
+
+class Writer(NamedTuple):
+    """How a kind of file is written, and what of the command line says anything about it."""
+
+    kind: str
+    takes: set[str]
+    write: Callable[[Asked], list[Metric]]
+
+
+_PLACED = {"betas", "own_body", "up", "ground", "front"}
+_BONES = _PLACED | {"motion", "fps", "rate", "root", "names"}
+_MOVES = {"betas", "own_body", "motion", "fps", "rate"}
+# by the ending of the output's name; without one it is a folder
+WRITERS = {
+    ".glb": Writer("glb", _BONES | {"morphs", "correctives"}, partial(_skin, write=write_skinned_glb)),
+    ".bvh": Writer("bvh", _BONES | {"unit"}, _bvh),
+    ".npz": Writer("npz", {"motion", "fps", "rate"}, _npz),
+    **dict.fromkeys(USD, Writer("usd", _BONES | {"morphs", "correctives"}, partial(_skin, write=write_skinned_usd))),
+    **{f".points{ending}": Writer("point cache", _MOVES | {"up"}, _points) for ending in USD},
+    **dict.fromkeys((".obj", ".ply", ".stl", ".off", ".ply.gz"), Writer("mesh", _PLACED, _mesh)),
+    "": Writer("folder", _MOVES, _folder),
+}
+
+
+def _writer(output: Path) -> Writer:
+    name = output.name.lower()
+    ending = max((ending for ending in WRITERS if name.endswith(ending)), key=len)
+    if not ending and name_of(output) != output.name and not output.is_dir():
+        raise ValueError(f"{output}: expected a name ending in {', '.join(filter(None, WRITERS))}, or a folder")
+    return WRITERS[ending]
