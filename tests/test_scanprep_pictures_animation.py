@@ -57,7 +57,7 @@ def test_colours_are_stored_as_light(motion):
     colors = np.tile([1.0, 0.5, 0.0], (frames.shape[1], 1))
     glb = Glb(animated_glb(faces, frames, 4.0, colors))
     stored = glb.array(glb.json["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"])
-    assert np.allclose(stored, [1.0, 0.2140, 0.0, 1.0], atol=1e-4)
+    assert np.allclose(stored, [1.0, 0.2140, 0.0], atol=1e-4)
 
 
 def test_one_frame_is_a_still(motion):

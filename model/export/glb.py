@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scanprep.geometry.format_common import as_light
-from scanprep.geometry.format_glb import VERTICES, Glb, some_normal, turn_up
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.format_glb import VERTICES, Glb, turn_up
 from scanprep.geometry.storage import writing
 from scanprep.pictures.gltf import skin_material
 from scanprep.pictures.sheets import png_bytes
@@ -113,25 +111,13 @@ def continuous_quaternions(R: np.ndarray) -> np.ndarray:
 
 
 def _primitive(glb: Glb, rig: Rig, targets: np.ndarray, material: Material | None, U: np.ndarray) -> dict[str, Any]:
-    base, normals = rig.mesh.vertices, some_normal(rig.mesh) if material is None else material.normals @ U
     joints, weights = four_carriers(rig.weights)
-    out: dict[str, Any] = {
-        "attributes": {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
-                       "NORMAL": glb.add(normals, "VEC3", VERTICES), "JOINTS_0": glb.add_joints(joints),
-                       "WEIGHTS_0": glb.add(weights, "VEC4", VERTICES)},
-        "indices": glb.add_indices(rig.mesh.faces), "material": 0}
-    if rig.mesh.colors is not None:
-        rgba = np.concatenate([as_light(rig.mesh.colors), np.ones((len(base), 1))], axis=1)
-        out["attributes"]["COLOR_0"] = glb.add(rgba, "VEC4", VERTICES)
-    if material is not None:
-        out["attributes"]["TEXCOORD_0"] = glb.add(material.uv * [1, -1] + [0, 1], "VEC2", VERTICES)
-        if material.tangents is not None:
-            tangents = np.column_stack([material.tangents[:, :3] @ U, material.tangents[:, 3]])
-            out["attributes"]["TANGENT"] = glb.add(tangents, "VEC4", VERTICES)
-    if len(targets):
-        out["targets"] = [{"POSITION": glb.add(change, "VEC3", VERTICES, bounds=True),
-                           "NORMAL": glb.add(some_normal(Mesh(base + change, rig.mesh.faces)) - normals, "VEC3",
-                                             VERTICES)} for change in targets]
+    out = (glb.add_surface(rig.mesh, targets=targets) if material is None else
+           glb.add_surface(rig.mesh, material.normals @ U, material.uv, targets))
+    out["attributes"] |= {"JOINTS_0": glb.add_joints(joints), "WEIGHTS_0": glb.add(weights, "VEC4", VERTICES)}
+    if material is not None and material.tangents is not None:
+        tangents = np.column_stack([material.tangents[:, :3] @ U, material.tangents[:, 3]])
+        out["attributes"]["TANGENT"] = glb.add(tangents, "VEC4", VERTICES)
     return out
 
 

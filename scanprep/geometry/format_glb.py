@@ -10,7 +10,7 @@ import base64
 import binascii
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -372,16 +372,10 @@ def encode(contents: Contents, double: bool) -> bytes:
     """A GLB file of one mesh with normals, in single precision whatever `double` says."""
     assert contents.faces is not None, "a GLB file is written for meshes"
     up = tallest(contents.vertices)
-    vertices = contents.vertices @ turn_up(up).T
-    glb, normals = Glb(), some_normal(Mesh(vertices, contents.faces))
-    indices = glb.add_indices(contents.faces)
-    attributes = {"POSITION": glb.add(vertices, "VEC3", VERTICES, bounds=True),
-                  "NORMAL": glb.add(normals, "VEC3", VERTICES)}
-    if contents.colors is not None:
-        attributes["COLOR_0"] = glb.add(as_light(contents.colors), "VEC3", VERTICES)
+    glb, mesh = Glb(), Mesh(contents.vertices @ turn_up(up).T, contents.faces, contents.colors)
     return glb.pack({
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "meshes": [{"primitives": [glb.add_surface(mesh)]}],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}]}, up)
 
 
@@ -413,6 +407,27 @@ class Glb:
         """An accessor of numbers of whatever type; its index."""
         values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
         return self._append(values, len(values), kind, None, {"normalized": normalized})
+
+    def add_surface(self, mesh: Mesh, normals: np.ndarray | None = None, uv: np.ndarray | None = None,
+                    targets: Iterable[np.ndarray] = ()) -> dict[str, Any]:
+        """A surface as a primitive of `meshes`, with its colours and of the first material.
+
+        Unit normals (N, 3) are its own unless given. `uv` (N, 2) are places in images, (0, 0) in the lower left corner.
+        `targets` are changes (N, 3) of the vertices, metres: morph targets, with those of the normals.
+        """
+        normals = some_normal(mesh) if normals is None else normals
+        out: dict[str, Any] = {"attributes": {"POSITION": self.add(mesh.vertices, "VEC3", VERTICES, bounds=True),
+                                              "NORMAL": self.add(normals, "VEC3", VERTICES)},
+                               "indices": self.add_indices(mesh.faces), "material": 0}
+        if mesh.colors is not None:
+            out["attributes"]["COLOR_0"] = self.add(as_light(mesh.colors), "VEC3", VERTICES)
+        if uv is not None:
+            out["attributes"]["TEXCOORD_0"] = self.add(uv * [1, -1] + [0, 1], "VEC2", VERTICES)
+        for change in targets:
+            turn = some_normal(Mesh(mesh.vertices + change, mesh.faces)) - normals
+            out.setdefault("targets", []).append({"POSITION": self.add(change, "VEC3", VERTICES, bounds=True),
+                                                  "NORMAL": self.add(turn, "VEC3", VERTICES)})
+        return out
 
     def parts(self) -> tuple[dict[str, Any], bytes]:
         """The tree that `accessor` reads and the buffer, without a file."""

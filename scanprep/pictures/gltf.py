@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.format_common import as_light
-from ..geometry.format_glb import VERTICES, Glb, some_normal, turn_up
+from ..geometry.format_glb import Glb, turn_up
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
 
@@ -35,19 +34,10 @@ def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.
     frames, faces = np.asarray(frames, dtype=float), np.asarray(faces)
     _check(frames, rate)
     U = turn_up(up).T
-    meshes = [Mesh(frame @ U, faces) for frame in frames]
-    glb = Glb()
-    base, normals = meshes[0].vertices, some_normal(meshes[0])
-    attributes = {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
-                  "NORMAL": glb.add(normals, "VEC3", VERTICES)}
-    if colors is not None:
-        rgba = np.concatenate([as_light(np.asarray(colors)), np.ones((len(base), 1))], axis=1)
-        attributes["COLOR_0"] = glb.add(rgba, "VEC4", VERTICES)
-    primitive: dict[str, Any] = {"attributes": attributes, "indices": glb.add_indices(faces), "material": 0}
-    primitive["targets"] = [{"POSITION": glb.add(m.vertices - base, "VEC3", VERTICES, bounds=True),
-                             "NORMAL": glb.add(some_normal(m) - normals, "VEC3", VERTICES)} for m in meshes[1:]]
-    count = len(meshes) - 1
-    mesh: dict[str, Any] = {"name": "body", "primitives": [primitive]}
+    glb, count = Glb(), len(frames) - 1
+    first = Mesh(frames[0] @ U, faces, colors)
+    mesh: dict[str, Any] = {"name": "body", "primitives": [
+        glb.add_surface(first, targets=[frame @ U - first.vertices for frame in frames[1:]])]}
     document: dict[str, Any] = {
         "scene": 0, "scenes": [{"nodes": [0]}], "meshes": [mesh],
         "nodes": [{"name": "body", "mesh": 0}],
@@ -60,8 +50,6 @@ def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.
         document["animations"] = [{
             "name": "motion", "samplers": [{"input": times, "output": weights, "interpolation": "LINEAR"}],
             "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}]
-    else:
-        del primitive["targets"]
     return glb.pack(document, up)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.format_common import load_bytes, metres_per_unit
-from ..geometry.format_glb import VERTICES, Glb, chunks_of, file_beside, some_normal, tallest, turn_up, up_of
+from ..geometry.format_glb import Glb, chunks_of, file_beside, some_normal, tallest, turn_up, up_of
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
 from ..geometry.surface import Rays, barycentric
@@ -189,18 +189,14 @@ def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
 def write_textured(path: str | Path, texture: Texture) -> None:
     """Write a GLB with its picture inside, whole or not at all."""
     glb, up = Glb(), tallest(texture.mesh.vertices)
-    U = turn_up(up).T
-    attributes = {"POSITION": glb.add(texture.mesh.vertices @ U, "VEC3", VERTICES, bounds=True),
-                  "NORMAL": glb.add(_normals(texture.mesh) @ U, "VEC3", VERTICES),
-                  "TEXCOORD_0": glb.add(texture.uv * [1, -1] + [0, 1], "VEC2", VERTICES)}
+    U, mesh = turn_up(up).T, texture.mesh
+    surface = glb.add_surface(Mesh(mesh.vertices @ U, mesh.faces), _normals(mesh) @ U, texture.uv)
     material = skin_material((1, 1, 1))
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
     write(path, glb.pack({
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": glb.add_indices(texture.mesh.faces),
-                                    "material": 0}]}],
-        "images": [image], "textures": [{"source": 0}]}, up))
+        "meshes": [{"primitives": [surface]}], "images": [image], "textures": [{"source": 0}]}, up))
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
