@@ -11,11 +11,11 @@ from scipy.spatial import ConvexHull
 from model import body_with_measurements, find_tapes, measure
 from model.measurement import reading
 from model.measurement.catalogue import CATALOGUE, named
+from model.measurement.measure import measured_error
 from model.measurement.path import shortest_path
 from model.measurement.reading import Reading, Standing
 from model.measurement.section import Curve, around, bulge, direction, mean_of, section, tape
 from model.measurement.tapes import Girth, Span, Way
-from model.measurement.uncertainty import measured_error
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
 from scanprep.synthetic.body_parts import body_surface

@@ -12,9 +12,8 @@ from model.export.bvh import write_bvh
 from model.export.conventions import for_programs
 from model.motion.bvh import read_bvh
 from model.motion.error import followed
-from model.motion.onto import read_motion
+from model.motion.onto import read_motion, standing_rest
 from model.motion.retarget import Pairing
-from model.motion.standing import standing_rest
 from model.motion.trunks import nearest_starts
 from model.rig import joint_places, make_rig
 from model.statue.control.files import humanoid

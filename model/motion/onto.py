@@ -10,6 +10,7 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
+from scanprep.skeleton.roles import numbered_roles
 
 from ..body import BodyModel
 from ..linear import Subject
@@ -20,7 +21,8 @@ from .files import StoredMotion, betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
 from .retarget import Pairing, Retargeted, retargeted
 from .same import copied
-from .standing import standing_rest
+
+UPRIGHT = 0.8                        # cosine between segments and the vertical, from which on somebody stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,3 +136,34 @@ def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, 
     fit = followed(pair, found.poses, subject.joints(found.poses, found.trans))
     return BodyMotion(found.poses, found.trans, subject.betas, found.rate, gender, "by the directions of the segments",
                       uncertain, found, fit)
+
+
+def standing_rest(moving: MovingSkeleton) -> tuple[MovingSkeleton, int | None]:
+    """The skeleton at rest as in the frame in which trunk and legs are nearest to the vertical, and its number.
+
+    Some files have bones at rest that all lie along one axis. A skeleton that stands at rest, or never, is returned as
+    it is, and None. The vertical is y, as BVH says, or z where nobody stands along y.
+    """
+    roles = numbered_roles(moving.names, moving.rest)
+    chains = [[roles.get(f"{side}_{name}") for name in ("shoulder", "hip", "knee", "ankle")] for side in "lr"]
+    if any(j is None for chain in chains for j in chain):
+        return moving, None
+    joints = np.array(chains)
+    if _upright(moving.rest[None], joints).max() > UPRIGHT / 2:
+        return moving, None
+    along = _upright(moving.places, joints)
+    told = along[int(along[0].max() < UPRIGHT)]
+    best = int(told.argmax())
+    if told[best] < UPRIGHT:
+        return moving, None
+    rest = moving.places[best]
+    offsets = rest - np.where(moving.parents[:, None] < 0, 0, rest[moving.parents])
+    R = moving.rotations @ np.swapaxes(moving.rotations[best], -1, -2)
+    return replace(moving, offsets=offsets, rotations=R), best
+
+
+def _upright(places: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """(2, T) the least cosine between y, or z, and the segments from shoulders to ankles, (2, 4) joints."""
+    steps = np.diff(places[:, joints], axis=2)
+    size = np.linalg.norm(steps, axis=3)
+    return np.stack([(-steps[..., axis] / np.maximum(size, 1e-12)).min(axis=(1, 2)) for axis in (1, 2)])

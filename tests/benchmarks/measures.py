@@ -5,7 +5,7 @@
 Bodies are those of `measured_bodies.py`, made in FOLDER where they are missing. The truth of a girth is the convex hull
 of a section of the true triangles by trimesh, in the plane that the true vertices carry. Registered people are measured
 as they stood; half views and markers in the rest pose, after `repose`, against the person at rest. Stated errors are
-those of half views: the constants of `model/measurement/uncertainty.py` were chosen on the even people, the odd ones
+those of half views: the constants of `model/measurement/measure.py` were chosen on the even people, the odd ones
 are told apart. Men: two registrations of two scans of one man, and two ways of carrying a girth beside ours.
 """
 from __future__ import annotations

@@ -280,7 +280,7 @@ MUTATIONS = (
         ("plane that stands still", "on_edge = pull - out[:, None] * cut.normal", "on_edge = pull"),
         ("plane that turns the other way", "by_normal = -(out @", "by_normal = (out @"),
         ("height below the floor", "place @ up - height[floor]", "place @ up + height[floor]")),
-    *of("model/measurement/uncertainty.py", "model_measurement",
+    *of("model/measurement/measure.py", "model_measurement",
         ("errors of one direction", "* force / np.sqrt(3)", "* force"),
         ("reach of what errors have in common, twice", "REACH = 0.10", "REACH = 0.20"),
         ("reach of what errors have in common, half", "REACH = 0.10", "REACH = 0.05"),
