@@ -77,14 +77,6 @@ def point_to_point(points: MovingPoints, targets: np.ndarray, weights: np.ndarra
     return Residual(r.reshape(*r.shape[:-2], -1), J.reshape(*J.shape[:-3], -1, J.shape[-1]))
 
 
-def point_to_plane(points: MovingPoints, targets: np.ndarray, normals: np.ndarray, weights: np.ndarray
-                   ) -> Residual:
-    """Distance of points to planes through their targets (..., L, 3) with unit normals (..., L, 3)."""
-    root = np.sqrt(weights)
-    r = root * np.einsum("...ld,...ld->...l", normals, points.positions - targets)
-    return Residual(r, root[..., None] * (normals[..., None, :] @ points.jacobian)[..., 0, :])
-
-
 def pose_prior(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray = 1.0) -> Residual:
     """Squared Mahalanobis distance of the pose from the training poses (the root is free).
 

@@ -95,14 +95,14 @@ def _person(template: Mesh, skeleton: Skeleton) -> _Person | None:
     left = _unit(left - up * (left @ up))
     axes = np.stack([left, np.cross(up, left), up], axis=1)                       # their left is +x, they face -y
     scale = float(np.ptp(template.vertices @ up)) / average().shape.stature
-    source = [(PARTS.index(part), PARTS.index(part), 0.0) for part in _trunk_parts(skeleton, names)]
+    source = [(PARTS.index(part), PARTS.index(part), 0.0) for part in _trunk_parts(names)]
     at_rest = np.broadcast_to(np.eye(3), (len(names), 3, 3)).copy()
     for (kind, side), chain in chains.items():
         _follow_limb(template, skeleton, chain, kind, side, scale, axes, source, at_rest)
     return _Person(axes, source, at_rest)
 
 
-def _trunk_parts(skeleton: Skeleton, names: Sequence[str]) -> list[str]:
+def _trunk_parts(names: Sequence[str]) -> list[str]:
     """The synthetic part that each part of the trunk moves with; limbs are put in later."""
     def nearest(name: str) -> str:
         plain = name.rstrip("0123456789")

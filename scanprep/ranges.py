@@ -7,11 +7,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
-
-Result = TypeVar("Result")
 
 FLAG = "flag"                           # marks a field of settings that is a flag of the command line too
 TINY, LARGE = 1e-12, 1e9                # nearer to 0, or larger, is no setting of anything: their squares overflow

@@ -30,11 +30,6 @@ def points(body, x0):
     return lambda x: energy.point_to_point(follow(x), HOLED, WEIGHTS)
 
 
-def planes(body, x0):
-    follow = body.follow(IDS, x0)
-    return lambda x: energy.point_to_plane(follow(x), TARGETS, NORMALS, WEIGHTS)
-
-
 def skin(body, x0):
     follow = body.follow(TRIPLES, x0, np.tile([0.5, 0.3, 0.2], (6, 1)))
     return lambda x: energy.point_to_point(energy.above_skin(follow(x), np.array([0.01, 0.03])), TARGETS[:2],
@@ -43,7 +38,6 @@ def skin(body, x0):
 
 ENERGIES = {
     "point_to_point": points,
-    "point_to_plane": planes,
     "above_skin": skin,
     "pose_prior": lambda body, x0: lambda x: energy.pose_prior(x, PRIOR, 2.0),
     "upright": lambda body, x0: lambda x: energy.upright(x, np.array([0, 0.6, 0.8]), np.array([0, 1.0, 0]), 0.3),

@@ -8,7 +8,7 @@ from completion import energy
 from completion.bodies import FixedBody, ShapedBody
 from completion.partial.limbs import nearest_squared
 from completion.partial.pull import Pull
-from scanprep.geometry.least_squares import levenberg_marquardt, normal_equations
+from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 
 RNG = np.random.default_rng(3)
 IDS, MATCHED = np.array([3, 90, 91, 200, 310, 395]), np.array([200, 3, 90, 200, 310, 90])
@@ -27,8 +27,10 @@ def unknowns(body):
 def test_one_residual_of_three_rows_is_that_of_place_and_plane(body):
     x = unknowns(body)
     points = body.follow(MATCHED, x)(x[None])
-    plain = normal_equations([energy.point_to_point(points, TARGETS, TO_POINT),
-                              energy.point_to_plane(points, TARGETS, NORMALS, TO_PLANE)])
+    off, root = points.positions - TARGETS, np.sqrt(TO_PLANE)
+    to_planes = Residual(root * (NORMALS * off).sum(axis=-1),
+                         root[:, None] * np.einsum("ld,...ldp->...lp", NORMALS, points.jacobian))
+    plain = normal_equations([energy.point_to_point(points, TARGETS, TO_POINT), to_planes])
     pull = Pull(*body.gathered(MATCHED, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
     nothing = normal_equations([energy.stay_near(x[None], x, np.zeros(len(x)))])
     for ours, theirs in zip(pull.equations(x[None], nothing).dense, plain, strict=True):

@@ -270,12 +270,6 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
     return out
 
 
-def compose(angles: np.ndarray, sequence: str) -> np.ndarray:
-    """(3, 3) the rotation of three angles, radians: the inverse of `decompose`."""
-    first, second, third = (_turn(axis, angle) for axis, angle in zip(SEQUENCES[sequence], angles, strict=True))
-    return first @ second @ third
-
-
 def _turn(axis: int, angle: np.ndarray | float) -> np.ndarray:
     """(..., 3, 3) the rotations by angles (...), radians, about an axis."""
     return rotations.exp(np.asarray(angle)[..., None] * np.eye(3)[axis])

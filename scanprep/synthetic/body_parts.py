@@ -96,7 +96,7 @@ def shoulder_line(a: Anatomy) -> list[Field]:
             RoundCone(mid, top, r, r * 0.9)]
 
 
-def _limb(a: Anatomy, origin: np.ndarray, frame: np.ndarray, at: np.ndarray, extents: np.ndarray,
+def _limb(origin: np.ndarray, frame: np.ndarray, at: np.ndarray, extents: np.ndarray,
           caps: tuple[float, float], exponent: float = 2.1) -> Loft:
     extents = np.maximum(extents, 0.012)
     out, inner, front, back = extents.T
@@ -125,7 +125,7 @@ def leg(a: Anatomy) -> Field:
     thigh = np.linalg.norm(a.joints[11] - a.joints[10])
     shin = np.linalg.norm(a.joints[12] - a.joints[11])
     at = np.interp(table[:, 0], [-1, 0, 1, 2, 3], [-thigh, 0, thigh, thigh + shin, thigh + 2 * shin])
-    shank = _limb(a, a.joints[10], a.leg_frame, at, extents, (0.02 * g, 0.012 * g))
+    shank = _limb(a.joints[10], a.leg_frame, at, extents, (0.02 * g, 0.012 * g))
     knee, ankle, f = a.joints[11], a.joints[12], a.leg_frame
     bumps = _bumps(knee, f, g, [((0.0, 0.052, -0.012), 0.007, (0.019, 0.03, 0.024)),
                                 ((0.0, 0.045, 0.055), 0.004, (0.014, 0.03, 0.016)),
@@ -168,10 +168,10 @@ def arm(a: Anatomy) -> Field:
     fat = a.fat * (1.0 + 0.2 * (1 - a.man)) + 0.6 * s.limbs
     upper, fore = tables.upper_arm_man, tables.forearm_man
     extents = upper[:, 1:] + fat * tables.upper_arm_fat[:, None] + s.muscle * tables.upper_arm_muscle
-    first = _limb(a, a.joints[4], a.upper_arm_frame, upper[:, 0] * a.width["upper_arm"], extents * thin,
+    first = _limb(a.joints[4], a.upper_arm_frame, upper[:, 0] * a.width["upper_arm"], extents * thin,
                   (0.03 * g, 0.02 * g))
     extents = fore[:, 1:] + fat * tables.forearm_fat[:, None] + s.muscle * tables.forearm_muscle[:, None]
-    second = _limb(a, a.joints[5], a.forearm_frame, fore[:, 0] * a.width["forearm"], extents * thin,
+    second = _limb(a.joints[5], a.forearm_frame, fore[:, 0] * a.width["forearm"], extents * thin,
                    (0.02 * g, 0.006 * g))
     elbow, wrist, f = a.joints[5], a.joints[6], a.forearm_frame
     bumps = _bumps(elbow, f, g, [((0.0, -0.037, -0.004), 0.006, (0.012, 0.02, 0.016)),

@@ -146,7 +146,7 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     if disk.vertex_component.max() > 0 or euler != 1 or len(disk.boundary_loops) != 1:
         raise ValueError(f"seams: expected a tree of edges that cuts the mesh into one disk, got "
                          f"{disk.vertex_component.max() + 1} pieces with Euler number {euler}")
-    chart = Chart(fill_square(flatten(disk), disk), faces)
+    chart = Chart(fill_square(flatten(disk)), faces)
     problem = chart_problem(mesh, chart)
     assert problem is None, problem
     return chart
@@ -215,7 +215,7 @@ def tutte(mesh: Mesh, border: np.ndarray) -> np.ndarray:
     return sparse.harmonic(mesh.vertex_adjacency, uv, np.isin(np.arange(len(uv)), border))
 
 
-def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
+def fill_square(uv: np.ndarray) -> np.ndarray:
     """Turned and scaled so that the smallest square around it is the unit square without its margin."""
     angles = np.radians(np.arange(0, 90, 0.5))
     cos, sin = np.cos(angles), np.sin(angles)
