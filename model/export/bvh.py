@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scanprep.geometry.format_common import UNITS
+from scanprep.geometry.format_common import metres_of
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.geometry.tables import number_lines
@@ -51,8 +51,7 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
         A motion of other parts or not finite; a rate that is not positive; an unknown unit; an axis that
         does not exist; names with white space.
     """
-    if unit not in UNITS:
-        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    scale = 1 / metres_of(unit)
     spaced = [name for name in skeleton.names if name.split() != [name]]
     if spaced:
         raise ValueError(f"names: expected names without white space in BVH, got {spaced[0]!r}")
@@ -60,7 +59,6 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
         poses, trans = np.zeros((1, len(skeleton.parents), 3)), None
     poses, trans = check_motion(skeleton, poses, trans, rate)
     U = turn_up(up).T
-    scale = 1 / UNITS[unit]
     lines = ["HIERARCHY", *_hierarchy(skeleton, scale * skeleton.joints @ U, scale * part_ends(skeleton, body) @ U),
              "MOTION", f"Frames: {len(poses)}", f"Frame Time: {1 / rate:.9f}"]
     places = scale * (skeleton.joints[0] + trans) @ U

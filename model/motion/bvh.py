@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import tables
-from scanprep.geometry.format_common import UNITS
+from scanprep.geometry.format_common import metres_of
 from scanprep.geometry.storage import LARGEST, StorageError, read_bytes, taking_apart
 
 from .moving import MovingSkeleton
@@ -49,12 +49,11 @@ def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSk
     >>> read_bvh("walk.bvh", "cm").names[0]
     'Hips'
     """
-    if unit not in UNITS:
-        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    metre = metres_of(unit)
     data = read_bytes(path, "a BVH file")
     with taking_apart(path, "a BVH file"):
         lines = tables.decoded(data).splitlines()
-    words, metre = _Words(path, lines), UNITS[unit]
+    words = _Words(path, lines)
     joints, ends = _read_hierarchy(words)
     table, own_rate = _read_motion(words, joints, rate)
     R, places = _posed(joints, table, metre)

@@ -96,6 +96,14 @@ def unit_named(text: str) -> str | None:
     return word if word in UNITS else next(whole, None)
 
 
+def metres_of(unit: str | None) -> float:
+    """How many metres a unit is that a user names, one where none is named; ValueError for another word."""
+    unit = "m" if unit is None else unit
+    if unit not in UNITS:
+        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    return UNITS[unit]
+
+
 def likely_unit(extent: float) -> str | None:
     """The unit in which `extent` is that of a person, other than metres; None where none is or several may be."""
     likely = [unit for unit in ("mm", "cm", "in") if PERSON[0] <= extent * UNITS[unit] <= PERSON[1]]
@@ -112,9 +120,7 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
     they lie.
     """
     if unit is not None:
-        if unit not in UNITS:
-            raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
-        return UNITS[unit]
+        return metres_of(unit)
     if named != 1:
         warnings.warn(f"{path}: the file says that its unit is {named:g} m", stacklevel=3)
         return named

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from . import storage
 from .files import name_of
-from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_per_unit
+from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_of, metres_per_unit
 from .landmark_names import paired_names
 from .landmark_reading import Entry, entries_of
 from .landmark_writing import as_bytes
@@ -158,7 +158,7 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
     points = {name: value for name, value in out.items() if isinstance(value, np.ndarray)}
     data = as_bytes(Path(path).name, points, unit)
     if data is None:
-        storage.write_json(path, {name: (value / UNITS[unit or "m"]).tolist() if name in points else value
+        storage.write_json(path, {name: (value / metres_of(unit)).tolist() if name in points else value
                                   for name, value in out.items()})
     elif len(points) < len(out):
         raise ValueError(f"{path}: expected points; vertices and faces of a mesh can be written as JSON only")
@@ -236,9 +236,7 @@ def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, 
     counts where the points then lie on the scan, else the one in which they do. A body looks much alike from in front
     and from behind, so axes that the file tells are doubted only where the others fit far better.
     """
-    if unit is not None and unit not in UNITS:
-        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
-    told, of_scan = UNITS[unit or "m"], scan.vertices if isinstance(scan, Mesh) else scan
+    told, of_scan = metres_of(unit), scan.vertices if isinstance(scan, Mesh) else scan
     size = float(np.linalg.norm(np.ptp(of_scan, axis=0)))
     surface = Surface(scan) if isinstance(scan, Mesh) and len(scan.faces) else cKDTree(of_scan)
     signs = [np.ones(3), np.array([-1.0, -1, 1])] if flipped else [np.ones(3)]

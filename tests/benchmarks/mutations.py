@@ -262,7 +262,7 @@ MUTATIONS = (
         ("turns about fixed axes", '"XYZ"[channels[k][1]]', '"xyz"[channels[k][1]]'),
         ("the child's turn first", "R[:, p] @ mine", "mine @ R[:, p]"),
         ("bones in the axes of the child", "R[:, p], steps[:, j])", "R[:, j], steps[:, j])"),
-        ("units turned over", "lines), UNITS[unit]", "lines), 1 / UNITS[unit]"),
+        ("units turned over", "metre = metres_of(unit)", "metre = 1 / metres_of(unit)"),
         ("channels that mean the other thing", "changes = off[1] < off[0]", "changes = off[1] > off[0]")),
     *of("model/export/bvh.py", "model_export_bvh",
         ("degrees of another order", "axis=0, period=360)", "axis=0, period=180)"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.geometry.format_common import FARTHEST, UNITS, unit_named
+from scanprep.geometry.format_common import FARTHEST, UNITS, metres_of, unit_named
 from scanprep.words import number_of
 
 from .c3d import read_c3d, write_c3d
@@ -138,8 +138,7 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
     ('LFHD', 'RFHD')
     """
     path = Path(path)
-    if unit is not None and unit not in UNITS:
-        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    metres_of(unit)                      # another word is refused before the file is read
     raw = _read_raw(path)
     own_unit = unit or unit_named(raw.unit)
     if own_unit is None:

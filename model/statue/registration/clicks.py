@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.geometry.format_common import UNITS
+from scanprep.geometry.format_common import metres_of
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError, numbers, read_json, taking_apart
+from scanprep.geometry.storage import numbers, read_json, taking_apart
 from scanprep.geometry.surface import checked_surface
 
 from ..control.model import ControlModel
@@ -46,13 +46,11 @@ def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | Non
 def _clicked(path: Path, unit: str | None) -> tuple[dict[str, tuple[np.ndarray, np.ndarray, float]],
                                                     dict[str, np.ndarray]]:
     """Origin, direction and depth of the clicks of a file, and its plain places; nothing where it has no click."""
-    tree = read_json(path, WANTED)
+    tree, metre = read_json(path, WANTED), metres_of(unit)
     with taking_apart(path, WANTED):
         if not isinstance(tree, dict) or not any(isinstance(one, dict) and "ray" in one for one in tree.values()):
             return {}, {}
-        if unit is not None and unit not in UNITS:
-            raise StorageError(f"{path}: unknown unit {unit}")
-        metre, rays, places = UNITS[unit or "m"], {}, {}
+        rays, places = {}, {}
         for name, one in tree.items():
             if isinstance(one, dict) and "ray" in one:
                 origin, direction = numbers({name: np.array(one["ray"], dtype=np.float64)}, name, 2, 3)
