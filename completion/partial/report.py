@@ -33,7 +33,7 @@ ONE_SIDED = 0.05                     # of the surface: its mean normal from whic
 
 
 def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh,
-                       height: int | None = None, masked: np.ndarray | None = None) -> np.ndarray:
+                       masked: np.ndarray | None = None) -> np.ndarray:
     """The scan, and the completed body in two colours from the side that was seen and from behind.
 
     `masked` (n,) bool.
@@ -45,7 +45,7 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
         (given, views[0], "scan, from the camera"), (given, views[1], "scan, from behind"),
         ([Solid(body, colors)], views[0], "completed"), ([Solid(body, colors)], views[1], "completed, from behind"),
         ([Solid(completion.predicted)], views[1], "predicted, from behind")]
-    width, height = _size(views, height or HEIGHT)
+    width, height = _size(views)
     return side_by_side([render(shape, view, width, height) for shape, view, _ in shown],
                         [label for _, _, label in shown])
 
@@ -149,8 +149,8 @@ def _two_colors(completion: Completion) -> np.ndarray:
     return np.where(completion.seen[:, None], MEASURED, COMPLETED)
 
 
-def _size(views: Sequence[Camera], height: int) -> tuple[int, int]:
+def _size(views: Sequence[Camera]) -> tuple[int, int]:
     """Width and height of a picture in which all views fit; one of something long is less high."""
     aspect = max(view.width / view.height for view in views)
-    height = max(1, min(height, round(WIDEST * height / aspect)))
+    height = max(1, min(HEIGHT, round(WIDEST * HEIGHT / aspect)))
     return int(height * aspect) + 10, height

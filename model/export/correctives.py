@@ -75,15 +75,15 @@ def motion_correctives(rig: Rig, subject: Subject, poses: np.ndarray, count: int
 
 
 def body_correctives(rig: Rig, poses: np.ndarray, trans: np.ndarray, bodies: Callable[[np.ndarray], np.ndarray],
-                     frames: np.ndarray, count: int | None = None) -> Correctives:
-    """As `motion_correctives`, for bodies that change as they move, or are smoothed.
+                     frames: np.ndarray) -> Correctives:
+    """As `motion_correctives` without a count, for bodies that change as they move, or are smoothed.
 
     Of frames (n,) of the motion `bodies` tells the vertices (n, N, 3), metres; between them the correctives go straight
     from one to the next.
     """
     lacking = np.concatenate([rest_corrections(rig, poses[some], bodies(some) - trans[some, None])
                               for some in np.array_split(frames, -(-len(frames) // SEEN))])
-    mean, basis = _directions(lacking[spaced(len(frames), SEEN)], count)
+    mean, basis = _directions(lacking[spaced(len(frames), SEEN)], None)
     weights = (lacking - mean).reshape(len(frames), -1) @ basis.reshape(len(basis), mean.size).T
     return _scaled(mean, basis, weights, frames)
 

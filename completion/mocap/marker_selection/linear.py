@@ -67,13 +67,12 @@ class WholeFits:
     prior: Prior
     linear: LinearBodies
 
-    def refitted(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig,
-                 tell: Callable[[int], None] | None = None) -> np.ndarray:
+    def refitted(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig) -> np.ndarray:
         """Unknowns (Z, P) from some candidates without linearising, from the fit to the whole body on. [MoSh] Eq. 26"""
         chosen = np.asarray(chosen)
         weights = np.full(len(chosen), config.marker_sd**-2)
         return fit_points(self.markers.some(chosen), self.places[:, chosen], weights, self.prior, self.x,
-                          FIT_ITERATIONS, tell)
+                          FIT_ITERATIONS)
 
 
 def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig,

@@ -98,9 +98,9 @@ def warp(vertices: np.ndarray, from_points: np.ndarray, to_points: np.ndarray, s
     return vertices + (moved if share is None else share[:, None] * moved)
 
 
-def head_share(control: ControlModel, part: str = "skullbase") -> np.ndarray:
-    """(N,) from 1 on a part to 0 beyond it: w²(3 - 2w) of its skinning weight, flat at both ends of the neck."""
-    w = control.weights[:, control.skeleton.names.index(part)]
+def head_share(control: ControlModel) -> np.ndarray:
+    """(N,) from 1 on the head to 0 beyond it: w²(3 - 2w) of its skinning weight, flat at both ends of the neck."""
+    w = control.weights[:, control.skeleton.names.index("skullbase")]
     return w * w * (3 - 2 * w)
 
 
