@@ -237,9 +237,9 @@ def test_the_command_refuses_in_one_line(files, arguments, code, words, capsys, 
 
 def test_a_new_kind_of_file_is_one_line_of_the_table(files, monkeypatch):
     """Joints at rest as text: a writer that gets what was asked for, and says what it wrote."""
-    def write_joints(asked):
-        np.savetxt(asked.output, asked.model.subject(asked.person).joints(np.zeros((4, 3))))
-        return [Metric("joints", len(asked.model.skeleton.parents))]
+    def write_joints(order):
+        np.savetxt(order.output, order.model.subject(order.person).joints(np.zeros((4, 3))))
+        return [Metric("joints", len(order.model.skeleton.parents))]
 
     monkeypatch.setitem(WRITERS, ".joints.txt", Writer("joint list", {"betas"}, write_joints))
     assert exported(files, "a.joints.txt", "--betas", "1") == {"joints": 4}

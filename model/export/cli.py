@@ -86,13 +86,13 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if moves is not None and fps is not None:
         moves = moves.at_rate(fps)
     person = _person(model, loaded, betas, own_body, moves) if "betas" in writer.takes else None
-    asked = Asked(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
+    order = Order(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
                   None if up is None else "xyz".index(up), root, names, ground, front)
-    return Outcome(output, writer.write(asked), judgement=judgement)
+    return Outcome(output, writer.write(order), judgement=judgement)
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class Order:
     """What is to be written, as the arguments of `export` say."""
 
     output: Path
@@ -141,27 +141,27 @@ def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bo
     return np.array(betas) if betas else moves.betas if moves is not None else np.zeros(1)
 
 
-def _mesh(asked: Asked) -> list[Metric]:
+def _mesh(order: Order) -> list[Metric]:
     """The body at rest."""
-    model = asked.model
+    model = order.model
     rest = np.zeros((len(model.skeleton.parents), 3))
-    body = model.template.with_vertices(model.vertices(rest, asked.person))
-    write_mesh(asked.output, standing(body, body, asked.up, asked.ground, asked.front))
-    return [Metric("vertices", len(body.vertices)), _size(asked.output)]
+    body = model.template.with_vertices(model.vertices(rest, order.person))
+    write_mesh(order.output, standing(body, body, order.up, order.ground, order.front))
+    return [Metric("vertices", len(body.vertices)), _size(order.output)]
 
 
-def _npz(asked: Asked) -> list[Metric]:
+def _npz(order: Order) -> list[Metric]:
     """The model as linear blend skinning; with a motion, that motion as AMASS has it."""
-    if asked.moves is not None:
-        return _amass(asked, asked.moves)
-    model = asked.model
-    arrays = write_body_npz(asked.output, model)
+    if order.moves is not None:
+        return _amass(order, order.moves)
+    model = order.model
+    arrays = write_body_npz(order.output, model)
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean)
     poses = sample_poses(model, MEASURED, np.random.default_rng(1))      # not those of the fit
     exact = model.subject(mean).vertices(poses)
     changes = np.tensordot(pose_features(poses), arrays["posedirs"], axes=(1, 2))
-    return [_size(asked.output), Metric("joints", len(model.skeleton.parents)),
+    return [_size(order.output), Metric("joints", len(model.skeleton.parents)),
             Metric("shape directions", model.n_betas),
             Metric("pose directions", arrays["posedirs"].shape[-1]),
             Metric("measured on", f"{MEASURED} poses of the prior"),
@@ -170,93 +170,93 @@ def _npz(asked: Asked) -> list[Metric]:
                         np.linalg.norm(rig.vertices(poses, changes=changes) - exact, axis=-1))]
 
 
-def _amass(asked: Asked, moves: BodyMotion) -> list[Metric]:
-    family = str(asked.model.info.get("family") or "")
+def _amass(order: Order, moves: BodyMotion) -> list[Metric]:
+    family = str(order.model.info.get("family") or "")
     if not family:
-        raise ValueError(f"{asked.path}: a motion under the names of AMASS is one of an imported model of the SMPL "
-                         f"family (scape model import); write {asked.output.stem}.bvh, .glb or a folder")
-    write_amass(asked.output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
-    return [_size(asked.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+        raise ValueError(f"{order.path}: a motion under the names of AMASS is one of an imported model of the SMPL "
+                         f"family (scape model import); write {order.output.stem}.bvh, .glb or a folder")
+    write_amass(order.output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+    return [_size(order.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
             Metric("surface_model_type", family)]
 
 
-def _folder(asked: Asked) -> list[Metric]:
+def _folder(order: Order) -> list[Metric]:
     """The exact mesh of every frame, in a file of its own."""
-    subject, moves = asked.model.subject(asked.person), asked.motion("a folder of meshes")
+    subject, moves = order.model.subject(order.person), order.motion("a folder of meshes")
     with bar("writing meshes") as progress:
-        paths = write_frames(asked.output, subject, moves.poses, moves.trans, progress=progress)
+        paths = write_frames(order.output, subject, moves.poses, moves.trans, progress=progress)
     return [Metric("meshes", len(paths)), *moves.told, Metric("rate", moves.rate, "1/s"),
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
 
 
-def _points(asked: Asked) -> list[Metric]:
+def _points(order: Order) -> list[Metric]:
     """The exact mesh of every frame, in one file."""
-    subject, moves = asked.model.subject(asked.person), asked.motion("the points of its frames")
+    subject, moves = order.model.subject(order.person), order.motion("the points of its frames")
     count = len(moves.poses)
-    rest = asked.model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
-    axis = upright(rest)[0] if asked.up is None else asked.up
+    rest = order.model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
+    axis = upright(rest)[0] if order.up is None else order.up
     with bar("writing meshes") as progress:
         def frames() -> Iterator[np.ndarray]:
             for t in range(count):
                 yield subject.vertices(moves.poses[t], moves.trans[t])
                 progress(t + 1, count)
 
-        write_points_usd(asked.output, rest, frames(), count, moves.rate, axis)
-    return [_size(asked.output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
+        write_points_usd(order.output, rest, frames(), count, moves.rate, axis)
+    return [_size(order.output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
 
 
-def _bvh(asked: Asked) -> list[Metric]:
+def _bvh(order: Order) -> list[Metric]:
     """The skeleton and its motion."""
-    rig = make_rig(asked.model, asked.person)
-    where, poses, frames = _measured_poses(asked)
-    off = joint_places(rig.skeleton, poses[frames]) - asked.model.subject(asked.person).joints(poses[frames])
-    told = _write_rig(asked, rig, lambda ready, poses, trans, rate, up: write_bvh(
-        asked.output, ready.skeleton, poses, trans, rate, asked.unit, up, ready.mesh))
-    return [*told, Metric("unit", asked.unit), where,
+    rig = make_rig(order.model, order.person)
+    where, poses, frames = _measured_poses(order)
+    off = joint_places(rig.skeleton, poses[frames]) - order.model.subject(order.person).joints(poses[frames])
+    told = _write_rig(order, rig, lambda ready, poses, trans, rate, up: write_bvh(
+        order.output, ready.skeleton, poses, trans, rate, order.unit, up, ready.mesh))
+    return [*told, Metric("unit", order.unit), where,
             *_distances("joints of the exact body", np.linalg.norm(off, axis=-1))]
 
 
-def _skin(asked: Asked, write: Callable[..., None]) -> list[Metric]:
+def _skin(order: Order, write: Callable[..., None]) -> list[Metric]:
     """A body that hangs on joints, with morph targets of betas and, in a motion, of what skinning lacks."""
-    shapes, moves = asked.shapes, asked.moves
+    shapes, moves = order.shapes, order.moves
     if shapes is None:
         # morph targets where nobody says how many
-        shapes = 0 if asked.person is None else min(10, asked.model.n_betas)
-    rig, subject = make_rig(asked.model, asked.person, shapes), asked.model.subject(asked.person)
-    if moves is None and asked.correctives:
+        shapes = 0 if order.person is None else min(10, order.model.n_betas)
+    rig, subject = make_rig(order.model, order.person, shapes), order.model.subject(order.person)
+    if moves is None and order.correctives:
         raise UsageError("--correctives: expected the motion that they belong to; name it with --motion")
-    where, poses, frames = _measured_poses(asked)
-    if moves is not None and asked.correctives != 0:
-        rig = replace(rig, correctives=motion_correctives(rig, subject, moves.poses, asked.correctives))
+    where, poses, frames = _measured_poses(order)
+    if moves is not None and order.correctives != 0:
+        rig = replace(rig, correctives=motion_correctives(rig, subject, moves.poses, order.correctives))
     extra = 0 if rig.correctives is None else len(rig.correctives.shapes)
     off = off_exact(rig, poses, None, subject.vertices(poses[frames]), frames)
-    return [*_write_rig(asked, rig, partial(write, asked.output)), Metric("shape targets", 2 * len(rig.shapes)),
+    return [*_write_rig(order, rig, partial(write, order.output)), Metric("shape targets", 2 * len(rig.shapes)),
             Metric("corrective targets", extra), where, *_distances("exact body", off)]
 
 
-def _measured_poses(asked: Asked) -> tuple[Metric, np.ndarray, np.ndarray]:
+def _measured_poses(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
     """Where a rig is compared with the exact body: of which poses (T, J, 3), and in which frames (n,) of them."""
-    if asked.moves is None:
-        poses = sample_poses(asked.model, MEASURED, np.random.default_rng(0))
+    if order.moves is None:
+        poses = sample_poses(order.model, MEASURED, np.random.default_rng(0))
         return Metric("measured on", f"{MEASURED} poses of the prior"), poses, np.arange(MEASURED)
-    frames = spaced(len(asked.moves.poses), MEASURED)
-    return Metric("measured on", f"{len(frames)} frames of the motion"), asked.moves.poses, frames
+    frames = spaced(len(order.moves.poses), MEASURED)
+    return Metric("measured on", f"{len(frames)} frames of the motion"), order.moves.poses, frames
 
 
-def _write_rig(asked: Asked, rig: Rig, write: Callable[..., None]) -> list[Metric]:
+def _write_rig(order: Order, rig: Rig, write: Callable[..., None]) -> list[Metric]:
     """Write a rig and its motion as other programs want them, and say what became of the skeleton."""
-    axis = upright(rig.mesh)[0] if asked.up is None else asked.up
+    axis = upright(rig.mesh)[0] if order.up is None else order.up
     rest = np.zeros((0, len(rig.skeleton.parents), 3))
-    moves = asked.moves or BodyMotion(rest, rest[:, 0], asked.person, 30.0)
-    ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, asked.root, asked.names, asked.ground,
-                                       asked.front)
+    moves = order.moves or BodyMotion(rest, rest[:, 0], order.person, 30.0)
+    ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, order.root, order.names, order.ground,
+                                       order.front)
     write(ready, poses if len(poses) else None, trans, moves.rate, up=axis)
     # parts that keep their names although others were asked for
-    known = {} if asked.names is None else names_of(rig.skeleton, asked.names)
+    known = {} if order.names is None else names_of(rig.skeleton, order.names)
     kept = [name for name in rig.skeleton.names if name not in known]
-    return [_size(asked.output), *moves.told, Metric("joints", len(ready.skeleton.names)),
+    return [_size(order.output), *moves.told, Metric("joints", len(ready.skeleton.names)),
             Metric("root", ready.skeleton.names[0]),
-            *([Metric(f"parts without a name of {asked.names}", ", ".join(kept))] if asked.names and kept else []),
+            *([Metric(f"parts without a name of {order.names}", ", ".join(kept))] if order.names and kept else []),
             Metric("up", "xyz"[axis]), Metric("frames", len(poses))]
 
 
@@ -276,7 +276,7 @@ class Writer(NamedTuple):
 
     kind: str
     takes: set[str]
-    write: Callable[[Asked], list[Metric]]
+    write: Callable[[Order], list[Metric]]
 
 
 _PLACED = {"betas", "own_body", "up", "ground", "front"}
