@@ -21,6 +21,25 @@ HEAVY = {"open3d", "pymeshlab", "matplotlib", "PIL", "trimesh", "ezc3d", "igl", 
 ONE_FILE_EACH = {"pymeshlab", "open3d", "ezc3d"}
 SPEAKS = {"cli.py", "command_line.py", "console.py", "interrupts.py", "__main__.py"}
 
+# the rooms of each package from the lowest floor up, and the rooms below that each enters
+ROOMS = {
+    "scanprep": {
+        "geometry": "", "adapters": "geometry", "batch": "geometry", "cleaning": "geometry",
+        "correspondence": "geometry", "depth_camera": "geometry", "pictures": "geometry",
+        "repair": "adapters geometry", "skeleton": "batch geometry",
+        "decimation": "adapters geometry skeleton", "fusion": "geometry repair", "synthetic": "geometry skeleton",
+        "alignment": "fusion geometry",
+        "registration": "alignment cleaning correspondence geometry skeleton synthetic",
+        "surfaces": "adapters alignment cleaning decimation fusion geometry repair skeleton",
+        "viewer": "alignment batch depth_camera geometry pictures registration",
+        "pipeline": "batch cleaning correspondence geometry pictures registration skeleton viewer"},
+    "model": {
+        "learning": "", "measurement": "", "motion": "", "resolution": "", "coregistration": "learning",
+        "export": "motion", "posing": "export learning motion", "statue": "export motion", "evaluation": "posing"},
+    "completion": {
+        "mocap": "", "partial": "mocap", "demo": "mocap partial", "tracking": "mocap partial",
+        "viewing": "mocap partial", "measuring": "partial viewing"}}
+
 
 @functools.cache
 def parsed(path):
@@ -52,6 +71,24 @@ def test_imports_point_down():
         wrong += [f"{name(path)}:{line} imports {module}" for module, line in imports(path)
                   if module.split(".")[0] in (*above, "tests")]
     assert not wrong
+
+
+def test_rooms_enter_rooms_of_lower_floors_only():
+    arrows = {}
+    for path in MODULES:
+        package, room, *inner = path.relative_to(ROOT).parts
+        for module, line in imports(path) if inner else ():
+            over, other, *_ = [*module.split("."), ""]
+            if over == package and other in ROOMS[package] and other != room:
+                arrows.setdefault((package, room, other), []).append(f"{name(path)}:{line} imports {module}")
+    table = {(package, room, other) for package, rooms in ROOMS.items() for room, below in rooms.items()
+             for other in below.split()}
+    assert not [places for arrow, places in arrows.items() if arrow not in table]
+    assert not table - arrows.keys(), "arrows that nobody needs any more"
+    for package, rooms in ROOMS.items():
+        assert {path.parent.name for path in (ROOT / package).glob("*/__init__.py")} == set(rooms)
+        below = list(rooms)
+        assert not [room for room in below if set(rooms[room].split()) - set(below[:below.index(room)])]
 
 
 def test_no_files_import_each_other_in_a_circle():
