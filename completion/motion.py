@@ -116,11 +116,6 @@ class Motion:
             return _restored(stored)
 
 
-def spread_frames(length: int, count: int) -> np.ndarray:
-    """At most so many frames, spread evenly from the first to the last."""
-    return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(int))
-
-
 def _restored(stored: StoredMotion) -> Motion:
     """The motion of a file, with what it tells of markers."""
     a, T = stored.more, len(stored.poses)

@@ -11,12 +11,13 @@ import numpy as np
 from model.linear import Subject
 from scanprep.decimation.registered_set import decimate_set
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, stance
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots, Moving, Shape, Solid, render, side_by_side
 
-from .motion import Motion, spread_frames
+from .motion import Motion
 
 MARKER, LOST = (0.85, 0.25, 0.2), (0.78, 0.78, 0.78)
 LIGHT = 7000                         # triangles of a body in small pictures and in motion
@@ -153,7 +154,7 @@ def bodies_in_a_row(subject: Subject, poses: np.ndarray, bodies: np.ndarray, col
 def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames: np.ndarray, count: int = 8
                    ) -> np.ndarray:
     """Some of the meshes (n, N, 3) of a body that changes side by side, at one scale; `frames` (n,) is when."""
-    chosen = spread_frames(len(frames), count)
+    chosen = spread_indices(len(frames), count)
     return side_by_side(bodies_in_a_row(subject, motion.poses[frames[chosen]], bodies[chosen]),
                         seconds(motion, frames[chosen]))
 

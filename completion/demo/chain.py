@@ -19,6 +19,7 @@ from scanprep.batch.room import Room, inside
 from scanprep.batch.workspace import KeptSteps, Task, Workspace
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage, tables
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
@@ -267,7 +268,7 @@ class Demo:
             rng = np.random.default_rng([self.config.seed, 8])
             seen = scan(truth.mesh, scanner, rng)
             marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
-            few = np.unique(np.linspace(0, len(marks) - 1, LANDMARKS).round().astype(int))
+            few = spread_indices(len(marks), LANDMARKS)
             write_scan(folder / HALF.parent, HALF.stem, seen, truth,
                        {name: marks[name] for name in np.array(list(marks))[few]}, views=False)
 

@@ -13,6 +13,7 @@ from scanprep.arguments import Place
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.judgement import Judgement, extent, unit_problem
 from scanprep.ranges import Positive
 
@@ -87,7 +88,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
 
 def wrong_size(frames: FrameFolder, person: Subject) -> str | None:
     """Why frames cannot show the body, by the largest of a few of them; None where they can."""
-    some = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
+    some = spread_indices(len(frames), 5)
     spans = [extent(np.concatenate([np.zeros((0, 3)), *(view.points for view in frames[t])])) for t in some]
     return unit_problem(float(np.fmax.reduce(spans)), extent(person.template.vertices), "the frames are", 0.1)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.linear import Subject
 from model.motion.bvh import USUAL_RATE
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import heat
 from scanprep.pictures.low_rank import low_rank
@@ -15,7 +16,7 @@ from scanprep.pictures.shading import CLAY, Dots, Moving
 from scanprep.words import number_of
 
 from ..mocap.files.markers import MarkerSequence, marker_subjects, read_markers
-from ..motion import Motion, spread_frames
+from ..motion import Motion
 from .contents import MARKER, SHOWN_OFF, Content, MarkersTold, Stance, body_shades
 
 MADE = 150                           # frames that the columns are made from
@@ -24,7 +25,7 @@ AT_ONCE = 256                        # frames whose coefficients are computed to
 
 def of_motion(name: str, motion: Motion, subject: Subject, markers: MarkerSequence | None = None) -> Content:
     """A body in motion, with the markers that were measured."""
-    some = spread_frames(len(motion.poses), MADE)
+    some = spread_indices(len(motion.poses), MADE)
     frames = motion.vertices(subject, some)
     basis, coefficients = as_columns(motion, subject, frames)
     body = subject.template.with_vertices(frames[0].astype(float))

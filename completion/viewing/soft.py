@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.colors import Heat
 from scanprep.pictures.low_rank import low_rank
 from scanprep.pictures.shading import Moving, Shape, Solid
 
 from ..mocap.files.markers import MarkerSequence
 from ..mocap.soft_tissue.soft_tissue import SoftTissue
-from ..motion import Motion, spread_frames
+from ..motion import Motion
 from .contents import Content
 from .motions import AT_ONCE, MADE, of_motion, with_markers
 
@@ -42,7 +43,7 @@ def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel, marke
 
     Where the skin is soft is one of its colours: how far the change moves it, the root of the mean square over time.
     """
-    some = spread_frames(len(soft.motion.poses), MADE)
+    some = spread_indices(len(soft.motion.poses), MADE)
     frames = soft.vertices(model, some)
     basis, coefficients = soft_columns(soft, model, frames)
     moved = soft.movement(model)

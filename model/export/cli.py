@@ -13,6 +13,7 @@ from model.priors import sample_poses
 from scanprep.arguments import Called, UsageError
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import name_of, write_mesh
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import upright
@@ -28,7 +29,7 @@ from ..people import ASKED, person_judgement
 from ..rig import Rig, joint_places, make_rig
 from .bvh import write_bvh
 from .conventions import for_programs, standing
-from .correctives import motion_correctives, off_exact, pose_features, spaced, write_body_npz
+from .correctives import motion_correctives, off_exact, pose_features, write_body_npz
 from .glb import write_skinned_glb
 from .names import Names, names_of
 from .usd import USD, write_points_usd, write_skinned_usd
@@ -239,7 +240,7 @@ def _measured_poses(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
     if order.moves is None:
         poses = sample_poses(order.model, MEASURED, np.random.default_rng(0))
         return Metric("measured on", f"{MEASURED} poses of the prior"), poses, np.arange(MEASURED)
-    frames = spaced(len(order.moves.poses), MEASURED)
+    frames = spread_indices(len(order.moves.poses), MEASURED)
     return Metric("measured on", f"{len(frames)} frames of the motion"), order.moves.poses, frames
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sides import side_of
 from scanprep.pictures.camera import stance, upright
@@ -88,7 +89,7 @@ def placed(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool
     vertical = np.eye(3)[up]
     shift = step = -rig.mesh.vertices[:, up].min() * vertical
     if len(poses):
-        chosen = np.unique(np.linspace(0, len(poses) - 1, min(FRAMES, len(poses))).round().astype(int))
+        chosen = spread_indices(len(poses), FRAMES)
         step = -min(float(rig.vertices(poses[some], trans[some])[..., up].min())
                     for some in np.array_split(chosen, -(-len(chosen) // _SOME))) * vertical
     return carried(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))

@@ -12,7 +12,7 @@ import numpy as np
 
 from model.priors import sample_poses
 from scanprep.geometry import rotations
-from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.farthest_points import farthest_points, spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import save_arrays
 
@@ -60,7 +60,7 @@ def motion_correctives(rig: Rig, subject: Subject, poses: np.ndarray, count: int
         Of correctives, at most as many as there are frames; else as few as come within `NEAR`.
     """
     poses = np.asarray(poses, dtype=np.float64)
-    seen = poses[spaced(len(poses), SEEN)]
+    seen = poses[spread_indices(len(poses), SEEN)]
     mean, basis = _directions(rest_corrections(rig, seen, subject.vertices(seen)), count)
     ids = farthest_points(rig.mesh.vertices, min(POINTS, len(rig.mesh.vertices)))
     few = replace(rig, mesh=Mesh(rig.mesh.vertices[ids], np.zeros((0, 3))), weights=rig.weights[ids],
@@ -83,7 +83,7 @@ def body_correctives(rig: Rig, poses: np.ndarray, trans: np.ndarray, bodies: Cal
     """
     lacking = np.concatenate([rest_corrections(rig, poses[some], bodies(some) - trans[some, None])
                               for some in np.array_split(frames, -(-len(frames) // SEEN))])
-    mean, basis = _directions(lacking[spaced(len(frames), SEEN)], None)
+    mean, basis = _directions(lacking[spread_indices(len(frames), SEEN)], None)
     weights = (lacking - mean).reshape(len(frames), -1) @ basis.reshape(len(basis), mean.size).T
     return _scaled(mean, basis, weights, frames)
 
@@ -116,11 +116,6 @@ def _scaled(mean: np.ndarray, basis: np.ndarray, weights: np.ndarray, frames: np
     low, span = weights.min(axis=0), np.maximum(np.ptp(weights, axis=0), 1e-12)
     shapes = np.concatenate([(mean + np.tensordot(low, basis, axes=1))[None], basis * span[:, None, None]])
     return Correctives(shapes, np.column_stack([np.ones(len(weights)), (weights - low) / span]), frames)
-
-
-def spaced(total: int, count: int) -> np.ndarray:
-    """Up to `count` of 0..total-1, evenly spaced and with both ends."""
-    return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
 
 
 def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | None = None, draws: int = 300

@@ -1,4 +1,4 @@
-"""Points spread over a set: each the farthest from all before it, or one in each cell of a grid."""
+"""Points spread over a set: each the farthest from all before it, one in each cell of a grid, or evenly by number."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -35,6 +35,11 @@ def farthest_points(points: np.ndarray, count: int, start: ArrayLike | None = No
 def _apart(points: np.ndarray, i: int, limit: float, distances: Callable[[int, float], np.ndarray] | None
            ) -> np.ndarray:
     return ((points - points[i]) ** 2).sum(axis=1) if distances is None else distances(i, limit)
+
+
+def spread_indices(total: int, count: int) -> np.ndarray:
+    """Up to `count` of 0..total-1, evenly spaced and with both ends."""
+    return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
 
 
 def thin(points: np.ndarray, cell: float) -> np.ndarray:

@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..geometry.farthest_points import spread_indices
+
 TOLERANCE = 5e-4                     # metres, at any point of any frame
 FIRST, MORE = 60, 20                 # frames that the columns are made from; frames added where they do not do
 MOST = 400
@@ -15,7 +17,7 @@ def low_rank(frames: np.ndarray, tolerance: float = TOLERANCE) -> tuple[np.ndarr
     are in C. So the columns are taken from some frames, and from those where they did not do.
     """
     count, points = frames.shape[:2]
-    chosen = np.unique(np.linspace(0, count - 1, min(count, FIRST)).round().astype(int))
+    chosen = spread_indices(count, FIRST)
     while True:
         basis = _columns(frames[chosen], tolerance)
         coefficients = np.einsum("nr,tnc->trc", basis, frames, optimize=True)

@@ -48,20 +48,21 @@ def cases(model_file, motion_file, folder):
     from dataclasses import replace
 
     from completion.mocap.files.motion_files import write_glb, write_motion_bvh
-    from completion.motion import Motion, spread_frames
+    from completion.motion import Motion
     from model.export.bvh import write_bvh
     from model.export.conventions import for_programs
     from model.export.correctives import motion_correctives
     from model.export.glb import write_skinned_glb
     from model.files import load_model
     from model.rig import joint_places, make_rig, subject_rig
+    from scanprep.geometry.farthest_points import spread_indices
     from scanprep.geometry.files import write_mesh
     from scanprep.geometry.format_glb import tallest, turn_up
     from scanprep.pictures.camera import upright
 
     model, motion = load_model(model_file), Motion.load(motion_file)
     subject = model.subject(motion.betas)
-    frames = spread_frames(len(motion.poses), FRAMES)
+    frames = spread_indices(len(motion.poses), FRAMES)
     up = upright(subject.template)[0]
     U, times, exact = turn_up(up).T, frames / motion.rate, motion.vertices(subject, frames)
     found = {}

@@ -15,9 +15,10 @@ from model.linear import Subject
 from model.rig import subject_rig
 from scanprep.console import Metric, details
 from scanprep.geometry import storage, tables
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.camera import upright
 
-from ...motion import Motion, spread_frames
+from ...motion import Motion
 from .markers import MarkerSequence
 from .opensim import guessed_angles, known_centres, write_opensim
 
@@ -93,9 +94,9 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
     if bodies is None:
         extra = motion_correctives(rig, subject, motion.poses)
     else:
-        extra = body_correctives(rig, motion.poses, motion.trans, bodies, spread_frames(T, KEYS))
+        extra = body_correctives(rig, motion.poses, motion.trans, bodies, spread_indices(T, KEYS))
     rig = replace(rig, mesh=replace(rig.mesh, colors=colors), correctives=extra)
-    up, measured = upright(subject.template)[0], spread_frames(T, MEASURED)
+    up, measured = upright(subject.template)[0], spread_indices(T, MEASURED)
     exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
     off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
     write_skinned_glb(path, aimed(rig, up), motion.poses, motion.trans, motion.rate, up)

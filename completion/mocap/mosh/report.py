@@ -14,12 +14,12 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.folders import add_entry, as_line
 from scanprep.geometry import storage
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
 from scanprep.pictures.sheets import webp_bytes
 
-from ...motion import spread_frames
 from ...motion_pictures import MARKER, facing, marker_rows, mean_over, upwards, worst_frames
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
@@ -77,7 +77,7 @@ def _worn_section(page: Page, result: MoshResult) -> None:
 
 def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Page:
     """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
-    frames = spread_frames(len(take.shown.poses), SOME)
+    frames = spread_indices(len(take.shown.poses), SOME)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
     page.table([(m.name, m.text(), m.unit) for m in _main(metrics)])
     page.section("The whole sequence").bodies(

@@ -19,11 +19,11 @@ from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
 from scanprep.folders import PICTURE
 from scanprep.geometry import storage, tables
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
 
-from ...motion import spread_frames
 from ...motion_pictures import picture_bodies
 from ..artefacts.results import MarkerArtefacts, artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
@@ -274,7 +274,7 @@ def _character(character: BodyModel, take: Take, folder: Path, factor: float
     motion = retarget(take.motion, take.subject, body)
     motion.save(folder / "character.npz")
     told = write_glb(folder / "character.glb", motion, body)
-    frames = spread_frames(len(motion.poses), 8)
+    frames = spread_indices(len(motion.poses), 8)
     return picture_bodies(motion, body, motion.vertices(body, frames), frames), "", told
 
 

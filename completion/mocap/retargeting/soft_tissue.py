@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.console import Metric
+from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import harmonic
 from scanprep.pictures.colors import color_bar, heat
@@ -18,7 +19,6 @@ from scanprep.pictures.shading import side_by_side
 from scanprep.skeleton.tree import Skeleton
 
 from ...bodies import at_rest
-from ...motion import spread_frames
 from ...motion_pictures import bodies_in_a_row, seconds
 from ..files.motion_files import KEYS, write_glb
 from ..soft_tissue.soft_tissue import SoftTissue
@@ -130,7 +130,7 @@ FULL = 0.2                           # deformation at the end of the heat map
 def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, moved: SoftTissue, count: int = 8,
                      height: int = 320) -> np.ndarray:
     """Frames in three rows: the person, the character moving as `moved`, how far its skin is deformed. [MoSh]"""
-    frames = spread_frames(len(soft.motion.poses), count)
+    frames = spread_indices(len(soft.motion.poses), count)
     person = moving_character(model, soft, frames)[1]
     fixed, changed = moving_character(character, moved, frames)
     colors = heat(deformation(character.template.faces, fixed, changed), 0.0, FULL)
@@ -150,7 +150,7 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue) -> tuple
 
     Returned are these and how far the file is from the exact bodies.
     """
-    frames = spread_frames(len(soft.motion.poses), KEYS)
+    frames = spread_indices(len(soft.motion.poses), KEYS)
     most = np.asarray(deformation(character.template.faces, *moving_character(character, soft, frames)).max(axis=0))
     creases = Creases(at_rest(character), character.skeleton)
 

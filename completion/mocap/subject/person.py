@@ -11,7 +11,7 @@ from model.body import BodyModel
 from scanprep.batch.room import Step, once
 from scanprep.console import Metric
 from scanprep.geometry import rotations
-from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.farthest_points import farthest_points, spread_indices
 from scanprep.judgement import Judgement
 from scanprep.threads import one_thread
 
@@ -213,7 +213,7 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
 
 def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
     """Frames (B,) in which markers (T, L, 3) stand to each other in many ways, by the distances between them."""
-    some = np.unique(np.linspace(0, len(positions) - 1, 400).round().astype(int))
+    some = spread_indices(len(positions), 400)
     first, second = np.triu_indices(positions.shape[1], 1)
     apart = np.linalg.norm(positions[some][:, first] - positions[some][:, second], axis=2)
     there = ~np.isnan(apart)
