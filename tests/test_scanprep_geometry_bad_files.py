@@ -117,10 +117,13 @@ def test_a_glb_with_a_face_out_of_range_or_damaged_json(tmp_path):
     write_mesh(tmp_path / "bad.glb", TETRAHEDRON)
     data = (tmp_path / "bad.glb").read_bytes()
     size = struct.unpack_from("<I", data, 12)[0]
-    (tmp_path / "bad.glb").write_bytes(data[:20 + size + 8] + struct.pack("<I", 77) + data[20 + size + 12:])
-    refused(tmp_path / "bad.glb", "vertex 77", "0..3")
     tree = json.loads(data[20:20 + size])
-    del tree["accessors"][1]["componentType"]
+    surface = tree["meshes"][0]["primitives"][0]
+    indices = tree["accessors"][surface["indices"]]
+    at = 20 + size + 8 + tree["bufferViews"][indices["bufferView"]].get("byteOffset", 0)
+    (tmp_path / "bad.glb").write_bytes(data[:at] + struct.pack("<I", 77) + data[at + 4:])
+    refused(tmp_path / "bad.glb", "vertex 77", "0..3")
+    del tree["accessors"][surface["attributes"]["POSITION"]]["componentType"]
     text = json.dumps(tree, separators=(",", ":")).encode().ljust(size)
     (tmp_path / "bad.glb").write_bytes(data[:20] + text + data[20 + size:])
     refused(tmp_path / "bad.glb", "componentType")
