@@ -12,7 +12,7 @@ from completion.mocap.mosh.mosh import PoseConfig
 from completion.mocap.pose.robust import hardly_believed, markers_told
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
-from completion.mocap.subject.person import choose_frames, common_markers, judge_moves
+from completion.mocap.subject.person import choose_frames, common_markers, judge_moves, spread_frames
 from completion.mocap.subject.worn_elsewhere import MovedMarker, Worn, _Frames, _with_whole_parts, find_worn
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
@@ -307,6 +307,14 @@ def test_a_marker_moved_by_more_than_a_hand_is_to_be_looked_at():
              (("M1", 0.07), ("M2", 0.31))]
     (told,) = Worn(moved=tuple(moved)).judgement(LABELS).doubts
     assert told == "moved by more than a hand's width: M2 by 31 cm"
+
+
+def test_the_first_frame_is_the_most_usual_one():
+    """A triangle whose third corner is 1 to 3 m away: 2.1 m is nearest to the mean, then come the farthest."""
+    away = np.array([1.0, 3, 2.1, 1.2, 2.8])
+    frames = np.zeros((5, 3, 3))
+    frames[:, 1, 0], frames[:, 2, 1] = 0.1, away
+    assert [spread_frames(frames, count).tolist() for count in (1, 2, 3)] == [[2], [0, 2], [0, 1, 2]]
 
 
 def test_a_quarter_of_the_markers_moved_by_more_than_a_hand_means_nothing():
