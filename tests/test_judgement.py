@@ -12,6 +12,7 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from scanned_shapes import ball as sphere
+from scipy import stats
 
 from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import COMMANDS as SCAPE
@@ -40,7 +41,17 @@ from scanprep.cli import Output
 from scanprep.console import Metric, Outcome
 from scanprep.correspondence.correspondences import Correspondences, correspondences_doubts, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.judgement import Judgement, beyond_people, carry_judgements, judge_many, read_judgement, size
+from scanprep.judgement import (
+    ONE_OF,
+    USUAL,
+    Judgement,
+    beyond_people,
+    carry_judgements,
+    judge_many,
+    longest_betas,
+    read_judgement,
+    size,
+)
 from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.registration.schedule import RegistrationConfig
@@ -502,3 +513,15 @@ def test_a_second_person_is_no_furniture():
     both = Mesh(np.vstack([one.vertices + at for at in many]), np.vstack([one.faces, one.faces + len(one.vertices)]))
     assert cleaning_doubts(clean_scan(one)) == []
     assert "a second person?" in cleaning_doubts(clean_scan(both))[0]
+
+
+@pytest.mark.parametrize("count", [1, 3, 18, 80])
+def test_hardly_anybody_has_longer_betas(count):
+    """[MoSh] Eq. 20: a sum of squares of so many standard normal numbers, by the distribution of another library."""
+    length = longest_betas(count)
+    assert length**2 == pytest.approx(max(stats.chi2.isf(1 / ONE_OF, count), USUAL**2 * count))
+
+
+def test_nobody_is_a_giant_or_a_doll():
+    verdicts = [beyond_people(stature).verdict for stature in (0.5, 1.75, 2.5, 4.0)]
+    assert verdicts == ["failed", "good", "failed", "failed"]
