@@ -19,9 +19,9 @@ NAMES = np.array(SUBJECT.skeleton.names)
 LEGS = tuple(label for label in LAYOUT.labels if label[1:] in ("ASI", "PSI", "THI", "KNE", "TIB", "ANK", "HEE", "TOE"))
 
 
-def covered(labels, others=0, doubted=()):
+def covered(labels, others=0, doubted=(), called="X"):
     """Of a recording of these labels of the set and so many others."""
-    every = (*labels, *(f"X{i}" for i in range(others)))
+    every = (*labels, *(f"{called}{i}" for i in range(others)))
     residuals = np.full((5, len(every)), np.nan)
     residuals[:, :len(labels)] = 0.005
     trusted = np.isfinite(residuals) & ~np.isin(every, doubted)
@@ -58,6 +58,8 @@ def test_points_that_plug_in_gait_computed_are_no_markers():
     unnamed = {"*113", "U_2", "U3", "Unlabeled 1023", "Unidentified 4"}
     markers = {*("A:" + label for label in LAYOUT.labels), "LTHA", "LTHP", "LTHO", "U4D", "Centre"}
     assert marker_labels(markers | segments | unnamed | {"A:CentreOfMass", "CentreOfMassFloor"}) == markers
+    found, _ = covered(LAYOUT.labels, 60, called="*")
+    assert found.metrics()[0].value == "39 of 39" and found.judgement().verdict == "good"
 
 
 def test_markers_on_one_part_alone_tell_of_no_body():

@@ -316,7 +316,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         if registered is not None:
             raise UsageError("--registered: expected --model with it")
         moved = read_statue_motion(loaded, motion, rate)
-        bodies, of_file = control.rig.vertices(moved.poses, moved.trans), moved.rate
+        bodies, frame_rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
         output.mkdir(parents=True, exist_ok=True)
         write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
                          motion=moved, up=up)
@@ -324,22 +324,22 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         rows = [Metric("joints that follow the motion", len(moved.matched)),
                 *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
     else:
-        bodies, of_file = _following(loaded, motion, model, registered, rate)
+        bodies, frame_rate = _following(loaded, motion, model, registered, rate)
         step = max(1, len(bodies) // 120)
         write_animated_glb(output / "statue.glb", fine.faces, np.stack([detailed(body) for body in bodies[::step]]),
-                           of_file / step, up=up)
+                           frame_rate / step, up=up)
         rows = [Metric("follows", str(model))]
     shown = bodies[::max(1, len(bodies) // 24)]
     with bar("rendering") as progress:
         write_gif(output / "motion.gif", motion_pictures(loaded, detailed, shown, progress),
-                  of_file * len(shown) / len(bodies))
+                  frame_rate * len(shown) / len(bodies))
     if meshes:
         with bar("writing meshes") as progress:
             for t, body in enumerate(bodies):
                 write_mesh(output / "meshes" / f"{t:05d}.ply", detailed.mesh(body))
                 progress(t + 1, len(bodies))
     inverted = [len(inverted_triangles(control, body, fine, detailed(body))) for body in shown]
-    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", of_file, "1/s"), *rows,
+    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", frame_rate, "1/s"), *rows,
                             Metric("inverted triangles in a frame, most", max(inverted))], {"level": level},
                    judgement=_judge_motion(max(inverted) / len(fine.faces)))
 

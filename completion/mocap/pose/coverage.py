@@ -21,9 +21,10 @@ HALF = 0.5                           # share of a file's markers that are to be 
 # share of the skin on parts that no marker saw: both hands have 5% of it, a head 7%, all above the waist 60%
 UNSEEN_SKIN = 0.25
 PASSING = 0.1                        # share of the frames in which a trajectory is there that counts as a marker
-UNNAMED = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"           # as Vicon, Motive and Qualisys write trajectories
-COMPUTED = r"CentreOfMass(Floor)?"   # what Plug-in Gait adds to the markers of a file,
-AXES = "OALP"                        # beside the origin and the ends of the axes of every segment, as PELO, PELA, ...
+# trajectories without a name, as Vicon, Motive and Qualisys write them
+UNNAMED = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"
+# points that Plug-in Gait computes: centres of mass, and of every segment its origin and the ends of its three axes
+COMPUTED, AXES = r"CentreOfMass(Floor)?", "OALP"             # PELO, PELA, PELL, PELP of the pelvis
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +91,10 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     skeleton, body = subject.skeleton, subject.template
     used = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)
             if np.isfinite(column).any()}
-    lasting = {label for one in markers for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True)
-               if share >= PASSING and label in marker_labels(one.labels)}
+    lasting = set[str]()
+    for one in markers:
+        often = {label for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True) if share >= PASSING}
+        lasting |= often & marker_labels(one.labels)
     doubted = {label for motion in motions for label in motion.distrusted}
     known = {layout.aliases.get(label, label) for label in used - doubted}
     part_of_marker = skeleton.part_of_vertex(body)[layout.nearest]

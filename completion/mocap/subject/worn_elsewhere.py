@@ -102,7 +102,7 @@ class Worn:
                          ", ".join(labels)) for part, labels, whole in self.lost)]
 
     def judgement(self, labels: Sequence[str]) -> Judgement:
-        """What is worth what was found with these markers, of all `labels` of a recording."""
+        """Whether a person found with these markers can be used; `labels` are all those of the recording."""
         sides, check = sum(i < j for i, j in enumerate(label_pairs(labels))), list[str]()
         if 2 * len(self.exchanged) > sides:
             check.append(f"left and right of {len(self.exchanged)} of {number_of(sides, 'pair')} of markers were "
