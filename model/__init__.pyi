@@ -15,11 +15,11 @@ from .export.bvh import write_bvh as write_bvh
 from .export.correctives import write_body_npz as write_body_npz
 from .export.glb import write_skinned_glb as write_skinned_glb
 from .files import load_model as load_model
-from .fitting import FitConfig as FitConfig
-from .fitting import PoseFit as PoseFit
-from .fitting import ShapeFit as ShapeFit
-from .fitting import fit_pose as fit_pose
-from .fitting import fit_shape as fit_shape
+from .fitting.vertices import FitConfig as FitConfig
+from .fitting.vertices import PoseFit as PoseFit
+from .fitting.vertices import ShapeFit as ShapeFit
+from .fitting.vertices import fit_pose as fit_pose
+from .fitting.vertices import fit_shape as fit_shape
 from .importing import import_model as import_model
 from .learning.config import LearnConfig as LearnConfig
 from .learning.mixing import learn_scape_mix as learn_scape_mix

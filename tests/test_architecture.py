@@ -34,8 +34,10 @@ ROOMS = {
         "viewer": "alignment batch depth_camera geometry pictures registration",
         "pipeline": "batch cleaning correspondence geometry pictures registration skeleton viewer"},
     "model": {
-        "learning": "", "measurement": "", "motion": "", "resolution": "", "coregistration": "learning",
-        "export": "motion", "posing": "export learning motion", "statue": "export motion", "evaluation": "posing"},
+        "fitting": "", "learning": "fitting", "measurement": "", "motion": "", "resolution": "",
+        "coregistration": "fitting learning",
+        "export": "motion", "posing": "export fitting learning motion", "statue": "export fitting motion",
+        "evaluation": "fitting posing"},
     "completion": {
         "mocap": "", "partial": "mocap", "demo": "mocap partial", "tracking": "mocap partial",
         "viewing": "mocap partial", "measuring": "partial viewing"}}

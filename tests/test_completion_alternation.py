@@ -5,12 +5,12 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 from derivatives import slope
 
-from completion.bodies import FixedBody
 from completion.partial.alternation import Alternation, Blocks, Markers, damped_twists, nearest_markers
 from completion.partial.completion import complete
-from completion.partial.fit import REACH, ScanFit
-from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
+from model.fitting.bodies import FixedBody
+from model.fitting.scan import prepare_scan
+from model.fitting.scan_fit import REACH, ScanFit
 from model.gradients import edges
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
@@ -103,7 +103,7 @@ def test_markers_weigh_as_the_points_of_the_scan():
     model, config = worm_with_prior(0), replace(TURNS, surface_weight=0.7, landmark_sd=0.002, scan_sd=0.005)
     mesh = model.template
     fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(mesh), MARKS, mesh.vertices[MARKS], config)
-    found = nearest_markers(fit, mesh, REACH)
+    found = nearest_markers(fit, 1.0, mesh, REACH)
     cloud, thin = len(fit.cloud.points), len(fit.thin.points)
     of_scan = found.weights[len(MARKS):len(MARKS) + thin]
     np.testing.assert_allclose(of_scan.sum(), 0.7 * cloud, rtol=1e-3)

@@ -3,13 +3,13 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 from scipy.linalg import block_diag
 
-from completion import energy
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate, smoothed
 from completion.mocap.pose.marked_body import MarkedBody, supports
 from completion.mocap.pose.robust import marker_weights
 from completion.motion import Motion
+from model.fitting import energy
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 

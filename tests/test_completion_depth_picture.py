@@ -8,12 +8,12 @@ from config_files import config_file
 from PIL import Image
 
 from completion.__main__ import main
-from completion.bodies import as_body
 from completion.partial import report
 from completion.partial.completion import complete, doubts, load_completion, strayed
-from completion.partial.fit import ScanFit
 from completion.partial.inputs import in_metres
 from completion.partial.work import read_picture
+from model.fitting.bodies import as_body
+from model.fitting.scan_fit import ScanFit
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.surface import Rays

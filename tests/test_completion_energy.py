@@ -3,8 +3,8 @@ import pytest
 from completion_bodies import worm_with_prior
 from derivatives import differences
 
-from completion import energy
-from completion.bodies import Anchor, FixedBody, ShapedBody, as_body
+from model.fitting import energy
+from model.fitting.bodies import Anchor, FixedBody, ShapedBody, as_body
 from model.priors import JointLimits, gaussian_prior
 from scanprep.geometry import rotations
 

@@ -7,12 +7,12 @@ import pytest
 from people_bodies import small_people
 
 from completion.__main__ import main
-from completion.bodies import at_rest
 from completion.mocap.marker_sets import pictures, transfer
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import layout_names, named_layout, read_layout
 from completion.mocap.marker_sets.opensim import opensim_markers
 from completion.mocap.marker_sets.pictures import marker_rows, picture_layout
+from model.fitting.bodies import at_rest
 from scanprep import read_mesh, write_landmarks, write_mesh
 from scanprep.geometry.landmark_reading import read_marker_set
 from scanprep.registration.nonrigid import Registration

@@ -11,7 +11,7 @@ from config_files import config_file
 from completion.__main__ import main
 from completion.mocap.marker_selection.linear import example_poses, in_poses
 from completion.mocap.marker_sets.layout import MarkerLayout
-from model.fitting import spread_vertices
+from model.fitting.vertices import spread_vertices
 from scanprep.geometry.files import write_mesh
 
 MODEL = worm_with_prior()

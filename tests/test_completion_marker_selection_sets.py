@@ -12,7 +12,7 @@ from completion.mocap.marker_selection.fits import BodyPoints, DesignConfig, pri
 from completion.mocap.marker_selection.greedy import ADD, REMOVE, MarkerSets, exchange, symmetric_groups, walk
 from completion.mocap.marker_selection.linear import LinearBodies, fit_bodies, shared_shape
 from completion.mocap.marker_sets.layout import MarkerLayout
-from model.fitting import spread_vertices
+from model.fitting.vertices import spread_vertices
 from scanprep.geometry import rotations
 
 MODEL = worm_with_prior()

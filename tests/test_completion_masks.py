@@ -7,9 +7,10 @@ import pytest
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 
 from completion.partial.completion import complete
-from completion.partial.free_space import Clothing
-from completion.partial.masks import part_vertices, read_mask
-from completion.partial.scan import prepare_scan
+from completion.partial.masks import read_mask
+from model.fitting.free_space import Clothing
+from model.fitting.scan import prepare_scan
+from model.fitting.scan_fit import part_vertices
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

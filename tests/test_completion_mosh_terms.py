@@ -5,14 +5,14 @@ import pytest
 from completion_bodies import worm_with_prior
 from derivatives import differences
 
-from completion import energy
-from completion.bodies import FixedBody
-from completion.energy import MovingPoints
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.marked_body import supports
 from completion.mocap.subject import latent_fit as terms
 from completion.mocap.subject.attachment import above_triangles, latent_markers, simulated
 from completion.mocap.subject.latent_fit import LatentPoints
+from model.fitting import energy
+from model.fitting.bodies import FixedBody
+from model.fitting.energy import MovingPoints
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 
-from completion import energy
-from completion.bodies import FixedBody
 from completion.partial import completion as completing
 from completion.partial.completion import complete, load_completion, save_completion
-from completion.partial.free_space import Contact
-from completion.partial.limbs import limbs, redrawn
 from completion.partial.settings import CompletionConfig
+from model.fitting import energy
+from model.fitting.bodies import FixedBody
+from model.fitting.free_space import Contact
+from model.fitting.limbs import limbs, redrawn
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from completion import energy
-from completion.partial.limbs import unbranched
+from model.fitting import energy
+from model.fitting.limbs import unbranched
 from model.priors import JointLimits, gaussian_prior, typical_poses
 
 EXAMPLES = np.random.default_rng(7).normal(0, 0.4, (12, 4, 3)) * (np.arange(4) > 0)[:, None]

@@ -4,10 +4,10 @@ import pytest
 from completion_bodies import worm_with_prior
 from scipy.spatial import cKDTree
 
-from completion import energy
-from completion.bodies import FixedBody, ShapedBody
-from completion.partial.limbs import nearest_squared
-from completion.partial.pull import Pull
+from model.fitting import energy
+from model.fitting.bodies import FixedBody, ShapedBody
+from model.fitting.limbs import nearest_squared
+from model.fitting.pull import Pull
 from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 
 RNG = np.random.default_rng(3)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion.bodies import FixedBody
 from completion.partial.completion import (
     Completion,
     beyond_closed,
@@ -16,10 +15,11 @@ from completion.partial.completion import (
     save_completion,
 )
 from completion.partial.confidence import expected_error
-from completion.partial.fit import ScanFit
-from completion.partial.rounds import Solved, solve_jointly
-from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
+from model.fitting.bodies import FixedBody
+from model.fitting.rounds import Solved, solve_jointly
+from model.fitting.scan import prepare_scan
+from model.fitting.scan_fit import ScanFit
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
 from scanprep.synthetic.people import Person
@@ -118,7 +118,7 @@ def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide
         reaches.append(some[-1])
         return Solved(np.array([len(reaches) - 1]), True, len(some), {})
 
-    monkeypatch.setattr("completion.partial.rounds._in_rounds", rounds)
+    monkeypatch.setattr("model.fitting.rounds._in_rounds", rounds)
     fit = SimpleNamespace(config=CompletionConfig(), misfit=lambda x: (None, wide, narrow)[x[0]])
     solved = solve_jointly(fit, fit, np.zeros(1), lambda done: None)
     assert solved.x[0] == 1 + kept and reaches[0] == reaches[1] > reaches[2]
@@ -133,7 +133,7 @@ def test_where_a_step_lowers_nothing_a_shorter_one_is_tried(monkeypatch, lowest,
         tried.append(damping)
         return SimpleNamespace(x=x + (damping >= lowest))
 
-    monkeypatch.setattr("completion.partial.fit.levenberg_marquardt", once)
+    monkeypatch.setattr("model.fitting.scan_fit.levenberg_marquardt", once)
     fit = ScanFit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
                   np.zeros((0, 3)), CompletionConfig())
     assert (fit.step(np.zeros(15), fit.thin, 0.1)[0] == moved).all()

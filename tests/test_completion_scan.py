@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 
-from completion.partial.free_space import find_camera
-from completion.partial.scan import prepare_scan, spread
-from completion.starts import distinct
+from model.fitting.free_space import find_camera
+from model.fitting.named_points import distinct
+from model.fitting.scan import prepare_scan, spread
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 
-from completion.bodies import FixedBody
 from completion.partial.completion import complete
-from completion.partial.fit import ScanFit
-from completion.partial.free_space import Outside, find_camera
-from completion.partial.limbs import examples_of
-from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
-from completion.partial.starts import AXES, all_rotations, at_a_glance, from_nothing, placements, starting_poses, varied
+from model.fitting.bodies import FixedBody
+from model.fitting.free_space import Outside, find_camera
+from model.fitting.limbs import examples_of
+from model.fitting.scan import prepare_scan
+from model.fitting.scan_fit import ScanFit
+from model.fitting.starts import AXES, all_rotations, at_a_glance, from_nothing, placements, starting_poses, varied
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 

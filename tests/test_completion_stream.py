@@ -6,7 +6,6 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 from derivatives import differences
 
-from completion import energy
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate, low_pass
@@ -17,6 +16,7 @@ from completion.mocap.pose.robust import LabelWatch, marker_speed, marker_weight
 from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.motion import Motion
 from model.features import linear_features
+from model.fitting import energy
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace

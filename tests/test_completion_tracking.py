@@ -6,11 +6,11 @@ from completion_bodies import half_view, worm_with_prior
 from test_completion_partial import MARKS, QUICK
 
 from completion import Motion, TrackConfig, smoothing, track
-from completion.bodies import FixedBody, ShapedBody
 from completion.smoothing import inertia, predicted, smooth
 from completion.tracking.frame_fit import FrameFit, shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
 from completion.tracking.sequence import Tracker
+from model.fitting.bodies import FixedBody, ShapedBody
 from scanprep.batch.values import load_value, save_value
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud

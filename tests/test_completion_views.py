@@ -6,11 +6,11 @@ import pytest
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 from derivatives import differences
 
-from completion.bodies import as_body
 from completion.partial.completion import complete
-from completion.partial.free_space import find_cameras, free_space_violation
 from completion.partial.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
-from completion.partial.scan import as_views, prepare_scan
+from model.fitting.bodies import as_body
+from model.fitting.free_space import find_cameras, free_space_violation
+from model.fitting.scan import as_views, prepare_scan
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

@@ -4,7 +4,7 @@ import pytest
 from animal_bodies import ODD, Animal, Build, random_pose
 
 from model import LearnConfig, learn_scape
-from model.fitting import fit_pose, fit_shape
+from model.fitting.vertices import fit_pose, fit_shape
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 

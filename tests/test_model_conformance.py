@@ -13,7 +13,7 @@ from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
 from model.body import BodyModel
 from model.files import load_model
-from model.fitting import FitConfig, fit_pose, fit_shape
+from model.fitting.vertices import FitConfig, fit_pose, fit_shape
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 

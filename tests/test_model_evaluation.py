@@ -18,7 +18,7 @@ from model.evaluation.errors import (
 )
 from model.evaluation.page import error_pane
 from model.evaluation.sampling import sample_bodies, specificity, unposed
-from model.fitting import FitConfig, ShapeFitter
+from model.fitting.vertices import FitConfig, ShapeFitter
 from model.posing.cli import mesh as mesh_command
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace

@@ -3,7 +3,7 @@ import pytest
 from derivatives import differences
 from model_bodies import random_poses, worm_model
 
-from model.fitting import FitConfig, _equations, fit_pose, fit_shape, share_of_vertices, spread_vertices
+from model.fitting.vertices import FitConfig, _equations, fit_pose, fit_shape, share_of_vertices, spread_vertices
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.geometry import rotations

@@ -15,7 +15,7 @@ from model.cli import import_file
 from model.export.correctives import write_body_npz
 from model.features import QuaternionLift, RotationLift, lifted, lifted_slopes
 from model.files import load_model
-from model.fitting import fit_shape
+from model.fitting.vertices import fit_shape
 from model.importing import NAMES, import_model
 from model.linear import check_pose
 from model.makehuman import part_of, regressor_of

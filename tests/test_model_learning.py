@@ -3,7 +3,7 @@ import pytest
 from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
 from model import LearnConfig, learn_scape
-from model.fitting import fit_pose, fit_shape
+from model.fitting.vertices import fit_pose, fit_shape
 from model.learning.scape import pose_examples, pose_prior
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel

@@ -7,7 +7,7 @@ from conformance_bodies import skinned_worm
 from model_bodies import random_poses, worm, worm_skeleton
 
 from model.blend_weights import _onto_simplex, diffused_weights, fit_weights, strongest
-from model.fitting import fit_pose, fit_shape
+from model.fitting.vertices import fit_pose, fit_shape
 from model.learning import skinning
 from model.learning.skinning import (
     SkinConfig,

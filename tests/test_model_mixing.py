@@ -6,7 +6,7 @@ import pytest
 from model_bodies import random_poses, worm_model, worm_skeleton
 
 from model import LearnConfig, learn_scape
-from model.fitting import fit_pose, fit_shape
+from model.fitting.vertices import fit_pose, fit_shape
 from model.learning.mixing import GAIN, MIX, learn_scape_mix
 from model.learning.within import Within
 

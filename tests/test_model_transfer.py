@@ -8,7 +8,7 @@ from posing_bodies import skinned, symmetric_worm
 from model import fit_pose
 from model.cli import group
 from model.features import linear_features
-from model.fitting import PoseFit, ShapeFit
+from model.fitting.vertices import PoseFit, ShapeFit
 from model.posing.transfer import own_body, subject_from_body
 from model.scape import BlendScapeModel
 from scanprep import read_mesh, write_mesh

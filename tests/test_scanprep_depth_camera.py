@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from completion.partial.free_space import PictureView
-from completion.partial.upright import PICTURE, Upright
+from model.fitting.free_space import PictureView
+from model.fitting.upright import PICTURE, Upright
 from scanprep.depth_camera.person import find_person, room_planes
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import rotations

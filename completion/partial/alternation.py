@@ -16,6 +16,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from model.body import BodyModel
+from model.fitting.rounds import SETTLED, Solved
+from model.fitting.scan_fit import EVIDENCE, FINAL_REACH, REACH, ScanFit, Skin
 from model.gradients import edges
 from model.linear import Subject
 from model.scape import ScapeModel
@@ -23,9 +25,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .fit import EVIDENCE, FINAL_REACH, REACH, ScanFit, Skin
 from .free_surface import FreeSurface
-from .rounds import SETTLED, Solved
 from .settings import CompletionConfig
 
 MORE = 3                             # times as many rounds as the joint method: each block gives way only a little
@@ -38,7 +38,7 @@ def turns_of(body: BodyModel | Subject, config: CompletionConfig) -> Callable[..
     if config.free_scale:
         raise ValueError("free_scale: expected False with method='alternation'; a scan of unknown scale needs 'joint'")
     if isinstance(body, ScapeModel) and body.kind == ScapeModel.kind:
-        return partial(solve_in_turns, body)
+        return partial(solve_in_turns, body, config.surface_weight)
     what = f"a model of kind {body.kind!r}" if isinstance(body, BodyModel) else f"a {type(body).__name__}"
     raise ValueError(f"body: expected a SCAPE model with method='alternation', which turns and deforms its triangles, "
                      f"got {what}; a model learned without shapes stands for its template's own body")
@@ -158,8 +158,8 @@ def damped_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.nda
     return np.linalg.solve(normal.reshape(3 * J, 3 * J), side.ravel()).reshape(J, 3)
 
 
-def solve_in_turns(model: ScapeModel, fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int], None]
-                   ) -> Solved:
+def solve_in_turns(model: ScapeModel, surface_weight: float, fit: ScanFit, few: ScanFit, x: np.ndarray,
+                   tell: Callable[[int], None]) -> Solved:
     """As `solve_jointly`: in a round the points closest to Y[Z] become markers, then R, Y and betas are found in turns.
 
     [SCAPE] §7
@@ -170,7 +170,7 @@ def solve_in_turns(model: ScapeModel, fit: ScanFit, few: ScanFit, x: np.ndarray,
     rounds, shift = MORE * config.rounds, np.inf
     reaches = np.geomspace(REACH, FINAL_REACH, rounds)
     for i, reach in enumerate([*reaches, *[FINAL_REACH] * rounds]):
-        markers, before = nearest_markers(fit, model.template.with_vertices(now.Y), reach), now.Y
+        markers, before = nearest_markers(fit, surface_weight, model.template.with_vertices(now.Y), reach), now.Y
         now = steps.rotated(now, config.twist_weight)               # [SCAPE] Eq. 11
         now = steps.stretched(now, markers)                         # [SCAPE] Eq. 10
         now = steps.shaped(now)                                     # [SCAPE] §6
@@ -183,7 +183,7 @@ def solve_in_turns(model: ScapeModel, fit: ScanFit, few: ScanFit, x: np.ndarray,
     return Solved(x, bool(shift < SETTLED), i + 1, {"eq_10": steps.energy(now, markers)})
 
 
-def nearest_markers(fit: ScanFit, mesh: Mesh, reach: float) -> Markers:
+def nearest_markers(fit: ScanFit, surface_weight: float, mesh: Mesh, reach: float) -> Markers:
     """Closest points and landmarks as markers, weighted as in the joint method, in units of one point of the scan.
 
     The weight of the setting is meant for all points of the scan; what is matched are fewer.
@@ -193,7 +193,7 @@ def nearest_markers(fit: ScanFit, mesh: Mesh, reach: float) -> Markers:
     config = fit.config
     ids, points, _, weights = fit.matches(Skin(mesh.vertices, mesh.vertex_normals), fit.thin, reach)
     one = EVIDENCE / config.scan_sd**2 / len(fit.thin.points)
-    w_Z = config.surface_weight * len(fit.cloud.points) / len(fit.thin.points)
+    w_Z = surface_weight * len(fit.cloud.points) / len(fit.thin.points)
     marked = np.full(len(fit.vertices), config.landmark_sd**-2)
     return Markers(np.concatenate([fit.vertices, ids]), np.concatenate([fit.points, points]),
                    w_Z / one * np.concatenate([marked, weights]))

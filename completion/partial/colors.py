@@ -7,15 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.fitting.free_space import find_camera
+from model.fitting.scan import View, as_views, check_viewpoints, in_metres, prepare_scan
 from scanprep.geometry import sparse
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture
 from scanprep.ranges import Positive, Settings
-
-from .free_space import find_camera
-from .scan import View, as_views, check_viewpoints, in_metres, prepare_scan
 
 NEIGHBOURS = 3                       # points of a cloud that make the colour of a place
 RIM = 0.015                          # metres: towards its border a view counts less and less

@@ -9,6 +9,13 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
+from model.fitting.bodies import as_body
+from model.fitting.free_space import free_space_violation
+from model.fitting.limbs import with_limbs
+from model.fitting.rounds import solve_jointly
+from model.fitting.scan import Scan
+from model.fitting.scan_fit import STRANGE, ScanFit
+from model.fitting.starts import best_starts, first_starts, going_on
 from model.linear import Subject
 from model.people import person_judgement
 from model.priors import CRUDE
@@ -21,19 +28,12 @@ from scanprep.registration.ground import foot_of_vertex, grounded
 from scanprep.skeleton.roles import in_words, joint_in_words
 from scanprep.threads import one_thread
 
-from ..bodies import as_body
 from .alternation import turns_of
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
-from .fit import STRANGE, ScanFit
-from .free_space import free_space_violation
 from .free_surface import distance_to, free_surface
 from .inputs import in_metres
-from .limbs import with_limbs
-from .rounds import solve_jointly
 from .scale import ScaledBody
-from .scan import Scan
 from .settings import CompletionConfig
-from .starts import best_starts, first_starts, going_on
 
 Progress = Callable[[int, int], None]
 

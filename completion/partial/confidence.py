@@ -4,10 +4,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainc
 
+from model.fitting.bodies import FixedBody
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
-
-from ..bodies import FixedBody
 
 # Chosen so that the stated probabilities fit best (least Brier score at 5, 10, 20 and 40 mm) on completed half views
 # of tuning bodies: 14 poses of a known man and 7 men of unknown shape, none of which the models were learned from.

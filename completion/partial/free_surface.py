@@ -4,12 +4,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 
+from model.fitting.scan import ScanPoints
+from model.fitting.scan_fit import MIN_COSINE
 from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-from .fit import MIN_COSINE
-from .scan import ScanPoints
 from .settings import CompletionConfig
 
 NEAR, ROUNDS = 0.03, 4              # metres: limit on the distance of scan points to the free surface; its matchings

@@ -1,4 +1,4 @@
-"""Clothing and hair: points that hide the body, and the files that say which they are; parts that are left out."""
+"""Clothing and hair: points that hide the body, and the files that say which they are."""
 from __future__ import annotations
 
 import re
@@ -11,22 +11,9 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_points
-from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.tree import Skeleton
 
 GREY = 0.1                           # least difference of two channels of a colour that marks
 NEAR = 6e-4                          # of the scan's extent: from a point of a marked file to the point it means
-
-
-def part_vertices(template: Mesh, skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:
-    """(N,) bool: vertices of the parts of these names."""
-    unknown = [name for name in names if name not in skeleton.names]
-    if unknown:
-        raise ValueError(f"ignored_parts: expected names of {', '.join(skeleton.names)}; got {', '.join(unknown)}")
-    if names and set(names) == set(skeleton.names):
-        raise ValueError("ignored_parts: expected to leave some parts of the body to match, got all of them")
-    numbers = [skeleton.names.index(name) for name in names]
-    return np.isin(skeleton.part_of_vertex(template), numbers)
 
 
 def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.fitting.scan import View, all_points, as_views, in_metres
 from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
@@ -19,7 +20,6 @@ from scanprep.pictures.shading import Dots, Heat, Shape, Solid, render, side_by_
 from scanprep.pictures.sheets import webp_bytes
 
 from .completion import Completion
-from .scan import View, all_points, as_views, in_metres
 
 MEASURED, COMPLETED = (0.55, 0.67, 0.80), (0.93, 0.75, 0.42)
 PREDICTED, OVER = (0.62, 0.74, 0.62), (0.45, 0.42, 0.50)

@@ -7,16 +7,16 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.fitting import energy
+from model.fitting.bodies import FixedBody, Follow, NearPoints
+from model.fitting.energy import MovingPoints
+from model.fitting.scan import spread
+from model.fitting.starts import all_rotations
 from model.priors import gaussian_prior, typical_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
 
-from .. import energy
-from ..bodies import FixedBody, Follow, NearPoints
-from ..energy import MovingPoints
-from .scan import spread
 from .settings import CompletionConfig
-from .starts import all_rotations
 
 LOOSE = 0.3                          # standard deviation of the logarithm of what the first guess is off by
 POINTS = 1500                        # that show how far a scan extends

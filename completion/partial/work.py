@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from model.body import BodyModel
+from model.fitting.scan import all_points, point_count, prepare_picture
 from model.linear import Subject
 from scanprep.arguments import UsageError
 from scanprep.batch.room import Room
@@ -30,7 +31,6 @@ from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, save_completion
 from .masks import read_mask
 from .report import completion_page, completion_panes, picture_completion
-from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
 from .worn import worn_markers, write_worn
 

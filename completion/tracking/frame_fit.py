@@ -7,6 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.fitting import energy
+from model.fitting.bodies import FixedBody, ShapedBody
+from model.fitting.limbs import reinitialise_limbs
+from model.fitting.scan import ScanPoints, spread
+from model.fitting.scan_fit import ScanFit
+from model.fitting.starts import approach, best_starts, first_starts
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import (
     Arrow,
@@ -18,12 +24,6 @@ from scanprep.geometry.least_squares import (
 )
 from scanprep.geometry.surface import Surface
 
-from .. import energy
-from ..bodies import FixedBody, ShapedBody
-from ..partial.fit import ScanFit
-from ..partial.limbs import reinitialise_limbs
-from ..partial.scan import ScanPoints, spread
-from ..partial.starts import approach, best_starts, first_starts
 from ..smoothing import inertia
 from .settings import TrackConfig
 

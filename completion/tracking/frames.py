@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.fitting.scan import NEIGHBOURS, ScanPoints, View, prepare_scan, spread
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
-
-from ..partial.scan import NEIGHBOURS, ScanPoints, View, prepare_scan, spread
 
 DENSER = 4                           # times as many points as are matched make the normals
 

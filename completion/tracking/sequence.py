@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
+from model.fitting.bodies import FixedBody, ShapedBody, as_body
+from model.fitting.scan import ScanPoints
 from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.threads import one_thread
 
-from ..bodies import FixedBody, ShapedBody, as_body
 from ..motion import Motion, Progress
 from ..partial.completion import complete
 from ..partial.free_surface import free_surface
-from ..partial.scan import ScanPoints
 from ..smoothing import inertia, predicted, smooth
 from .frame_fit import FrameFit, Refined, shared_shape, spread_poses
 from .frames import Frame, as_views, prepare_frame

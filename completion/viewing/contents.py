@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
+from model.fitting.bodies import at_rest
 from model.linear import Subject
 from model.statue.control.model import Statue
 from scanprep.geometry import rotations
@@ -20,7 +21,6 @@ from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
 from scanprep.pictures.thinning import thinned
 from scanprep.viewer.clicked import camera_before
 
-from ..bodies import at_rest
 from ..partial.completion import Completion
 
 POINTS, TRIANGLES = 150_000, 120_000             # of a cloud or mesh that are shown

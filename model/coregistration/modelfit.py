@@ -19,7 +19,7 @@ from scanprep.geometry.target import Target, orient
 from ..bilinear import PosedPoints, ShapedPoints
 from ..body import BodyModel
 from ..features import twists
-from ..fitting import share_of_vertices, spread_vertices
+from ..fitting.vertices import share_of_vertices, spread_vertices
 from ..linear import PointOperator, Subject
 from .attraction import Attraction, apart, attraction, towards
 from .config import ModelFitConfig, PoseStage

@@ -12,7 +12,7 @@ import numpy as np
 from scanprep.judgement import HAND, extent, size, unit_problem
 
 from ..body import BodyModel
-from ..fitting import FitConfig, PoseFit, PoseFitter, ShapeFit, ShapeFitter
+from ..fitting.vertices import FitConfig, PoseFit, PoseFitter, ShapeFit, ShapeFitter
 from ..linear import Subject
 
 Progress = Callable[[int, int], None]

@@ -9,7 +9,7 @@ import numpy as np
 from model.priors import sample_poses
 
 from ..body import BodyModel
-from ..fitting import FitConfig, ShapeFitter
+from ..fitting.vertices import FitConfig, ShapeFitter
 from .errors import checked_bodies, checked_counts
 
 Progress = Callable[[int, int], None]

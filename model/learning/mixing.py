@@ -17,7 +17,7 @@ from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
 from ..digests import body_digests, digest
-from ..fitting import FitConfig, ShapeFitter
+from ..fitting.vertices import FitConfig, ShapeFitter
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel

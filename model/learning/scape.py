@@ -23,7 +23,7 @@ from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel
 from ..digests import body_digest, body_digests, digest
 from ..features import twists
-from ..fitting import FitConfig, PoseFitter
+from ..fitting.vertices import FitConfig, PoseFitter
 from ..gradients import GradientSystem, pose_gradients, shape_gradients
 from ..human_poses import mixed, with_human_poses
 from ..linear import Subject

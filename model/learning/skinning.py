@@ -16,7 +16,7 @@ from scanprep.threads import one_thread
 from ..blend_weights import diffused, diffused_weights, fit_weights, strongest
 from ..digests import body_digest, digest
 from ..features import LinearLift, PoseFeatures, part_features
-from ..fitting import FitConfig, PoseFitter, ShapeFitter
+from ..fitting.vertices import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import kept_directions
 from ..shape_space import body_volumes, learn_shape_space
 from ..skinning import SkinningModel, unblended

@@ -7,7 +7,7 @@ from functools import singledispatch
 import numpy as np
 
 from ..body import BodyModel
-from ..fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
+from ..fitting.vertices import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
 from ..gradients import GradientSystem, shape_gradients
 from ..linear import Subject, check_pose
 from ..scape import ScapeModel

@@ -104,7 +104,7 @@ def recovered_men(data: RealData, model: BodyModel, which: np.ndarray, offset: i
     from mosh_people import marker_set, put_on, recorded
 
     from completion.mocap.subject.person import PersonConfig, find_person
-    from model.fitting import fit_pose
+    from model.fitting.vertices import fit_pose
     from model.posing.transfer import subject_from_body
 
     layout, rows = marker_set(model, 47), []

@@ -104,9 +104,9 @@ def tried(args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any
     from half_views import picture
 
     from completion.partial.completion import complete
-    from completion.partial.scan import prepare_scan
     from completion.partial.settings import CompletionConfig
     from model.files import load_model
+    from model.fitting.scan import prepare_scan
     from model.scape import ScapeModel
     from scanprep.geometry.surface import OrientedPoints, Surface
 

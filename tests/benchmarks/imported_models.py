@@ -68,7 +68,7 @@ def walking(model: Any, own: np.ndarray, people: list[Any], frames: int) -> dict
     from completion.mocap.marker_sets.layout import MarkerLayout
     from completion.mocap.mosh.mosh import mosh
     from completion.mocap.pose.follow import animate
-    from model.fitting import fit_shape
+    from model.fitting.vertices import fit_shape
     from scanprep.geometry.farthest_points import farthest_points
     from scanprep.synthetic.landmarks import markers
     from scanprep.synthetic.people import walk
@@ -99,7 +99,7 @@ def _off(found: np.ndarray, bodies: np.ndarray) -> float:
 def main() -> None:
     from published_bodies import people_near_rest
 
-    from model.fitting import fit_shape
+    from model.fitting.vertices import fit_shape
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, required=True)

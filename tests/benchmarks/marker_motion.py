@@ -14,7 +14,7 @@ from protocols import RealData, scape_fold
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from model.body import BodyModel
-from model.fitting import fit_pose
+from model.fitting.vertices import fit_pose
 from model.linear import Subject
 from scanprep.geometry import rotations
 

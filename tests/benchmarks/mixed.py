@@ -17,7 +17,7 @@ from protocols import machine, write_report
 
 from model import LearnConfig, learn_scape
 from model.body import BodyModel
-from model.fitting import FitConfig, PoseFitter, ShapeFitter
+from model.fitting.vertices import FitConfig, PoseFitter, ShapeFitter
 from model.learning.mixing import MIX, learn_scape_mix
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton

@@ -22,7 +22,6 @@ import numpy as np
 from marker_motion import dropped
 from protocols import load_real, machine, spring_split, write_report
 
-from completion import energy
 from completion.mocap.artefacts.find import find_artefacts
 from completion.mocap.artefacts.results import ArtefactConfig, BadKind, BadSpan, Swap
 from completion.mocap.files.markers import MarkerSequence, read_markers
@@ -35,6 +34,7 @@ from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
+from model.fitting import energy
 from model.linear import Subject
 from model.posing.transfer import subject_from_body
 

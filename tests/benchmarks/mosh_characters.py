@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from protocols import load_real, machine, write_report
 
-from completion.bodies import at_rest
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
@@ -34,6 +33,7 @@ from completion.mocap.retargeting.soft_tissue import (
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
+from model.fitting.bodies import at_rest
 from model.posing.character import Character, register_character
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png

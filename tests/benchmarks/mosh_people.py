@@ -24,7 +24,7 @@ from completion.mocap.marker_sets.named import layout_names, named_layout
 from completion.mocap.subject.person import PersonConfig, PersonFit, find_person
 from model.body import BodyModel
 from model.files import load_model
-from model.fitting import fit_pose
+from model.fitting.vertices import fit_pose
 from model.linear import Subject
 from model.posing.transfer import subject_from_body
 from scanprep.geometry.mesh import Mesh

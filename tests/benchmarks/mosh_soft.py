@@ -27,7 +27,6 @@ from pathlib import Path
 import numpy as np
 from protocols import machine, write_report
 
-from completion.energy import lifted
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
@@ -40,6 +39,7 @@ from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
+from model.fitting.energy import lifted
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.pictures.camera import Camera, upright
 from scanprep.pictures.colors import Heat

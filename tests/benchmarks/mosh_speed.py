@@ -27,11 +27,11 @@ from marker_motion import dropped
 from mosh_artefacts import exchanged, spoilt
 from protocols import machine, write_report
 
-from completion import energy
 from completion.mocap.files.markers import MarkerSequence, read_markers, write_markers
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.marked_body import supports
 from completion.synthetic_people import synthetic_model, synthetic_path
+from model.fitting import energy
 from scanprep.synthetic.people import walk
 
 RATE, NOISE = 120.0, 0.001           # frames a second; metres

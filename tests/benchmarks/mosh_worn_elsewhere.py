@@ -30,7 +30,6 @@ from pathlib import Path
 import numpy as np
 from protocols import machine, write_report
 
-from completion import energy
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
@@ -42,6 +41,7 @@ from completion.mocap.subject.worn_elsewhere import Worn, find_worn
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
+from model.fitting import energy
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sides import other_side
 

@@ -16,7 +16,7 @@ from protocols import load_real, machine, scape_fold, write_report
 
 from model import LearnConfig
 from model.blending import BlendedTemplate, rigid_weights
-from model.fitting import PoseFitter
+from model.fitting.vertices import PoseFitter
 from model.learning.parts import coarse_copy, coarse_skeleton
 from model.learning.scape import Work, learn_pose
 from scanprep.skeleton.tree import Skeleton

@@ -20,7 +20,7 @@ import numpy as np
 from protocols import load_real, machine, scape_fold, write_report
 
 from model import BodyModel, LearnConfig, SkinConfig, learn_blendscape, learn_scape, learn_skinning
-from model.fitting import PoseFitter
+from model.fitting.vertices import PoseFitter
 from model.learning.parts import choose_skeleton
 from model.pose_space import PoseSpace
 from scanprep.geometry.mesh import Mesh

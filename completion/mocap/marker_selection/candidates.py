@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 
+from model.fitting.bodies import at_rest
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sides import other_side, side_of, split_side
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
 
-from ...bodies import at_rest
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.symmetry import SkinMirror, find_skin_mirror
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
+from model.fitting.bodies import at_rest
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
@@ -20,7 +21,6 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
 
-from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout

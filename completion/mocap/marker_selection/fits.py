@@ -9,13 +9,12 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from model.fitting.energy import MovingPoints, moving_points
 from model.linear import PointOperator, picked
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 from scanprep.ranges import FLAG, Count, Positive, Settings
-
-from ...energy import MovingPoints, moving_points
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.body import BodyModel
-from model.fitting import FitConfig, ShapeFitter, share_of_vertices, spread_vertices
+from model.fitting.vertices import FitConfig, ShapeFitter, share_of_vertices, spread_vertices
 from model.linear import check_pose
 from model.posing.transfer import own_body
 from scanprep.geometry import rotations

@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from model.files import load_model
+from model.fitting.bodies import at_rest
 from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
@@ -23,7 +24,6 @@ from scanprep.registration.person import average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.landmarks import landmarks as synthetic_landmarks
 
-from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model
 from .layout import MarkerLayout
 from .named import layout_names, layout_summaries, read_layout

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from model.body import BodyModel
+from model.fitting.energy import lifted
 from model.linear import Subject
 
-from ...energy import lifted
 from ...motion import Motion
 from ...motion_pictures import LightMesh
 from ..artefacts.results import MarkerArtefacts

@@ -3,11 +3,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from model.fitting import energy
+from model.fitting.named_points import ANNEALING
 from model.priors import typical_poses
 from scanprep.geometry import rotations
 
-from ... import energy
-from ...starts import ANNEALING
 from .marked_body import MarkedBody
 from .robust import marker_weights, misfit
 from .settings import AnimateConfig

@@ -11,14 +11,14 @@ from functools import partial
 import numpy as np
 
 from model.features import twists
+from model.fitting import energy
+from model.fitting.bodies import FixedBody
 from model.linear import Subject
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
 
-from ... import energy
-from ...bodies import FixedBody
 from ..marker_sets.layout import MarkerLayout
 from .part_shapes import PartShapes, part_shapes
 

@@ -9,6 +9,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
 from model.body import BodyModel
+from model.fitting.bodies import at_rest
 from model.linear import Subject
 from scanprep.console import Metric
 from scanprep.geometry.farthest_points import spread_indices
@@ -18,7 +19,6 @@ from scanprep.pictures.colors import color_bar, heat
 from scanprep.pictures.shading import side_by_side
 from scanprep.skeleton.tree import Skeleton
 
-from ...bodies import at_rest
 from ...motion_pictures import bodies_in_a_row, seconds
 from ..files.motion_files import KEYS, write_glb
 from ..soft_tissue.soft_tissue import SoftTissue

@@ -10,11 +10,11 @@ from typing import Literal
 
 import numpy as np
 
+from model.fitting.energy import MovingPoints
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface, barycentric
 
-from ...energy import MovingPoints
 from ..pose.marked_body import padded, ring_around
 
 Attachment = Literal["triangle", "neighbourhood"]

@@ -12,13 +12,13 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from model.fitting import energy
+from model.fitting.energy import MovingPoints
 from model.linear import picked
 from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 from scanprep.ranges import Count, Positive, Seed, Settings
 
-from ... import energy
-from ...energy import MovingPoints
 from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
 from ..pose.marked_body import supports

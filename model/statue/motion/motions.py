@@ -19,7 +19,7 @@ from scanprep.registration.nonrigid import Registration, register, registration_
 from scanprep.skeleton.tree import Skeleton
 
 from ...body import BodyModel
-from ...fitting import fit_shape
+from ...fitting.vertices import fit_shape
 from ...linear import Subject
 from ...motion.amass import moving_body
 from ...motion.bvh import read_bvh

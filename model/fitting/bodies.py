@@ -9,14 +9,14 @@ from typing import Protocol
 
 import numpy as np
 
-from model.bilinear import PosedPoints
-from model.body import BodyModel
-from model.human_poses import human_poses
-from model.linear import PointOperator, Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
+from ..bilinear import PosedPoints
+from ..body import BodyModel
+from ..human_poses import human_poses
+from ..linear import PointOperator, Subject
 from .energy import MovingPoints, moving_points
 
 Follow = Callable[[np.ndarray], MovingPoints]

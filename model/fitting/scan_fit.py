@@ -1,25 +1,25 @@
 """A body on a scan: matches and robust weights, a better body for one matching, and how badly a body explains it."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from model.priors import LEAST_POSES, GaussianPrior, JointLimits, gaussian_prior
 from scanprep.geometry.least_squares import Deferred, Residual, levenberg_marquardt, normal_equations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
+from scanprep.skeleton.tree import Skeleton
 
-from .. import energy
-from ..bodies import FixedBody
+from ..priors import LEAST_POSES, GaussianPrior, JointLimits, gaussian_prior
+from . import energy
+from .bodies import FixedBody
 from .free_space import Clothing, Contact, Outside, Violation, find_cameras, free_space_violation
-from .masks import part_vertices
 from .pull import Pull
 from .scan import ScanPoints, spread
-from .settings import CompletionConfig
+from .settings import ScanFitConfig
 from .upright import TILT, Upright
 
 Terms = dict[str, Residual]
@@ -58,7 +58,7 @@ class ScanFit:
     """
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: np.ndarray,
-                 config: CompletionConfig) -> None:
+                 config: ScanFitConfig) -> None:
         self.body, self.config = body, config
         self.points = points
         self.prior: GaussianPrior = gaussian_prior(body.pose_mean, body.pose_covariance)
@@ -331,3 +331,14 @@ class Matched:
                 "scan_planes": float(to_plane[self.landmarks:end].sum()),
                 "scan_points": float(to_point[self.landmarks:end].sum()), "violations": float(to_plane[end:].sum()),
                 **{name: float(term.energy[0]) for name, term in self.known(x[None]).items()}}
+
+
+def part_vertices(template: Mesh, skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:
+    """(N,) bool: vertices of the parts of these names."""
+    unknown = [name for name in names if name not in skeleton.names]
+    if unknown:
+        raise ValueError(f"ignored_parts: expected names of {', '.join(skeleton.names)}; got {', '.join(unknown)}")
+    if names and set(names) == set(skeleton.names):
+        raise ValueError("ignored_parts: expected to leave some parts of the body to match, got all of them")
+    numbers = [skeleton.names.index(name) for name in names]
+    return np.isin(skeleton.part_of_vertex(template), numbers)

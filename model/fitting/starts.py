@@ -3,17 +3,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from model.priors import GaussianPrior, typical_poses
 from scanprep import find_correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import normal_equations
 
-from .. import energy
-from ..bodies import FixedBody, Follow
-from ..starts import distinct, search
-from .fit import EVIDENCE, ScanFit
+from ..priors import GaussianPrior, typical_poses
+from . import energy
+from .bodies import FixedBody, Follow
+from .named_points import distinct, search
 from .scan import ScanPoints, spread
+from .scan_fit import EVIDENCE, ScanFit
 from .upright import SPREAD, SPREAD_OF_MANY, Upright
 
 AXES = 4                             # directions of the training poses along which a search from landmarks starts

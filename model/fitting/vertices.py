@@ -15,10 +15,10 @@ from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 from scanprep.ranges import Count, Settings
 from scanprep.threads import one_thread
 
-from .bilinear import PosedPoints, ShapedPoints
-from .body import BodyModel
-from .features import twists
-from .linear import PointOperator, Subject
+from ..bilinear import PosedPoints, ShapedPoints
+from ..body import BodyModel
+from ..features import twists
+from ..linear import PointOperator, Subject
 
 EXACT = 1e-15                        # square metres, over all points: a step that gains less is none
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .fit import FINAL_REACH, REACH, ScanFit
+from .scan_fit import FINAL_REACH, REACH, ScanFit
 
 WIDE_REACH = 0.08                    # metres: limit on the distance of matches, for models that follow a scan badly
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round

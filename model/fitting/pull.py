@@ -8,7 +8,7 @@ from scipy.sparse import coo_array, csr_array
 
 from scanprep.geometry.least_squares import Deferred, Dense
 
-from ..bodies import NearPoints
+from .bodies import NearPoints
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,10 @@ from functools import partial
 
 import numpy as np
 
-from model.priors import GaussianPrior, typical_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
 
+from ..priors import GaussianPrior, typical_poses
 from . import energy
 from .bodies import FixedBody, Follow
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model.priors import GaussianPrior
 from scanprep.skeleton.tree import Skeleton
 
-from ..bodies import FixedBody
-from ..starts import distinct
-from .fit import EVIDENCE, ScanFit
+from ..priors import GaussianPrior
+from .bodies import FixedBody
 from .free_space import INSIDE, PRESSED, Outside
+from .named_points import distinct
 from .scan import spread
+from .scan_fit import EVIDENCE, ScanFit
 from .starts import approach
 
 LOOSE = 0.1                          # radians around the limb of a known pose

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.priors import GaussianPrior, JointLimits
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual
+
+from ..priors import GaussianPrior, JointLimits
 
 GIVE = 0.1                           # radians beyond a joint's limit that cost as much as one standard deviation
 
