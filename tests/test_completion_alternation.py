@@ -10,7 +10,7 @@ from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
 from model.fitting.scan import prepare_scan
-from model.fitting.scan_fit import REACH, ScanFit
+from model.fitting.scan_fit import REACH, scan_fit
 from model.gradients import edges
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
@@ -102,8 +102,8 @@ def test_markers_weigh_as_the_points_of_the_scan():
     """On the scan itself all matches of its points weigh `surface_weight` a point; a landmark as its variance says."""
     model, config = worm_with_prior(0), replace(TURNS, surface_weight=0.7, landmark_sd=0.002, scan_sd=0.005)
     mesh = model.template
-    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(mesh), MARKS, mesh.vertices[MARKS], config)
-    found = nearest_markers(fit, 1.0, mesh, REACH)
+    fit = scan_fit(FixedBody(model.subject(None)), prepare_scan(mesh), MARKS, mesh.vertices[MARKS], config)
+    found = nearest_markers(fit, config.surface_weight, mesh, REACH)
     cloud, thin = len(fit.cloud.points), len(fit.thin.points)
     of_scan = found.weights[len(MARKS):len(MARKS) + thin]
     np.testing.assert_allclose(of_scan.sum(), 0.7 * cloud, rtol=1e-3)

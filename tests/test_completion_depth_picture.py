@@ -13,7 +13,7 @@ from completion.partial.completion import complete, doubts, load_completion, str
 from completion.partial.inputs import in_metres
 from completion.partial.work import read_picture
 from model.fitting.bodies import as_body
-from model.fitting.scan_fit import ScanFit
+from model.fitting.scan_fit import scan_fit
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.surface import Rays
@@ -60,7 +60,7 @@ def test_a_body_before_a_wall_is_completed(model, body, marks):
 def test_what_is_beyond_the_border_is_unknown_and_not_doubted(model, body, marks):
     middle = taken(body).project(body.vertices.mean(axis=0))[0]
     given = in_metres(as_body(model), taken(body, slice(int(middle), None)), marks, None, QUICK)
-    fit = ScanFit(as_body(model), given.cloud, given.vertices, given.points, QUICK)
+    fit = scan_fit(as_body(model), given.cloud, given.vertices, given.points, QUICK)
     x = as_body(model).join(POSE, body.vertices.mean(axis=0))
     x[3 * len(POSE):][:3] += (body.vertices - fit.mesh(x).vertices).mean(axis=0)
     np.testing.assert_allclose(fit.mesh(x).vertices, body.vertices, atol=1e-9)

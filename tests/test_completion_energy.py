@@ -4,7 +4,7 @@ from completion_bodies import worm_with_prior
 from derivatives import differences
 
 from model.fitting import energy
-from model.fitting.bodies import Anchor, FixedBody, ShapedBody, as_body
+from model.fitting.bodies import FixedBody, ShapedBody, anchor_at, as_body
 from model.priors import JointLimits, gaussian_prior
 from scanprep.geometry import rotations
 
@@ -125,7 +125,7 @@ def test_derivatives_by_betas_are_carried_with_the_bones():
     """They are exact where they were stitched and after a turn of the whole, and close after a turn of the joints."""
     x = unknowns(SHAPED)
     pose = x[:12].reshape(4, 3)
-    anchor = Anchor(MODEL, pose)
+    anchor = anchor_at(MODEL, pose)
     ids = np.arange(0, 398, 7)
     np.testing.assert_allclose(anchor.carried(ids, pose), MODEL.shape_jacobian(pose, ids), atol=1e-12)
     whole = pose.copy()

@@ -19,7 +19,7 @@ from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
 from model.fitting.rounds import Solved, solve_jointly
 from model.fitting.scan import prepare_scan
-from model.fitting.scan_fit import ScanFit
+from model.fitting.scan_fit import scan_fit
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
 from scanprep.synthetic.people import Person
@@ -76,7 +76,7 @@ def test_a_folder_that_lacks_an_array_is_refused(tmp_path):
 
 def test_parts_that_may_be_far_off_are_named_the_worst_first():
     body, x = FixedBody(MODEL.subject(None)), np.zeros(15)
-    fit = ScanFit(body, prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64), np.zeros((0, 3)),
+    fit = scan_fit(body, prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64), np.zeros((0, 3)),
                   CompletionConfig())
     error, seen = np.full(398, 0.004), np.ones(398, dtype=bool)
     assert doubts(fit, x, error, seen) == []
@@ -91,7 +91,7 @@ def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():
     nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
     for left_out, told in ((0.01, 0), (0.05, 1)):
         body = FixedBody(replace(MODEL, info={"left_out_error": left_out}).subject(None))
-        fit = ScanFit(body, prepare_scan(MODEL.template.vertices), *nothing, CompletionConfig())
+        fit = scan_fit(body, prepare_scan(MODEL.template.vertices), *nothing, CompletionConfig())
         found = doubts(fit, np.zeros(15), np.full(398, 0.004), np.ones(398, dtype=bool))
         assert len(found) == told and all("50 mm off" in reason for reason in found)
     far, off = np.array([0.0, 1.0]), np.zeros(2)
@@ -101,7 +101,7 @@ def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():
 
 def test_a_bend_that_the_model_never_saw_is_named():
     poses = np.random.default_rng(0).normal(0, 0.4, (60, 4, 3)) * np.array([0, 1, 0.01, 1])[:, None]
-    fit = ScanFit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
+    fit = scan_fit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
                   np.zeros(0, dtype=np.int64), np.zeros((0, 3)), CompletionConfig())
     x = np.zeros(15)
     x[[3, 6]] = np.radians(50)                                        # of the second part poses say that it bends
@@ -134,7 +134,7 @@ def test_where_a_step_lowers_nothing_a_shorter_one_is_tried(monkeypatch, lowest,
         return SimpleNamespace(x=x + (damping >= lowest))
 
     monkeypatch.setattr("model.fitting.scan_fit.levenberg_marquardt", once)
-    fit = ScanFit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
+    fit = scan_fit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
                   np.zeros((0, 3)), CompletionConfig())
     assert (fit.step(np.zeros(15), fit.thin, 0.1)[0] == moved).all()
     assert len(tried) == steps and tried == sorted(tried)
@@ -143,7 +143,7 @@ def test_where_a_step_lowers_nothing_a_shorter_one_is_tried(monkeypatch, lowest,
 def test_a_joint_held_as_in_no_known_pose_is_named_and_a_known_way_is_not():
     poses = np.zeros((1, 4, 3))
     poses[0, 1, 0] = np.radians(120)
-    fit = ScanFit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
+    fit = scan_fit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
                   np.zeros(0, dtype=np.int64), np.zeros((0, 3)), CompletionConfig())
     x, fine = np.zeros(15), (np.full(398, 0.004), np.ones(398, dtype=bool))
     x[:3] = 1.0                                                       # the whole body may stand anyhow
@@ -156,7 +156,7 @@ def test_a_joint_held_as_in_no_known_pose_is_named_and_a_known_way_is_not():
 
 @pytest.mark.parametrize(("explained", "told"), [(0.98, False), (0.95, True)])
 def test_a_limbs_worth_of_scan_without_a_body_is_told(explained, told):
-    fit = ScanFit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
+    fit = scan_fit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
                   np.zeros((0, 3)), CompletionConfig())
     assert left_over(fit, explained) == (["5.0% of the scan has no body near: clutter, or a limb elsewhere"] * told)
 

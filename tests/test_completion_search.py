@@ -10,7 +10,7 @@ from model.fitting.bodies import FixedBody
 from model.fitting.free_space import Outside, find_camera
 from model.fitting.limbs import examples_of
 from model.fitting.scan import prepare_scan
-from model.fitting.scan_fit import ScanFit
+from model.fitting.scan_fit import scan_fit
 from model.fitting.starts import AXES, all_rotations, at_a_glance, from_nothing, placements, starting_poses, varied
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
@@ -65,7 +65,7 @@ def test_the_table_says_what_the_camera_denies(scene):
 
 
 def test_a_glance_tells_the_body_of_the_scan_from_others(model, scene):
-    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
+    fit = scan_fit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
     x = np.repeat(fit.body.join(POSE, TRANS)[None], 40, axis=0)
     x[1:, 3:12] += np.random.default_rng(1).normal(0, 0.3, (39, 9))
     cost = at_a_glance(fit, x)
@@ -76,13 +76,12 @@ def test_a_glance_tells_the_body_of_the_scan_from_others(model, scene):
 
 def test_neighbouring_twists_are_damped_and_the_root_is_not(model, scene):
     """[SCAPE] Eq. 11: with an endless weight no joint turns, and the body still moves to the scan as a whole."""
-    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
+    fit = scan_fit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
     x = fit.body.join(POSE, TRANS + 0.02)
     x[3:12] += np.random.default_rng(2).normal(0, 0.1, 9)
     turned = []
     for weight in (0.0, 1e9):
-        fit.config = replace(QUICK, twist_weight=weight)
-        ahead, _ = fit.step(x, fit.thin, 0.2)
+        ahead, _ = replace(fit, config=replace(QUICK, twist_weight=weight)).step(x, fit.thin, 0.2)
         assert np.abs(ahead[12:15] - x[12:15]).max() > 1e-3
         turned.append(np.abs(ahead[3:12] - x[3:12]).max())
     assert turned[0] > 1e-3 and turned[1] < 1e-3 * turned[0]
@@ -90,7 +89,7 @@ def test_neighbouring_twists_are_damped_and_the_root_is_not(model, scene):
 
 def test_what_is_laid_on_the_scan_lies_there(model, scene):
     _, points = scene
-    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(points), *NOTHING, QUICK)
+    fit = scan_fit(FixedBody(model.subject(None)), prepare_scan(points), *NOTHING, QUICK)
     x, cost = placements(fit)
     assert (np.diff(cost) >= 0).all()
     best = Surface(fit.mesh(x[0])).closest(points).distances
@@ -105,7 +104,7 @@ def test_half_a_scan_without_landmarks_gives_the_whole_body(model, scene, kept):
     """A worm looks alike from both ends, so its surface is compared and not its vertices."""
     body, points = scene
     some = replace(model, pose_examples=model.pose_examples[:kept])
-    assert len(starting_poses(ScanFit(FixedBody(some.subject(None)), prepare_scan(points), *NOTHING, QUICK))) == (
+    assert len(starting_poses(scan_fit(FixedBody(some.subject(None)), prepare_scan(points), *NOTHING, QUICK))) == (
         21 if kept else 1 + 2 * AXES)
     result = complete(some.subject(None), points, None, QUICK)
     assert result.explained > 0.97 and np.isnan(result.landmark_rms)

@@ -14,7 +14,7 @@ from model.fitting.free_space import free_space_violation
 from model.fitting.limbs import with_limbs
 from model.fitting.rounds import solve_jointly
 from model.fitting.scan import Scan
-from model.fitting.scan_fit import STRANGE, ScanFit
+from model.fitting.scan_fit import STRANGE, ScanFit, scan_fit
 from model.fitting.starts import best_starts, first_starts, going_on
 from model.linear import Subject
 from model.people import person_judgement
@@ -159,7 +159,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
     given = in_metres(person, scan, landmarks, masked, config)
     sized = ScaledBody(person) if config.free_scale else person
-    fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
+    fit = scan_fit(sized, given.cloud, given.vertices, given.points, config)
     few = fit.few()
     starts = going_on(fit, start.pose, start.trans, start.betas) if start else first_starts(fit, few)   # [SCAPE] §7
     tell(1, total)
@@ -266,7 +266,7 @@ def strayed(fit: ScanFit, x: np.ndarray) -> list[str]:
     """What of the body of unknowns (P,) a camera speaks against, and what of a picture's person no part is near."""
     if fit.cloud.person is None:
         return []
-    entered = free_space_violation(fit.cameras, fit.mesh(x).vertices[fit.matched]).excess > 0
+    entered = free_space_violation(fit.data.cameras, fit.mesh(x).vertices[fit.sample.matched]).excess > 0
     lost, found = fit.unexplained(x, fit.thin), []
     if lost.mean() > LOST_LIMB:
         found.append(f"{100 * lost.mean():.1f}% of what was seen of the person has no body near")

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from model.fitting import energy
 from model.fitting.bodies import FixedBody, ShapedBody
 from model.fitting.limbs import reinitialise_limbs
 from model.fitting.scan import ScanPoints, spread
-from model.fitting.scan_fit import ScanFit
+from model.fitting.scan_fit import ScanFit, scan_fit
 from model.fitting.starts import approach, best_starts, first_starts
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import (
@@ -54,7 +53,7 @@ class FrameFit:
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, config: TrackConfig, rate: float) -> None:
         self.body, self.config = body, config
-        self.scan = ScanFit(body, cloud, *NOTHING, config.scan)
+        self.scan = scan_fit(body, cloud, *NOTHING, config.scan)
         self.few = self.scan.some(spread(body.template.vertices, VERTICES), config.body_points)
         self.inertia = inertia(body.n_angles + 3, rate, config.angle_acceleration, config.place_acceleration)
 
@@ -94,10 +93,8 @@ class FrameFit:
 def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, betas: np.ndarray,
                  config: TrackConfig) -> tuple[np.ndarray, np.ndarray]:
     """Betas (K,) that explain frames together, and pose and trans (n, P) of each, from such near the truth."""
-    fit = ScanFit(body, clouds[0], *NOTHING, config.scan)
-    fits = [fit.on(cloud) for cloud in clouds]
-    for one in fits:
-        one.body = copy(body)            # keeps what it has worked out for the pose of its own frame
+    # each with a body of its own, which keeps what it has worked out for the pose of its frame
+    fits = [scan_fit(ShapedBody(body.model), cloud, *NOTHING, config.scan) for cloud in clouds]
     rows = np.concatenate([x, np.tile(betas, (len(x), 1))], axis=1)
     for i in range(4):  # matchings of the frames that tell the shape
         each = [one.matched_at(row, one.thin, _reach(i)).equations(row[None]).dense

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -193,7 +192,7 @@ class ShapedBody(FixedBody):
             self._at = betas.copy()
             self.subject = self.model.subject(betas)
         if self._anchor is None or self._anchor.turned(pose) > self.turn:
-            self._anchor = Anchor(self.model, pose)
+            self._anchor = anchor_at(self.model, pose)
         operator, at = self.subject.points(vertex_ids, weights), self._at
         D, y = self._anchor.carried(vertex_ids.ravel(), pose), self.vertices(x)[vertex_ids]
         D = D.reshape(*vertex_ids.shape, *D.shape[1:])
@@ -236,10 +235,11 @@ class RoughBody(ShapedBody):
     """
 
     def __init__(self, whole: ShapedBody, ids: np.ndarray) -> None:
-        self.__dict__.update(whole.__dict__, known_poses=whole.known_poses, _known_rotations=whole._known_rotations)
+        super().__init__(whole.model)
+        self.known_poses, self._known_rotations = whole.known_poses, whole._known_rotations
         self.ids, self._mean = ids, whole.held(np.zeros(self.n_angles + 3 + self.n_betas)).subject
         self.subject = replace(self._mean, operator=self._mean.points(ids))
-        rest = Anchor(self.model, np.zeros((len(self.skeleton.parents), 3)))
+        rest = anchor_at(self.model, np.zeros((len(self.skeleton.parents), 3)))
         self._rest = rest.some(ids)
         if whole._anchor is None:
             whole._anchor = rest                     # near enough where the joints turn little
@@ -258,22 +258,19 @@ class RoughBody(ShapedBody):
         return CarriedPoints(self.subject.points(vertex_ids), np.zeros(self.n_betas), D, 0.0)
 
 
+@dataclass(frozen=True, eq=False)
 class Anchor:
-    """The derivative of all vertices by betas at one pose, carried to other poses as bones carry skin.
+    """The derivative of vertices by betas at one pose, carried to other poses as bones carry skin; by `anchor_at`.
 
     A vertex keeps its place in the frame of its part, and the part hangs on its joint. Stitching costs a quarter of
     a second, carrying a millisecond; with joints turned by half a radian it is off by a twentieth.
-
-    `pose` (J, 3), radians.
     """
 
-    def __init__(self, model: BodyModel, pose: np.ndarray) -> None:
-        self.skeleton = model.skeleton
-        self.part = model.skeleton.part_of_vertex(model.template)
-        self.R = model.skeleton.part_rotations(pose)
-        D = model.shape_jacobian(pose) if pose.any() else model.rest_shape_jacobian
-        self.joints = (model.joint_regressor @ D.reshape(len(D), -1)).reshape(-1, *D.shape[1:])
-        self.local = D - self.joints[self.part]
+    skeleton: Skeleton
+    part: np.ndarray                 # (L,) of each vertex
+    R: np.ndarray                    # (J, 3, 3), rotations of the parts
+    joints: np.ndarray               # (J, 3, K), derivative of the joints
+    local: np.ndarray                # (L, 3, K), of the vertices, less that of their parts' joints
 
     def turned(self, pose: np.ndarray) -> float:
         """The largest angle by which a part is turned at a pose (J, 3), radians."""
@@ -282,9 +279,7 @@ class Anchor:
 
     def some(self, ids: np.ndarray) -> Anchor:
         """That of some vertices (L,) alone."""
-        out = copy(self)
-        out.part, out.local = self.part[ids], self.local[ids]
-        return out
+        return replace(self, part=self.part[ids], local=self.local[ids])
 
     def carried(self, ids: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(L, 3, K) of some vertices at a pose (J, 3)."""
@@ -303,6 +298,14 @@ class Anchor:
             p = parents[j]
             joints[j] = joints[p] + turn[p] @ (at_joints[j] - at_joints[p])
         return turn[part] @ local + joints[part]
+
+
+def anchor_at(model: BodyModel, pose: np.ndarray) -> Anchor:
+    """The derivative of all vertices of a model by its betas at a pose (J, 3)."""
+    part = model.skeleton.part_of_vertex(model.template)
+    D = model.shape_jacobian(pose) if pose.any() else model.rest_shape_jacobian
+    joints = (model.joint_regressor @ D.reshape(len(D), -1)).reshape(-1, *D.shape[1:])
+    return Anchor(model.skeleton, part, model.skeleton.part_rotations(pose), joints, D - joints[part])
 
 
 def as_body(body: BodyModel | Subject) -> FixedBody:

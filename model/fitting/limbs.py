@@ -145,7 +145,7 @@ class LimbSearch:
         away = cKDTree(skin.places[~mine]).query(fit.coarse.points)[0] > EXPLAINED
         return LimbSearch(fit, limb, ids, np.flatnonzero(fit.part[ids] == limb[-1]), fit.part[ids] != limb[0],
                           fit.coarse.some(away).thinned(SCAN).points, float(away.mean()),
-                          InsideBody.of(skin.places[~mine], skin.normals[~mine]), fit.outside)
+                          InsideBody.of(skin.places[~mine], skin.normals[~mine]), fit.data.outside)
 
     def best(self, drawn: np.ndarray) -> np.ndarray:
         """Those few of unknowns (n, P) that explain most and differ, each after draws closer and closer around it."""
@@ -169,7 +169,7 @@ class LimbSearch:
         fit, config = self.fit, self.fit.config
         pose, trans, _ = fit.body.split(drawn)
         places = fit.body.subject.points(self.ids).evaluate(pose, trans)
-        share = np.isin(fit.part[fit.spread], fit.part[self.ids]).mean()
+        share = np.isin(fit.part[fit.sample.spread], fit.part[self.ids]).mean()
         depth = self.rest.depth(places) * self.loose
         cost = config.contact_weight * share * (np.minimum(depth, cap)**2).mean(axis=1)
         if self.free is not None:

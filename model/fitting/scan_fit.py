@@ -2,9 +2,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -50,97 +49,133 @@ class Skin:
         return OrientedPoints(self.places, self.normals)
 
 
-class ScanFit:
-    """One scan and one body, with what stays the same between the stages.
+class ScanData:
+    """A scan, and what is worked out of it once, however many bodies are fitted to it."""
 
-    `vertices` (L,) int; `points` (L, 3), metres, the landmarks. Of a body of few vertices, see `few`, these have their
-    numbers, `ids` (n,) are those of the template.
-    """
-
-    def __init__(self, body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: np.ndarray,
-                 config: ScanFitConfig) -> None:
-        self.body, self.config = body, config
-        self.points = points
-        self.prior: GaussianPrior = gaussian_prior(body.pose_mean, body.pose_covariance)
-        known = config.joint_limits and len(body.pose_examples) >= LEAST_POSES
-        self.limits = JointLimits.from_poses(body.pose_examples, 1.0, BEYOND) if known else None
-        self.upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
-        self.rng = np.random.default_rng(config.seed)
-        self._is_of(np.arange(len(body.template.vertices)), vertices, config.model_points)
-        self._take(cloud)
-
-    def _is_of(self, ids: np.ndarray, landmarks: np.ndarray, count: int) -> None:
-        """All that belongs to the vertices (n,) of the body; `landmarks` (L,) and `ids` in the template."""
-        template, skeleton = self.body.template, self.body.skeleton
-        self.ids, self.vertices = ids, np.searchsorted(ids, landmarks)
-        self.spread = spread(template.vertices[ids], count)
-        self.ignored = part_vertices(template, skeleton, self.config.ignored_parts)[ids]
-        self.matched = self.spread[~self.ignored[self.spread]]
-        self.part = skeleton.part_of_vertex(template)[ids]
-        self.contact = Contact(skeleton, self.part[self.spread])
-        self.gaps = 0.0                              # metres between vertices, where the skin is between those of few
-        self._skin: tuple[np.ndarray, Skin] | None = None
-
-    def _take(self, cloud: ScanPoints) -> None:
-        """All that belongs to the scan."""
-        config = self.config
+    def __init__(self, cloud: ScanPoints, config: ScanFitConfig) -> None:
         self.cloud = cloud
-        self._thin: ScanPoints | None = None
-        self._coarse: ScanPoints | None = None
         self.tree = OrientedPoints(cloud.points, cloud.normals)
         self.cameras = find_cameras(cloud) if config.free_space_weight > 0 else ()
         self.clothing = None if cloud.masked is None else Clothing(cloud.masked)
-        self._outside: Outside | None = None
+        self.thinned = lru_cache(maxsize=4)(cloud.thinned)
+
+    @cached_property
+    def outside(self) -> Outside | None:
+        """A table of where the cameras saw that nothing is; None without cameras."""
+        return Outside(self.cameras) if self.cameras else None
+
+
+@dataclass(frozen=True, eq=False)
+class BodySample:
+    """The vertices of a body, all or some of them, and which of these are matched.
+
+    Made by `sample_body`; numbers are those of the sample.
+    """
+
+    body: FixedBody
+    ids: np.ndarray                  # (n,) numbers of the vertices on the template
+    spread: np.ndarray               # spread evenly over the body
+    matched: np.ndarray              # of these, those that the scan may say something about
+    ignored: np.ndarray              # (n,) bool, vertices of parts that are not to be matched
+    part: np.ndarray                 # (n,) the part of each vertex
+    contact: Contact
+    gaps: float                      # metres between vertices, where the skin is between those of few
+
+
+def sample_body(body: FixedBody, ids: np.ndarray | None, count: int, ignored_parts: Sequence[str]) -> BodySample:
+    """A body with vertices `ids` (n,) of the template, or with all, of which about `count` are matched."""
+    template, skeleton = body.template, body.skeleton
+    gaps = 0.0 if ids is None else float(np.sqrt(template.face_areas.sum() / len(ids)))
+    all_or_some = np.arange(len(template.vertices)) if ids is None else ids
+    chosen = spread(template.vertices[all_or_some], count)
+    ignored = part_vertices(template, skeleton, ignored_parts)[all_or_some]
+    part = skeleton.part_of_vertex(template)[all_or_some]
+    return BodySample(body if ids is None else body.some(ids), all_or_some, chosen, chosen[~ignored[chosen]], ignored,
+                      part, Contact(skeleton, part[chosen]), gaps)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanFit:
+    """One scan and one body, ready to be fitted: a value, made by `scan_fit`.
+
+    Attributes
+    ----------
+    sample : BodySample
+    data : ScanData
+    template_vertices : (L,) int
+        The landmarks' vertices, by their numbers on the template.
+    points : (L, 3) float, metres
+        Where the landmarks are on the scan.
+    scan_points : int
+        Points of the scan that are matched.
+    rng : numpy.random.Generator
+    """
+
+    sample: BodySample
+    data: ScanData
+    template_vertices: np.ndarray
+    points: np.ndarray
+    prior: GaussianPrior
+    limits: JointLimits | None
+    upright: Upright | None
+    scan_points: int
+    config: ScanFitConfig
+    rng: np.random.Generator
+    _last: list[tuple[np.ndarray, Skin]] = field(default_factory=list, init=False)      # the skin asked for last
+
+    @property
+    def body(self) -> FixedBody:
+        return self.sample.body
+
+    @property
+    def ids(self) -> np.ndarray:
+        """(n,) numbers of the vertices on the template."""
+        return self.sample.ids
+
+    @property
+    def part(self) -> np.ndarray:
+        """(n,) the part of each vertex."""
+        return self.sample.part
+
+    @property
+    def cloud(self) -> ScanPoints:
+        return self.data.cloud
+
+    @cached_property
+    def vertices(self) -> np.ndarray:
+        """(L,) the landmarks' vertices, by their numbers in the sample."""
+        return np.searchsorted(self.sample.ids, self.template_vertices)
+
+    @property
+    def thin(self) -> ScanPoints:
+        """The points of the scan that are matched."""
+        return self.data.thinned(self.scan_points)
+
+    @property
+    def coarse(self) -> ScanPoints:
+        """Few points of the scan, for the first rounds of a search."""
+        return self.data.thinned(self.config.scan_points // 4)
 
     def on(self, cloud: ScanPoints) -> ScanFit:
-        """The same body with another scan, without landmarks; all that belongs to the body is shared."""
-        out = copy(self)
-        out.vertices, out.points = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        out._take(cloud)
-        return out
+        """The same body with another scan, without landmarks."""
+        return replace(self, data=ScanData(cloud, self.config), template_vertices=np.zeros(0, dtype=np.int64),
+                       points=np.zeros((0, 3)))
 
     def held(self, x: np.ndarray) -> ScanFit:
         """The same scan with the body that has the shape of unknowns (P,), as one of known shape."""
-        out = copy(self)
-        out.body, out._skin = self.body.held(x), None
-        return out
+        return replace(self, sample=replace(self.sample, body=self.body.held(x)))
+
+    def some(self, ids: np.ndarray, matched: int) -> ScanFit:
+        """The same with some vertices of the body, whose normals rotate with their parts; so many are matched."""
+        ids = np.union1d(ids, self.template_vertices)
+        return replace(self, sample=sample_body(self.body, ids, matched, self.config.ignored_parts))
 
     def few(self) -> ScanFit:
         """The same with few vertices of the body and points of the scan: for a search."""
         template, skeleton = self.body.template, self.body.skeleton
         rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
-        out = self.some(np.concatenate([spread(template.vertices, FEW), *rings]), self.config.model_points // 2)
-        out._thin = self.cloud.thinned(self.config.scan_points // 2)
-        return out
-
-    def some(self, ids: np.ndarray, matched: int) -> ScanFit:
-        """The same with some vertices of the body, whose normals rotate with their parts; so many are matched."""
-        out, ids = copy(self), np.union1d(ids, self.vertices)
-        out.body = self.body.some(ids)
-        out._is_of(ids, self.vertices, matched)
-        out.gaps = float(np.sqrt(self.body.template.face_areas.sum() / len(ids)))
-        return out
-
-    @property
-    def thin(self) -> ScanPoints:
-        """The points of the scan that are matched."""
-        if self._thin is None:
-            self._thin = self.cloud.thinned(self.config.scan_points)
-        return self._thin
-
-    @property
-    def coarse(self) -> ScanPoints:
-        """Few points of the scan, for the first rounds of a search."""
-        if self._coarse is None:
-            self._coarse = self.cloud.thinned(self.config.scan_points // 4)
-        return self._coarse
-
-    @property
-    def outside(self) -> Outside | None:
-        """A table of where the cameras saw that nothing is; None without cameras."""
-        if self._outside is None and self.cameras:
-            self._outside = Outside(self.cameras)
-        return self._outside
+        some = self.some(np.concatenate([spread(template.vertices, FEW), *rings]), self.config.model_points // 2)
+        return replace(some, scan_points=self.config.scan_points // 2)
 
     def mesh(self, x: np.ndarray) -> Mesh:
         """The predicted mesh of unknowns (P,)."""
@@ -148,14 +183,14 @@ class ScanFit:
 
     def skin(self, x: np.ndarray) -> Skin:
         """The vertices of unknowns (P,); the last ones are kept."""
-        if self._skin is None or not np.array_equal(x, self._skin[0]):
+        if not self._last or not np.array_equal(x, self._last[0][0]):
             places = self.body.vertices(x)
             if len(places) == len(self.body.template.vertices):
                 normals = self.body.template.with_vertices(places).vertex_normals
             else:
                 normals = self._turned_normals(np.arange(len(places)), self.body.split(x)[0])
-            self._skin = x.copy(), Skin(places, normals)
-        return self._skin[1]
+            self._last[:] = [(x.copy(), Skin(places, normals))]
+        return self._last[0][1]
 
     def unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
         """(n,) bool: points of the scan with nothing of the body near."""
@@ -169,10 +204,10 @@ class ScanFit:
 
     def without_ignored(self, cloud: ScanPoints, predicted: Mesh) -> ScanPoints:
         """A scan without its points on parts of the body that are not to be matched."""
-        if not self.ignored.any():
+        if not self.sample.ignored.any():
             return cloud
         found = OrientedPoints(predicted.vertices, predicted.vertex_normals).match(cloud.points, cloud.normals)
-        return cloud.some(~(self.ignored[found.index] & found.valid))
+        return cloud.some(~(self.sample.ignored[found.index] & found.valid))
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
         """How badly a body explains scan and landmarks, for the choice between starts."""
@@ -181,8 +216,8 @@ class ScanFit:
         off = self.thin.points - skin.places[found.index]
         along = np.einsum("nd,nd->n", off, skin.normals[found.index])
         beside = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0))
-        squared = np.where(found.valid, along**2 + np.maximum(beside - self.gaps, 0)**2, cap**2)
-        apart = (np.minimum(squared, cap**2) * ~(found.valid & self.ignored[found.index])).mean()
+        squared = np.where(found.valid, along**2 + np.maximum(beside - self.sample.gaps, 0)**2, cap**2)
+        apart = (np.minimum(squared, cap**2) * ~(found.valid & self.sample.ignored[found.index])).mean()
         for weight, ids, found_out in self.objections(skin):
             apart += weight * (np.minimum(found_out.excess, cap)**2).sum() / len(ids)
         marked = ((skin.places[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
@@ -253,15 +288,15 @@ class ScanFit:
 
     def matches(self, skin: Skin, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
         """Vertices, scan points, their normals and weights, by closest points both ways."""
-        config, mine = self.config, self.matched
+        config, mine = self.config, self.sample.matched
         there = skin.tree.match(scan.points, scan.normals, reach, MIN_COSINE)
-        back = self.tree.match(skin.places[mine], skin.normals[mine], reach, MIN_COSINE)
+        back = self.data.tree.match(skin.places[mine], skin.normals[mine], reach, MIN_COSINE)
         hit = back.index
         off = skin.places[mine] - self.cloud.points[hit]
         along = np.einsum("nd,nd->n", off, self.cloud.normals[hit])
         beside = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0))
         inner = back.valid & ~self.cloud.border[hit] & (beside < 2 * self.cloud.spacing + 0.3 * np.abs(along))
-        a, b = there.valid & ~self.ignored[there.index], inner
+        a, b = there.valid & ~self.sample.ignored[there.index], inner
         ids = np.concatenate([there.index[a], mine[b]])
         target = np.concatenate([scan.points[a], self.cloud.points[hit[b]]])
         normal = np.concatenate([scan.normals[a], self.cloud.normals[hit[b]]])
@@ -271,9 +306,9 @@ class ScanFit:
         if self.cloud.person is not None:
             under = np.einsum("nd,nd->n", normal, skin.places[ids] - target) < 0
             weights = np.where(under, UNDER_CLOTHES, 1.0) * weights
-        if self.clothing is None:
+        if self.data.clothing is None:
             return ids, target, normal, weights
-        under, over, away = self.clothing.below(skin.places[mine], skin.normals[mine])
+        under, over, away = self.data.clothing.below(skin.places[mine], skin.normals[mine])
         loose = np.full(under.sum(), EVIDENCE / config.clothing_sd**2 / len(mine))
         return (np.concatenate([ids, mine[under]]), np.concatenate([target, over[under]]),
                 np.concatenate([normal, away[under]]), np.concatenate([weights, loose]))
@@ -296,14 +331,28 @@ class ScanFit:
     def objections(self, skin: Skin) -> list[tuple[float, np.ndarray, Violation]]:
         """What says that vertices cannot be where they are: its weight, and the vertices."""
         config, places, normals = self.config, skin.places, skin.normals
-        mine = self.matched
-        found = [(config.contact_weight, self.spread, self.contact.violation(places[self.spread],
-                                                                             normals[self.spread]))]
-        if self.cameras:
-            found.append((config.free_space_weight, mine, free_space_violation(self.cameras, places[mine])))
-        if self.clothing is not None:
-            found.append((1.0, mine, self.clothing.violation(places[mine], normals[mine])))
+        mine = self.sample.matched
+        found = [(config.contact_weight, self.sample.spread, self.sample.contact.violation(places[self.sample.spread],
+                                                                             normals[self.sample.spread]))]
+        if self.data.cameras:
+            found.append((config.free_space_weight, mine, free_space_violation(self.data.cameras, places[mine])))
+        if self.data.clothing is not None:
+            found.append((1.0, mine, self.data.clothing.violation(places[mine], normals[mine])))
         return found
+
+
+def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: np.ndarray, config: ScanFitConfig
+             ) -> ScanFit:
+    """A body and a scan, ready to be fitted.
+
+    `vertices` (L,) int and `points` (L, 3), metres: the landmarks on the template and on the scan, none or more.
+    """
+    sample = sample_body(body, None, config.model_points, config.ignored_parts)
+    prior, known = gaussian_prior(body.pose_mean, body.pose_covariance), len(body.pose_examples) >= LEAST_POSES
+    limits = JointLimits.from_poses(body.pose_examples, 1.0, BEYOND) if config.joint_limits and known else None
+    upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
+    return ScanFit(sample, ScanData(cloud, config), vertices, points, prior, limits, upright,
+                   config.scan_points, config, np.random.default_rng(config.seed))
 
 
 @dataclass(frozen=True, eq=False)

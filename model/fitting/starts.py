@@ -67,7 +67,7 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
     body = fit.body.held(mean)
     follow = body.follow(vertices, mean)
     x, _ = search(body, follow, points, sd, fit.prior, AXES)
-    x = x[distinct(body.subject.points(few.ids[few.spread]).evaluate(*body.split(x)[:2]), CANDIDATES)]
+    x = x[distinct(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), CANDIDATES)]
     drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, fit.config.random_starts, fit.rng)
                                 for start in x)])
     drawn = np.hstack([drawn, np.zeros((len(drawn), fit.body.n_betas))])
@@ -81,8 +81,8 @@ def at_a_glance(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     places, normals = fit.posed_points(ids, *fit.body.split(x)[:2])
     apart = np.array([_distances(y, n, np.eye(3)[None], np.zeros((1, 3)), scan)[0]
                       for y, n in zip(places, normals, strict=True)])
-    if fit.outside is not None:
-        apart += fit.config.free_space_weight * (fit.outside.at(places)**2).mean(axis=1)
+    if fit.data.outside is not None:
+        apart += fit.config.free_space_weight * (fit.data.outside.at(places)**2).mean(axis=1)
     unlikely = sum(term.energy for term in fit.prior_terms(x).values())
     return EVIDENCE / fit.config.scan_sd**2 * apart + unlikely
 
@@ -122,7 +122,7 @@ def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
 
 def places_of(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     """Some vertices (n, L, 3) of bodies (n, P), in one shape, to tell which are alike."""
-    return fit.body.subject.points(fit.spread).evaluate(*fit.body.split(x)[:2])
+    return fit.body.subject.points(fit.sample.spread).evaluate(*fit.body.split(x)[:2])
 
 
 def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
@@ -174,9 +174,9 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     poses, turns, lift = starting_poses(fit), *placed_turns(fit.upright)
     scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.posed_points(ids, poses)
-    toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.cameras]).reshape(-1, 3)
+    toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.data.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    table, rough = fit.outside, np.swapaxes(turns, 1, 2).astype(np.float32)
+    table, rough = fit.data.outside, np.swapaxes(turns, 1, 2).astype(np.float32)
     cost, shift = np.zeros((len(poses), len(turns))), np.empty((len(poses), len(turns), 3))
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
         shift[a] = _laid(y, n, turns, toward, scan.points) if fit.upright is None else \

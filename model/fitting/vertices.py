@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -158,11 +157,10 @@ class ShapeFitter:
         return self.model.points(self._chosen, n_betas=self.n_betas)
 
     def first(self, n_betas: int) -> ShapeFitter:
-        """The fitter of the first components only, which shares what has been prepared."""
-        if not 0 < n_betas <= self.n_betas:
+        """The fitter of the first components only, with points that are prepared already."""
+        if n_betas > self.n_betas:
             raise ValueError(f"n_betas: expected 1..{self.n_betas}, got {n_betas}")
-        fewer = copy(self)
-        fewer.config, fewer.n_betas = replace(self.config, n_betas=n_betas), n_betas
+        fewer = ShapeFitter(self.model, replace(self.config, n_betas=n_betas))
         fewer._points = self._points.first(n_betas)
         return fewer
 
