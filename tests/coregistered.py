@@ -3,14 +3,15 @@ import sys
 from unittest import mock
 
 from model.coregistration import cli
-from model.coregistration.config import CoregistrationConfig, ModelFitConfig
+from model.coregistration.config import CoregistrationConfig
+from model.fitting.settings import ScanFitConfig
 from model.learning.config import LearnConfig
 from scanprep import command_line
 from scanprep.batch.pool import Workers
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 QUICK = CoregistrationConfig(
-    fit=ModelFitConfig(axes=2, turns=2),
+    fit=ScanFitConfig(rounds=4, scan_points=800, model_points=400, random_starts=10),
     registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
                                            GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05))),
     learn=LearnConfig(refinements=1), rounds=2, failed=0.05, workers=Workers(1))

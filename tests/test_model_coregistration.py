@@ -11,14 +11,18 @@ from model_bodies import random_poses, worm_model
 
 from model import coregister, learn_scape, register_with_model
 from model.bilinear import PosedPoints
-from model.coregistration.attraction import apart, attraction, towards
-from model.coregistration.modelfit import ModelFit
+from model.coregistration.single import apart
+from model.fitting.bodies import as_body, resized
+from model.fitting.rounds import meet_vertices
+from model.fitting.scan import prepare_scan
+from model.fitting.scan_fit import scan_fit
 from model.priors import typical_poses, whitening
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
 from scanprep.registration.nonrigid import register
 
+NOTHING = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
 NEAR = np.array([0, 0.1, 0.05]), np.array([0.1, 0.0, -0.15])
 
 
@@ -40,8 +44,7 @@ def test_a_scan_that_plain_registration_gets_wrong_is_right_with_the_model(body,
 
 def test_without_any_start_or_landmark_the_pose_is_found(body, crab_model):
     truth = bent(body, *FAR) @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]).T + [3, 1, -2]
-    turned = replace(QUICK, fit=replace(QUICK.fit, turns=4, up=(0.0, 0.0, 1.0)))
-    found = register_with_model(crab_model.subject(), scan_of(body, truth), config=turned)
+    found = register_with_model(crab_model.subject(), scan_of(body, truth), config=QUICK)
     assert mean_mm(found.mesh.vertices, truth) < 4 and found.starts > 1
 
 
@@ -81,26 +84,11 @@ def test_betas_are_found_with_the_pose():
     rng = np.random.default_rng(1)
     pose, betas = 0.3 * random_poses(worm, 1, rng)[0], np.array([1.5, -1.0, 0.5])
     truth = worm.vertices(pose, betas, [0.02, 0, 0.01])
-    config = replace(COARSE, fit=replace(QUICK.fit, shape_prior=1e-5, search=(), refine=(
-        *QUICK.fit.refine, replace(QUICK.fit.refine[-1], reach=0.02, prior=1e-5, rounds=20, slide=0.01))))
+    sharp = replace(COARSE, fit=replace(QUICK.fit, scan_sd=0.001, landmark_sd=0.001))
     marks = np.arange(0, 398, 40)
-    found = register_with_model(worm, scan_of(worm.template, truth), (marks, truth[marks]), pose, config)
+    found = register_with_model(worm, scan_of(worm.template, truth), (marks, truth[marks]), pose, sharp)
     assert found.betas is not None and found.betas == pytest.approx(betas, abs=0.3)
     assert mean_mm(found.mesh.vertices, truth) < 5
-
-
-def test_residual_is_the_energy_of_all_matches(body):
-    """Two matches of one point make one quadratic of the same value up to a constant."""
-    target = target_of(body)
-    x, n = body.vertices[::7] + 0.01 * body.vertex_normals[::7], body.vertex_normals[::7]
-    share = np.full(len(x), 1 / len(x))
-    wanted = attraction(x, n, share, target, 0.1, 0.3, 0.05)
-    assert np.sum(wanted.residual(wanted.place)**2) == pytest.approx(0)
-    across = attraction(x, n, share, target, 0.1, 1e-4, 0.05)
-    along = np.cross(n, [0.3, 0.5, 0.8])
-    slid, lifted = (np.sum(across.residual(across.place + 0.005 * d)**2) for d in (along, n))
-    assert slid < 0.2 * lifted
-    assert np.sum(towards(x, share).residual(x + [0, 0, 0.1])**2) == pytest.approx(0.01)
 
 
 def test_what_faces_away_does_not_explain(body):
@@ -121,14 +109,30 @@ def test_derivatives_agree_with_finite_differences(known):
 
 
 def test_vertices_without_weight_do_not_count(body, crab_model):
-    fit = ModelFit(crab_model.subject(), target_of(body), None, QUICK.fit)
+    free = replace(QUICK.fit, prior_weight=1e-9)
+    fit = scan_fit(as_body(crab_model.subject()), prepare_scan(body), *NOTHING, free)
     pose = np.array([[0.1, 0, 0.2], [0, 0.5, 0.1], [0.1, -0.4, 0]])
     vertices = np.asarray(crab_model.subject().vertices(pose, np.array([0.1, 0, 0])))
     wrong = body.vertices[:, 1] > 0.02
-    spoilt = vertices + 0.3 * wrong[:, None]
-    x = fit.taken_from(spoilt, (~wrong).astype(float), np.zeros(12), 1e-6, 40)
-    np.testing.assert_allclose(fit.split(x)[0], pose, atol=2e-3)
-    np.testing.assert_allclose(fit.split(x)[1], [0.1, 0, 0], atol=1e-3)
+    x = meet_vertices(fit, np.zeros(12), vertices + 0.3 * wrong[:, None], (~wrong).astype(float))
+    np.testing.assert_allclose(fit.body.split(x)[0], pose, atol=2e-3)
+    np.testing.assert_allclose(fit.body.split(x)[1], [0.1, 0, 0], atol=1e-3)
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["subject", "betas"])
+def test_a_body_of_another_size_has_the_same_pose_and_betas(known):
+    """Points times a factor about where the root stands; derivatives agree with finite differences."""
+    worm = worm_model()
+    person = as_body(worm.subject([1.0, 0, 0]) if known else worm)
+    large, x = resized(person, 2.5), np.random.default_rng(3).normal(0, 0.3, person.n_angles + 3 + person.n_betas)
+    stand = person.subject.origin + person.split(x)[1]
+    np.testing.assert_allclose(large.vertices(x) - stand, 2.5 * (person.vertices(x) - stand), atol=1e-6)
+    ids = np.array([3, 50, 200, 390])
+    points = large.near(ids, x)
+    y, columns = points.columns(x)
+    np.testing.assert_allclose(y, large.vertices(x)[ids], atol=1e-6)
+    np.testing.assert_allclose(np.moveaxis(columns, 0, -1), differences(points.positions, x), atol=1e-6)
+    np.testing.assert_allclose(large.held(x).vertices(x[:person.n_angles + 3]), large.vertices(x), atol=1e-6)
 
 
 def test_prior_is_the_shrunk_gaussian(crab_model):
@@ -153,7 +157,7 @@ def test_one_scan_refuses_what_it_cannot_use(body, crab_model, given, words):
 def test_rounds_refuse_what_they_cannot_use(body, crab_model):
     with pytest.raises(ValueError, match="subjects: expected 2"):
         coregister(crab_model, [body, body], subjects=["a"])
-    strict = replace(QUICK, rounds=1, fit=replace(QUICK.fit, axes=0, turns=1))
+    strict = replace(QUICK, rounds=1)
     elsewhere = Mesh(np.random.default_rng(0).normal(0, 0.4, (3000, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(ValueError, match="only 0 of 2"):
         coregister(crab_model, [elsewhere.vertices, elsewhere.vertices], None, strict)

@@ -33,7 +33,7 @@ def made_of(template, vertices, explained=1.0):
     """A registration as it would have come, without the work."""
     mesh, N = template.with_vertices(vertices), len(vertices)
     return ModelRegistration(mesh, mesh, np.zeros((4, 3)), np.zeros(3), None, np.ones(N, dtype=bool), np.zeros(N), 0.0,
-                             explained, 0.0, np.nan, 0, np.ones(N), 0.0, 1)
+                             explained, 0.0, np.nan, 0, np.ones(N), 1)
 
 
 def test_the_person_with_most_scans_teaches_poses_and_others_shapes(monkeypatch):
@@ -146,7 +146,7 @@ def test_only_what_depends_on_a_change_is_made_anew(story, asked, tmp_path, what
         elif what == "the model":
             model = replace(first, pose_mean=first.pose_mean + 1e-9)        # of the same training set
         elif what == "settings":
-            config = replace(config, fit=replace(QUICK.fit, axes=3))
+            config = replace(config, fit=replace(QUICK.fit, seed=3))
         elif what == "what fails":
             config = replace(config, failed=0.5 * QUICK.failed)
         elif what == "learning":

@@ -27,7 +27,7 @@ from .config import CoregistrationConfig
 from .rounds import Coregistration, coregister, coregistration_doubts, coregistration_problem
 from .single import Landmarks
 
-FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "score", "starts")
+FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "starts")
 
 ScansArg = Annotated[Path, Place("SCANS")]
 

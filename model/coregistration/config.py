@@ -5,94 +5,11 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from scanprep.batch.pool import Workers
-from scanprep.ranges import FLAG, Cell, Count, Positive, Settings, Share, Signed
+from scanprep.ranges import FLAG, Count, Settings, Share
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
+from ..fitting.settings import ScanFitConfig
 from ..learning.config import LearnConfig
-
-
-@dataclass(frozen=True)
-class PoseStage(Settings):
-    """One stage of bringing the model to a scan by its pose and betas alone. Lengths are shares of √area.
-
-    Attributes
-    ----------
-    reach : float
-        Farthest match that counts.
-    slide : float
-        Force of a match along the surface, as a share of that across it.
-    prior : float
-        Distance to the data that a joint one standard deviation away from the training poses is worth.
-    landmarks : float
-        The share of the surface that one landmark weighs as much as.
-    rounds : int
-        Times that matches are sought anew.
-    detail : float
-        Spacing to which the scan is thinned.
-    sample : int
-        Vertices of the model that are matched.
-    """
-
-    reach: Positive
-    slide: float
-    prior: Positive
-    landmarks: float
-    rounds: Count = 5
-    detail: Cell = 0.02
-    sample: Count = 600
-
-
-@dataclass(frozen=True)
-class ModelFitConfig(Settings):
-    """Settings of bringing the model to a scan.
-
-    Attributes
-    ----------
-    search : stages that every start goes through
-    refine : stages that follow, once for starts that end alike
-    axes : int
-        Typical poses are the mean of the training poses and a step both ways along so many main directions.
-    turns : int
-        Without landmarks, each typical pose is turned so often about the vertical.
-    up : (3,) float, optional
-        The vertical; by default the coordinate axis along which the template is longest.
-    normal_weight : float
-        Distance, as a share of √area, that a difference of normals of one is worth when matching.
-    n_betas : int
-        Most shape components used while the pose is sought.
-    shape_prior : float
-        Distance to the data, as a share of √area, that one standard deviation of a beta is worth.
-    least : int
-        Starts that are tried in any case: an arm turned about itself explains a scan as well.
-    agreed : int
-        After more than `turns`, none is tried once so many have ended alike, better than all others.
-    near, enough : float
-        Nor is any, after the least, once the share `enough` of the scan's points is nearer to the body than the share
-        `near` of √area.
-    """
-
-    search: tuple[PoseStage, ...] = (
-        PoseStage(0.25, 0.5, 0.003, 0.02, 5, 0.04, 250),
-        PoseStage(0.15, 0.3, 0.002, 0.02, 5, 0.04, 250),
-    )
-    refine: tuple[PoseStage, ...] = (
-        PoseStage(0.1, 0.2, 0.0015, 0.01),
-        PoseStage(0.06, 0.1, 0.001, 0.01),
-        PoseStage(0.04, 0.05, 0.0007, 0.01),
-    )
-    axes: int = 6
-    turns: Count = 8
-    up: tuple[Signed, Signed, Signed] | None = None
-    normal_weight: float = 0.05
-    n_betas: int = 20
-    shape_prior: Positive = 0.0005
-    least: Count = 2
-    agreed: Count = 4
-    near: Positive = 0.02
-    enough: Share = 0.98
-
-
-EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
 
 # the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
 NEAR = RegistrationConfig(graph=(
@@ -109,7 +26,8 @@ class CoregistrationConfig(Settings):
 
     Attributes
     ----------
-    fit : ModelFitConfig
+    fit : ScanFitConfig
+        How the model is brought to a scan.
     registration : RegistrationConfig
         Of the template as the model predicts it, which resists by the predicted shape.
     learn : LearnConfig
@@ -123,7 +41,7 @@ class CoregistrationConfig(Settings):
     workers : Workers
     """
 
-    fit: ModelFitConfig = field(default_factory=ModelFitConfig)
+    fit: ScanFitConfig = field(default_factory=ScanFitConfig)
     registration: RegistrationConfig = NEAR
     learn: LearnConfig = field(default_factory=LearnConfig)
     rounds: Annotated[Count, FLAG] = 3

@@ -1,23 +1,33 @@
 """One scan registered with a model as prior."""
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.correspondence.correspondences import checked_pairs
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.target import target_of
+from scanprep.geometry.surface import Surface
+from scanprep.geometry.target import Target, orient, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.threads import one_thread
 
 from ..body import BodyModel
+from ..features import twists
+from ..fitting.bodies import FixedBody, as_body, resized
+from ..fitting.limbs import limbs_amiss, reinitialise_limbs, with_limbs
+from ..fitting.rounds import meet_vertices, solve_jointly
+from ..fitting.scan import prepare_scan
+from ..fitting.scan_fit import ScanFit, scan_fit
+from ..fitting.starts import best_starts, first_starts
 from ..linear import Subject
-from .config import EXPLAINED, CoregistrationConfig
-from .modelfit import ModelFit
+from .config import CoregistrationConfig
 
 Landmarks = tuple[np.ndarray, np.ndarray]
+PERSON = 1.36                        # metres: root of the surface area of a person
+EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
+ENOUGH = 0.98                        # share of a scan that a start must explain for no other to be sought
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +56,8 @@ class ModelRegistration:
         Triangles that face against their surroundings.
     confidence : (N,) float
         From 0, made up by the model, to 1: there were data here.
-    score, starts : float, metres, and int
-        How far scan and model were apart, of the best start, and how many were tried.
+    starts : int
+        How many starts were tried.
     """
 
     mesh: Mesh
@@ -63,7 +73,6 @@ class ModelRegistration:
     landmark_rms: float
     inverted: int
     confidence: np.ndarray
-    score: float
     starts: int
 
 
@@ -73,7 +82,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
                         progress: Callable[[int, int], None] | None = None) -> ModelRegistration:
     """Bring the template onto a scan with a model of it as prior.
 
-    1. Pose, place and betas are sought from several starts by matches alone.
+    1. Pose, place and betas are sought as in a partial scan: from several starts, with limbs tried elsewhere.
     2. The template as the model predicts it is aligned with the scan, which it follows where there are data; along
        the surface and elsewhere it keeps the predicted shape.
     3. Pose and betas are taken from where the alignment has data.
@@ -86,7 +95,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     landmarks : (L,) int and (L, 3) float, metres, optional
         Vertices of the template and where they are on the scan.
     start : (N, 3) float, metres, or (J, 3) float, radians, optional
-        An earlier registration, right or wrong, or a pose; it is tried beside the typical poses.
+        An earlier registration, right or wrong, or a pose; others are sought where it does not explain the scan.
     config : CoregistrationConfig, optional
     progress : callable, optional
         Called as progress(done, total).
@@ -100,32 +109,80 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     """
     config = config or CoregistrationConfig()
     tell = progress or (lambda done, total: None)
-    fit = ModelFit(body, target_of(scan), landmarks, config.fit)
-    given = [] if start is None else [_given(fit, start)]
-    best, tried = fit.best_of(itertools.chain(given, fit.starts()))
+    vertices, points = checked_pairs(body.template, *(landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))),
+                                     "landmarks", 0)
+    target = target_of(scan)
+    # lengths of the search are those of a person: bodies of another size are searched for as large as one
+    size = float(np.sqrt(body.template.face_areas.sum()))
+    factor = 1.0 if 0.5 < size / PERSON < 2 else PERSON / size
+    person = as_body(body)
+    fit = scan_fit(person if factor == 1 else resized(person, factor), prepare_scan(scan, metres=factor), vertices,
+                   factor * points, config.fit)
+    # 1. pose, place and betas by matches alone
+    x, tried = _pose_and_shape(fit, None if start is None else _given(fit, start, factor))
     tell(1, 2)
-    aligned = register(fit.predicted(best.x), scan, None, config.registration)
-    x = fit.taken_from(aligned.mesh.vertices, aligned.confidence, best.x, config.fit.refine[-1].prior)
+    # 2. the template as the model predicts it is aligned with the scan
+    aligned = register(_predicted(person, x, factor), scan, None, config.registration)
+    # 3. pose and betas from where there are data
+    x = meet_vertices(fit, x, factor * aligned.mesh.vertices, aligned.confidence)
     tell(2, 2)
-    predicted, (pose, trans, betas) = fit.predicted(x), fit.split(x)
-    mesh, seen = aligned.mesh, aligned.seen
+    predicted, mesh, seen = _predicted(person, x, factor), aligned.mesh, aligned.seen
+    pose, trans, betas = person.split(_own_size(person, x, factor))
     off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
-    off_marks = np.linalg.norm(mesh.vertices[fit.marks] - fit.marked, axis=1)
-    return ModelRegistration(mesh, predicted, pose, trans, betas, seen, aligned.distances, aligned.rms,
-                             fit.explained(mesh, 0.01, EXPLAINED), _rms(off_model), _rms(off_marks),
-                             aligned.inverted, aligned.confidence, best.score, tried)
+    off_marks = np.linalg.norm(mesh.vertices[vertices] - points, axis=1)
+    limit = EXPLAINED * size
+    explained = float((apart(mesh, orient(target.thinned(0.01 * size), mesh, limit), limit) < limit).mean())
+    return ModelRegistration(mesh, predicted, twists(pose), trans, betas if person.n_betas else None, seen, aligned.distances,
+                             aligned.rms, explained, _rms(off_model), _rms(off_marks), aligned.inverted,
+                             aligned.confidence, tried)
+
+
+def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray, int]:
+    """The best unknowns (P,) for a scan, and how many starts were tried: those given (1, P) first, all if need be."""
+    few, ends, tried = fit.few(), [], 0
+    if given is not None:
+        ends, tried = [reinitialise_limbs(few, best_starts(few, given)[0])], 1
+    if not ends or limbs_amiss(few, ends[0]) or few.unexplained(ends[0], few.thin).mean() > 1 - ENOUGH:
+        starts = first_starts(fit, few)
+        tried += len(starts)
+        ends.append(with_limbs(fit, few, best_starts(few, starts))[0])
+    best = min(ends, key=few.misfit)
+    return solve_jointly(fit, few, best, lambda done: None).x, tried
+
+
+def _given(fit: ScanFit, start: np.ndarray, factor: float) -> np.ndarray:
+    """Unknowns (1, P) of a start given as vertices of the template or as a pose."""
+    start, body = np.asarray(start, dtype=np.float64), fit.body
+    shapes = body.template.vertices.shape, body.pose_mean.shape
+    if start.shape not in shapes or not np.isfinite(start).all():
+        raise ValueError(f"start: expected finite vertices {shapes[0]} or a pose {shapes[1]}, got {start.shape}")
+    registered = start.shape == shapes[0]
+    onto = factor * start if registered else fit.cloud.points
+    pose = body.skeleton.pose_of(body.skeleton.fit_rotations(body.template, onto)) if registered else start
+    x = body.join(pose, np.zeros(3))
+    x[body.n_angles:body.n_angles + 3] = onto.mean(axis=0) - body.vertices(x).mean(axis=0)
+    return (meet_vertices(fit, x, onto, np.ones(len(onto))) if registered else x)[None]
+
+
+def _own_size(person: FixedBody, x: np.ndarray, factor: float) -> np.ndarray:
+    """Unknowns (P,) of a body at its own size, of those of the same body times a factor."""
+    out, place = x.copy(), slice(person.n_angles, person.n_angles + 3)
+    out[place] = (person.subject.origin + x[place]) / factor - person.subject.origin
+    return out
+
+
+def _predicted(person: FixedBody, x: np.ndarray, factor: float) -> Mesh:
+    """The body's own mesh, of unknowns (P,) of the same body times a factor."""
+    return person.template.with_vertices(person.vertices(_own_size(person, x, factor)))
+
+
+def apart(mesh: Mesh, target: Target, limit: float) -> np.ndarray:
+    """Distances (n,) of scan points to the nearest place of a mesh, metres; at most `limit`, which it is where the two
+    face away from each other."""
+    found = Surface(mesh).closest(target.points)
+    facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], target.normals) > 0
+    return np.where(facing, np.minimum(found.distances, limit), limit)
 
 
 def _rms(distances: np.ndarray) -> float:
     return float(np.sqrt((distances**2).mean())) if len(distances) else np.nan
-
-
-def _given(fit: ModelFit, start: np.ndarray) -> np.ndarray:
-    """Unknowns of a start given as vertices or as a pose."""
-    start = np.asarray(start, dtype=np.float64)
-    shapes = fit.body.template.vertices.shape, fit.pose_mean.shape
-    if start.shape not in shapes or not np.isfinite(start).all():
-        raise ValueError(f"start: expected finite vertices {shapes[0]} or a pose {shapes[1]}, got {start.shape}")
-    if start.shape == shapes[0]:
-        return fit.start_from(start, np.ones(len(start)))
-    return fit.placed(start, fit.target.points)

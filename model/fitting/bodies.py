@@ -258,6 +258,72 @@ class RoughBody(ShapedBody):
         return CarriedPoints(self.subject.points(vertex_ids), np.zeros(self.n_betas), D, 0.0)
 
 
+class ResizedBody(FixedBody):
+    """A body of unknown shape with all lengths times a factor; by `resized`.
+
+    Its place is that of the root's joint, which stands where it stood.
+    """
+
+    def __init__(self, inner: FixedBody, factor: float) -> None:
+        known = resized(inner.held(np.zeros(inner.n_angles + 3 + inner.n_betas)), factor)
+        super().__init__(known.subject)
+        self.inner, self.factor, self.n_betas = inner, factor, inner.n_betas
+        self.known_poses = inner.known_poses
+
+    def held(self, x: np.ndarray) -> FixedBody:
+        """The body with the shape it has at x (P,), as one of known shape."""
+        return resized(self.inner.held(x), self.factor)
+
+    def some(self, ids: np.ndarray) -> FixedBody:
+        return ResizedBody(self.inner.some(ids), self.factor)
+
+    def vertices(self, x: np.ndarray) -> np.ndarray:
+        """The predicted mesh (N, 3) of unknowns (P,)."""
+        return resize(self.inner.vertices(x), self.subject.origin + self.split(x)[1], self.factor)
+
+    def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
+        return ResizedPoints(self.inner.near(vertex_ids, x), self.subject.origin, self.n_angles, self.factor)
+
+
+@dataclass(frozen=True, eq=False)
+class ResizedPoints:
+    """Points of a body with all lengths times a factor."""
+
+    inner: NearPoints
+    origin: np.ndarray               # (3,) metres, where the root's joint stands without a place
+    n_angles: int
+    factor: float
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """(L, 3) metres, of unknowns (P,)."""
+        return resize(self.inner.positions(x), self.origin + x[self.n_angles:self.n_angles + 3], self.factor)
+
+    def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        y, columns = self.inner.columns(x)
+        columns = self.factor * columns
+        columns[self.n_angles:self.n_angles + 3] = np.eye(3)[:, None]          # the place is not resized
+        return resize(y, self.origin + x[self.n_angles:self.n_angles + 3], self.factor), columns
+
+
+def resize(points: np.ndarray, about: np.ndarray, factor: float) -> np.ndarray:
+    """Points (L, 3) with their distances from a point (3,) times a factor."""
+    return about + factor * (points - about)
+
+
+def resized(body: FixedBody, factor: float) -> FixedBody:
+    """A body with all lengths times a factor: the search's lengths in metres are those of a person."""
+    if body.n_betas:
+        return ResizedBody(body, factor)
+    subject = body.subject
+    large = replace(subject, operator=subject.operator.scaled(factor),
+                    template=subject.template.with_vertices(factor * subject.template.vertices),
+                    skeleton=replace(subject.skeleton, joints=factor * subject.skeleton.joints))
+    out = FixedBody(large)
+    out.known_poses = body.known_poses
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Anchor:
     """The derivative of vertices by betas at one pose, carried to other poses as bones carry skin; by `anchor_at`.

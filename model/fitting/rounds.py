@@ -1,4 +1,4 @@
-"""Pose, place and shape together, in rounds of matching with shrinking reach."""
+"""Pose, place and shape together: in rounds of matching with shrinking reach, or to meet an alignment."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -6,12 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .scan_fit import FINAL_REACH, REACH, ScanFit
+from scanprep.geometry.least_squares import levenberg_marquardt
+
+from .energy import shape_prior
+from .pull import Pull
+from .scan_fit import EVIDENCE, FINAL_REACH, REACH, Matched, ScanFit
+from .vertices import share_of_vertices
 
 WIDE_REACH = 0.08                    # metres: limit on the distance of matches, for models that follow a scan badly
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 FINE = 2                             # rounds at the wide reach that take all vertices, at least
 NARROWING, SETTLING = 3, 12          # rounds from the wide to the final reach; that a reach is held at most
+ALIGNINGS = 4                        # times that the points of a body are linearised anew to meet an alignment
 CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
 
 
@@ -54,3 +60,22 @@ def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[
         if i + 1 >= rounds and shift < SETTLED:
             break
     return Solved(x, bool(shift < 2 * SETTLED), i + 1, matched.energies(x))
+
+
+def meet_vertices(fit: ScanFit, x: np.ndarray, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Unknowns (P,) from x (P,) on at which a body meets an alignment, as far as priors and landmarks let it.
+
+    `vertices` (N, 3), metres, of the alignment; `weights` (N,), from 0 for those that may be anywhere to 1.
+    """
+    ids, config = fit.sample.spread, fit.config
+    share = share_of_vertices(fit.body.template.vertices, ids) / len(vertices)
+    near = EVIDENCE / config.scan_sd**2 * share * weights[ids]
+    to_point = np.concatenate([np.full(len(fit.vertices), config.landmark_sd**-2), near])
+    targets = np.concatenate([fit.points, vertices[ids]])
+    for _ in range(ALIGNINGS):
+        points, at = fit.body.gathered(np.concatenate([fit.vertices, ids]), x)
+        pull = Pull(points, at, targets, np.zeros_like(targets), to_point, np.zeros(len(targets)))
+        matched = Matched(pull, len(fit.vertices), len(ids), fit.prior_terms)
+        x = levenberg_marquardt(lambda at, m=matched: m.equations(at, shape_prior(at, fit.body.n_angles + 3)),
+                                x[None], 3, 1e-5).x[0]
+    return x

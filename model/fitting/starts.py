@@ -36,11 +36,11 @@ BLIND, APART = 24, 0.08              # of them, starts that differ by so many me
 
 
 def first_starts(fit: ScanFit, few: ScanFit) -> np.ndarray:
-    """Bodies (n, P) to start from: those that meet the landmarks, or, without any, typical poses on the scan.
+    """Bodies (n, P) to start from: those that meet the landmarks, or, with fewer than three, typical poses on the scan.
 
     The same with `few` vertices judges them.
     """
-    if not len(fit.vertices):
+    if len(fit.vertices) < 3:
         return from_nothing(few)
     marked = from_landmarks(fit, few, fit.vertices, fit.points, fit.config.landmark_sd)
     if not fit.config.correspondences:

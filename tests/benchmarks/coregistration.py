@@ -26,10 +26,9 @@ from scans import HELD_POSES, MARKS, TUNING_POSES, TestScan, test_scan
 from scipy.spatial import cKDTree
 
 from model import learn_scape
-from model.coregistration.attraction import apart
-from model.coregistration.config import EXPLAINED, CoregistrationConfig
+from model.coregistration.config import CoregistrationConfig
 from model.coregistration.rounds import coregister, task_name
-from model.coregistration.single import register_with_model
+from model.coregistration.single import EXPLAINED, apart, register_with_model
 from model.learning.config import LearnConfig
 from scanprep.batch.opening import workspace
 from scanprep.batch.pool import Workers
