@@ -12,6 +12,7 @@ from model.statue.registration.articulated import Articulated, Points
 from model.statue.registration.automatic import Features, find_features, likely_unit
 from model.statue.registration.clicks import MedialAxis
 from model.statue.registration.features import fit_features, head_share, misfit, warp
+from model.statue.registration.person_search import LENGTH, control_body
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, Person, compose
@@ -83,6 +84,21 @@ def test_derivatives_are_finite_differences(control, model):
     gradient = misfit(model, x, points, goal)[1]
     numeric = differences(lambda x: misfit(model, x, points, goal)[0], x, 1e-5)
     assert np.abs(gradient - numeric).max() < 1e-8 * np.abs(gradient).max()
+
+
+def test_as_a_body_of_unknown_shape_it_has_the_same_lengths(control, model):
+    """A beta of a segment is its length factor of [Statues] Eq. 2, 3, in surface and joints, in any pose."""
+    body, x = control_body(control), model.rest.copy()
+    forearm = control.segments.index("forearm")
+    betas = np.zeros(body.n_betas)
+    betas[1 + forearm] = 2.0
+    model.split(x)[1][forearm] = 1 + 2.0 * LENGTH
+    np.testing.assert_allclose(body.rest_vertices(betas), model.positions(model.frames(x), model.vertices), atol=1e-6)
+    posed = drawn(model, np.random.default_rng(8))
+    model.split(posed)[1][:], posed[-3:] = model.split(x)[1], 0
+    by_angles = model.positions(model.frames(posed), model.vertices)
+    by_betas = body.vertices(model.pose(posed), betas)
+    np.testing.assert_allclose(by_betas - by_betas.mean(axis=0), by_angles - by_angles.mean(axis=0), atol=5e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -270,10 +286,9 @@ def test_a_ball_is_no_person(control):
 
 
 def test_what_has_too_few_joints_says_so(control, monkeypatch):
-    stand = SimpleNamespace(off=0.01, T=np.eye(4), posed=None, to_scan=lambda places: places)
+    stands = [SimpleNamespace(off=off, mesh=control.mesh) for off in (0.01, 0.02)]
     nothing = SimpleNamespace(mesh=control.mesh, uncovered=0.0, confidence=np.zeros(len(control.mesh.vertices)))
-    monkeypatch.setattr(automatic, "find_person", lambda *given: [stand])
-    monkeypatch.setattr(automatic, "PoseSearch", lambda body: SimpleNamespace(mesh=lambda posed: control.mesh))
+    monkeypatch.setattr(automatic, "find_person", lambda *given: stands)
     monkeypatch.setattr(automatic, "register", lambda *given, **named: nothing)
     found = find_features(control, control.mesh)
     assert found.fit is None and "0 joints and 0 points" in found.problem
