@@ -41,7 +41,7 @@ class CoregistrationConfig(Settings):
     workers : Workers
     """
 
-    fit: ScanFitConfig = field(default_factory=ScanFitConfig)
+    fit: ScanFitConfig = field(default_factory=lambda: ScanFitConfig(scan_sd=0.015))
     registration: RegistrationConfig = NEAR
     learn: LearnConfig = field(default_factory=LearnConfig)
     rounds: Annotated[Count, FLAG] = 3

@@ -132,9 +132,9 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     off_marks = np.linalg.norm(mesh.vertices[vertices] - points, axis=1)
     limit = EXPLAINED * size
     explained = float((apart(mesh, orient(target.thinned(0.01 * size), mesh, limit), limit) < limit).mean())
-    return ModelRegistration(mesh, predicted, twists(pose), trans, betas if person.n_betas else None, seen, aligned.distances,
-                             aligned.rms, explained, _rms(off_model), _rms(off_marks), aligned.inverted,
-                             aligned.confidence, tried)
+    return ModelRegistration(mesh, predicted, twists(pose), trans, betas if person.n_betas else None, seen,
+                             aligned.distances, aligned.rms, explained, _rms(off_model), _rms(off_marks),
+                             aligned.inverted, aligned.confidence, tried)
 
 
 def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray, int]:
