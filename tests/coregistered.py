@@ -11,8 +11,8 @@ from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 QUICK = CoregistrationConfig(
     fit=ModelFitConfig(axes=2, turns=2),
-    registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
-                                           GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05))),
+    registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.7, 0.01, 0.08),
+                                           GraphStage(80, 0.06, 0.7, 0.01, 0.05))),
     learn=LearnConfig(refinements=1), rounds=2, failed=0.05, workers=Workers(1))
 
 

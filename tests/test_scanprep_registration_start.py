@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from jointed_bodies import bent, crab
 
-from scanprep.alignment.icp import landmark_motion
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.geodesics import SurfaceGraph
@@ -17,17 +16,16 @@ from scanprep.registration.folds import vertex_rotations
 from scanprep.registration.limb_ends import RigidFit, find_ends, rotated_ends
 from scanprep.registration.matches import (
     Likeness,
-    describe_both,
-    described_alike,
-    descriptors,
     hint_pull,
+    initial_transform,
     match_both_ways,
     path_anchors,
-    path_lengths,
+    prepare,
     pull,
     tukey,
 )
 from scanprep.registration.nonrigid import evidence, register
+from scanprep.registration.paths import descriptors, path_lengths
 from scanprep.registration.schedule import RegistrationConfig
 
 BEND = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
@@ -104,10 +102,7 @@ def test_paths_cross_gaps_but_leave_crumbs_out():
 def test_a_body_upside_down_and_bent_is_placed_by_its_descriptors():
     mesh = body()
     x = moved(bent(mesh, *BEND))
-    target = target_of(Mesh(x, mesh.faces))
-    mine, theirs = describe_both(mesh, target, (spread(mesh), x[spread(mesh)]), 0.01, size_of(mesh))
-    vertices, points = described_alike(mesh, mine, replace(target, descriptors=theirs), np.arange(0, len(x), 3))
-    T = landmark_motion(mesh.vertices[vertices], points)
+    T = initial_transform(prepare(mesh, Mesh(x, mesh.faces), (spread(mesh), x[spread(mesh)])))
     R, _ = rotations.procrustes(mesh.vertices, x)
     assert np.linalg.norm(rotations.log(T[:3, :3] @ R.T)) < 0.2
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)

@@ -134,7 +134,7 @@ MUTATIONS = (
         ("Tukey's weight not squared", "np.maximum(1 - (distances / reach) ** 2, 0) ** 2",
          "np.maximum(1 - (distances / reach) ** 2, 0)"),
         ("linear part once", "- 2 * np.sum(self.b * x)", "- np.sum(self.b * x)")),
-    *of("scanprep/registration/graph_fit.py",
+    *of("scanprep/registration/graph_energy.py",
         "scanprep_registration_hahnel scanprep_registration_nonrigid scanprep_registration_repair",
         ("rotations of nodes turned round", "Ji[..., 4:], Jj[..., 4:] = -rotations.hat(y)",
          "Ji[..., 4:], Jj[..., 4:] = rotations.hat(y)"),
