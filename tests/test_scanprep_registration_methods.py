@@ -60,7 +60,7 @@ def test_a_method_needs_one_function(truth):
     assert apart.mean() < 0.03 and found.rms < 0.003 and found.seen.mean() > 0.6
     assert told == sorted(told) and told[-1] == (100, 100) and set(found.energies) == {"stiffness"}
     whole = register(crab(), truth, (MARKS, truth.vertices[MARKS]), RegistrationConfig(method="affine"))
-    assert whole.rms < found.rms and "strain" in whole.energies
+    assert "strain" in whole.energies and not whole.inverted
 
 
 def test_it_is_a_word_in_the_settings_of_commands(truth, tmp_path, monkeypatch):

@@ -11,13 +11,10 @@ from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
 LEAST_AREA, LEAST_RADIUS = 0.075, 0.08  # of what is seen of a body, and of the largest circle in it: a leg has less
-MOST_AREA = 0.5                      # two people that touch show more
-PLANE_AREA, OPEN_AREA = 0.2, 0.6     # of floors and walls; of what something is behind: two backs are not that large
 BEHIND = 0.02                        # share of the picture that may seem to be behind a wall
 PIECE = 0.003                        # area below which a piece is noise
 APART = 0.08                         # pieces closer than this are one: an arm in front of its body
 NEAR = 0.15                          # pieces too small for a person are of the person who is so near: an arm behind
-GUESSES, PLANES = 300, 8             # of planes, and planes taken away at most
 THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, cosine within which points are on one
 
 
@@ -72,7 +69,8 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
                          "depth of all else to 0, or give landmarks on the person")
     mask = _with_neighbours(small, people[0], pieces, size)
     area = _shown(small, mask, size)[0]
-    if area > MOST_AREA:
+    # two people that touch show more
+    if area > 0.5:
         raise ValueError(f"picture: what stands in it shows {area * size**2:.1f} m², more than a person does: two "
                          "people who touch, or a wall that was not recognised; set the depth of all else to 0")
     return Person(small, mask)
@@ -86,14 +84,15 @@ def room_planes(picture: DepthPicture, size: float) -> np.ndarray:
     points, normals = picture.points(), picture.normals()
     open_, rng = picture.seen & np.isfinite(normals).all(axis=2), np.random.default_rng(0)
     taken = np.zeros(open_.shape, dtype=bool)
-    for _ in range(PLANES):
+    # of planes, and planes taken away at most
+    for _ in range(8):
         p, n = points[open_], normals[open_]
         if len(p) < 100:
             break
         some = rng.choice(len(p), min(4000, len(p)), replace=False)
         area = _areas(picture, p[some], n[some]) * len(p) / len(some)
         guesses = [(area[_on(p[some], n[some], n[i], n[i] @ p[i])].sum(), i)
-                   for i in rng.choice(len(p), min(GUESSES, len(p)), replace=False)]
+                   for i in rng.choice(len(p), min(300, len(p)), replace=False)]
         _, best = max(guesses)
         normal, offset = n[best], n[best] @ p[best]
         for _ in range(3):
@@ -106,7 +105,8 @@ def room_planes(picture: DepthPicture, size: float) -> np.ndarray:
             offset = normal @ centre
         mine = _on(p, n, normal, offset)
         behind = np.mean(points[picture.seen] @ normal - offset < -2 * _thickness(points[picture.seen]))
-        if _areas(picture, p[mine], n[mine]).sum() < (OPEN_AREA if behind > BEHIND else PLANE_AREA) * size**2:
+        # of floors and walls; of what something is behind: two backs are not that large
+        if _areas(picture, p[mine], n[mine]).sum() < (0.6 if behind > BEHIND else 0.2) * size**2:
             break
         taken[picture.seen] |= np.abs(points[picture.seen] @ normal - offset) < _thickness(points[picture.seen])
         open_ &= ~taken

@@ -15,11 +15,9 @@ from ..words import number_of
 from . import storage
 
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
-MOST_INSIDE = 0.1                     # of the extent: where nine points in ten span less, the others are no body
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 _SPELLED = {"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm", "centimetres": "cm",
             "centimeters": "cm", "inches": "in"}
-_SHORTEST = 4                        # letters that tell a word: some programs keep no more of each
 PERSON = 1.3, 2.3                    # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
 
 
@@ -92,7 +90,8 @@ def unit_named(text: str) -> str | None:
     ('mm', 'm', None)
     """
     word = text.strip(" .[]()\0").lower()
-    whole = (unit for full, unit in _SPELLED.items() if len(word) >= _SHORTEST and full.startswith(word))
+    # letters that tell a word: some programs keep no more of each
+    whole = (unit for full, unit in _SPELLED.items() if len(word) >= 4 and full.startswith(word))
     return word if word in UNITS else next(whole, None)
 
 
@@ -127,7 +126,8 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent > 10:                          # 65.535 m is what many a depth camera writes where it saw nothing
         inner = float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())
-        if inner < MOST_INSIDE * extent:
+        # of the extent: where nine points in ten span less, the others are no body
+        if inner < 0.1 * extent:
             warnings.warn(f"{path}: a few points lie far off the rest, which spans {inner:.3g} m and alone tells the "
                           "unit; scape prep clean drops them", stacklevel=3)
             extent = inner

@@ -266,9 +266,6 @@ def _strips(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return strip_triangles(corners[listed].astype(np.int64), np.unique(strip[listed], return_counts=True)[1])
 
 
-# of the edges between neighbours of a range scan, against their median: what is longer spans a jump from one surface to
-# another. Triangles seen at 75 degrees have edges four times as long as those seen from the front
-_JUMP = 4.0
 
 
 def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertices: np.ndarray) -> np.ndarray:
@@ -294,7 +291,9 @@ def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertice
     a, b, c = vertices[faces].transpose(1, 0, 2)
     if np.cross(b - a, c - a)[:, 2].sum() < 0:
         faces = faces[:, ::-1]
-    kept = longest <= _JUMP * np.median(longest) if len(longest) else np.zeros(0, bool)
+    # of the edges between neighbours of a range scan, against their median: what is longer spans a jump from one
+    # surface to another. Triangles seen at 75 degrees have edges four times as long as those seen from the front
+    kept = longest <= 4.0 * np.median(longest) if len(longest) else np.zeros(0, bool)
     warnings.warn(f"{path}: a range grid of {rows} x {cells.shape[1]}: neighbours were joined by {kept.sum()} "
                   f"triangles, {len(kept) - kept.sum()} that span jumps were left out", stacklevel=2)
     return np.asarray(faces[kept])

@@ -115,7 +115,6 @@ def _slicer(path: Path, markups: list[Any], unit: str | None) -> Found:
 
 _FIDUCIALS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID".split(",")
 _FIDUCIALS_OLD = "label,x,y,z,sel,vis".split(",")            # of 3D Slicer 3
-_DEFINED = "2"                       # what 3D Slicer 5 writes behind these columns of a point that was placed
 
 
 def _fiducials(path: Path, data: bytes) -> Found:
@@ -131,7 +130,8 @@ def _fiducials(path: Path, data: bytes) -> Found:
     for row in range(len(lines)):
         words = _cells(lines, row, ",")
         columns = named[0] if named else _FIDUCIALS if len(words) > len(_FIDUCIALS_OLD) else _FIDUCIALS_OLD
-        if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != _DEFINED:
+        # what 3D Slicer 5 writes behind these columns of a point that was placed
+        if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != "2":
             continue
         pairs.append(_named_point(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
     return Found([(name, point * signs) for name, point in pairs], "mm", flipped=True)

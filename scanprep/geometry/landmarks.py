@@ -19,7 +19,6 @@ from .landmark_writing import as_bytes
 from .mesh import Mesh
 from .surface import Surface
 
-ON_SURFACE = 0.03                    # of its size: clicks lie so near to a scan, those in another unit do not
 AXES = 2.0                           # times as near the points must lie in other axes than those that the file tells
 SPREAD = 0.2                         # of its size: landmarks of a person, who has hands, feet and a head, spread wider
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt",
@@ -251,7 +250,8 @@ def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, 
 
     def fits(scale: np.ndarray) -> bool:
         spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # on one spot of it anything lies on it
-        return spread > SPREAD * size and away(scale) <= ON_SURFACE * size
+        # of its size: clicks lie so near to a scan, those in another unit do not
+        return spread > SPREAD * size and away(scale) <= 0.03 * size
 
     best = min((told * sign for sign in signs), key=misfit)
     if len(points) < 3 or fits(best):

@@ -22,11 +22,7 @@ FLAT = 1e-9              # area over squared longest side: float32 files leave n
 SAMPLES = 400            # triangles of each patch that look for what is in front of them and behind
 WAYS = 4                 # rays of each, to either side
 REACH = 0.15             # of the diagonal, that a ray goes: through a trunk, but not across a room
-HIDDEN = 0.05            # share of the rays by which the front must be hidden more often than the back
 SURE = 5.0               # standard deviations by which that must differ from chance
-LIFT = 2e-3              # of the diagonal, above a triangle: farther than the noise of a depth camera
-IN_SIGHT = 0.8           # of a scan from one side: one view has 0.89 and more, a whole body a half
-ONE_WAY = 0.6            # share by which areas must face one way rather than the other; half views have 0.75 and more
 
 
 def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
@@ -157,7 +153,8 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     total = np.bincount(patch[some], vote, len(size))
     spread = np.sqrt(np.bincount(patch[some], vote**2, len(size)))
     share = total / np.maximum(np.bincount(patch[some], mesh.face_areas[some], len(size)), 1e-300)
-    known = (np.abs(share) > HIDDEN) & (np.abs(total) > SURE * spread)
+    # share of the rays by which the front must be hidden more often than the back
+    known = (np.abs(share) > 0.05) & (np.abs(total) > SURE * spread)
     turn = known & (total > 0)
     if turn.any() and not known.all():
         turn |= ~known & _against_nearest(mesh, patch, known, turn)
@@ -178,13 +175,16 @@ def _agree_with_camera(mesh: Mesh, rays: Rays, patch: np.ndarray, turn: np.ndarr
     some = np.random.default_rng(0).permutation(len(patch))[:SAMPLES]
     middle, area = mesh.corners[some].mean(axis=1), mesh.face_areas[some]
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    sights = [np.average(~rays.occluded(middle + LIFT * size * way, np.tile(way, (len(some), 1)), size), weights=area)
+    # of the diagonal, above a triangle: farther than the noise of a depth camera
+    sights = [np.average(~rays.occluded(middle + 2e-3 * size * way, np.tile(way, (len(some), 1)), size), weights=area)
               for way in ways]
-    if max(sights) < IN_SIGHT:
+    # of a scan from one side: one view has 0.89 and more, a whole body a half
+    if max(sights) < 0.8:
         return turn
     along = mesh.face_areas * (mesh.face_normals @ ways[int(np.argmax(sights))])
     facing = np.where(turn[patch], -along, along)
-    if abs(facing.sum()) > ONE_WAY * np.abs(facing).sum():
+    # share by which areas must face one way rather than the other; half views have 0.75 and more
+    if abs(facing.sum()) > 0.6 * np.abs(facing).sum():
         return turn
     return np.bincount(patch, along * np.sign(along.sum())) < 0
 

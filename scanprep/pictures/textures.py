@@ -19,7 +19,6 @@ from ..geometry.surface import Rays, barycentric
 from .gltf import skin_material
 from .sheets import png_bytes
 
-LARGEST_PICTURE = 8192**2            # pixels; the largest that scanners write, 1.6 GB when it is worked with
 # colours and weights of places with normals
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -58,7 +57,8 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 def check_pixels(size: Sequence[int]) -> None:
     """ValueError for a picture of more pixels than are read: a small file may unpack to one that fills the memory."""
-    if math.prod(size) > LARGEST_PICTURE:
+    # pixels; the largest that scanners write, 1.6 GB when it is worked with
+    if math.prod(size) > (8192**2):
         raise ValueError(f"{' x '.join(map(str, size))} pixels, expected at most 8192 x 8192")
 
 

@@ -17,9 +17,6 @@ from ..geometry.mesh import Mesh
 from ..geometry.target import Target
 from .matches import NORMALS
 
-SWING = 0.8                            # radians by which an end is tried bent at its base, to four sides
-BASE = 0.5                             # what its base, moved from where it is, weighs against all its other points
-
 
 @dataclass(frozen=True, eq=False)
 class End:
@@ -70,7 +67,8 @@ def rotated_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved:
     local, normals = rest - rest.mean(axis=0), template.vertex_normals[end.vertices]
     base, local_base = x[end.base].mean(axis=0), template.vertices[end.base].mean(axis=0) - rest.mean(axis=0)
     kept = [x[end.vertices]]
-    for weight in (0.0, BASE):
+    # what its base, moved from where it is, weighs against all its other points
+    for weight in (0.0, 0.5):
         found = []
         for turn, pivot in _starts(R @ end.axis, middle, base):
             start = rotations.exp(turn)
@@ -93,7 +91,8 @@ def _starts(axis: np.ndarray, middle: np.ndarray, base: np.ndarray) -> list[tupl
     across /= np.linalg.norm(across)
     around = [np.cos(angle) * across + np.sin(angle) * np.cross(axis, across) for angle in np.arange(4) * np.pi / 2]
     rolls = [(angle * axis, middle) for angle in (0.0, 0.5, 1.0, -0.5, -1.0)]
-    return [*rolls, *((SWING * way, base) for way in around)]
+    # radians by which an end is tried bent at its base, to four sides
+    return [*rolls, *((0.8 * way, base) for way in around)]
 
 
 def bending(rest: np.ndarray, now: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:

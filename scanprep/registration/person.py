@@ -25,7 +25,6 @@ from ..synthetic.people import PARENTS, PARTS, Person
 from .nonrigid import Registration, register, stretched_share
 from .schedule import RegistrationConfig
 
-UNCOVERED, STRETCHED = 0.02, 0.05      # shares of a template and of the person on it beyond which it is no person
 MATCHING = 30                          # per cent of the time, before the person is registered
 ENOUGH = 4                             # landmarks from which the average person finds the others
 ENDS = 5                               # of limbs: head, hands and feet
@@ -101,7 +100,8 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
                                      progress=lambda done, total: tell(round(MATCHING * done / total), 100))
         fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(
             round(MATCHING + (100 - MATCHING) * done / total), 100))
-    return None if fit.uncovered > UNCOVERED or stretched_share(person, fit.mesh) > STRETCHED else fit
+    # shares of a template and of the person on it beyond which it is no person
+    return None if fit.uncovered > 0.02 or stretched_share(person, fit.mesh) > 0.05 else fit
 
 
 def find_landmarks(template: Mesh, known: Mapping[str, int],

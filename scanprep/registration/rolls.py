@@ -15,7 +15,6 @@ from .person import PersonParts
 
 STEPS = 24                             # rolls that are tried, all round
 CHANGE = 0.5                           # what a roll by half a turn costs; a doubt costs one and more
-CENTRE = 0.5                           # what a joint costs that is rolled as far as people can
 FORCED = tuple(np.radians((90, -90, 180)))      # of a doubted limb, where no joint tells by how much
 
 
@@ -57,7 +56,8 @@ def joint_costs(R: np.ndarray) -> np.ndarray:
         angles = angles_of_joint(part, above[:, None], own[None])
         beyond = np.maximum(low[part] - angles, angles - high[part]).max(axis=-1)
         middle, half = (high[part, ROLL] + low[part, ROLL]) / 2, (high[part, ROLL] - low[part, ROLL]) / 2
-        costs[part] = (CENTRE * np.minimum(((angles[..., ROLL] - middle) / half) ** 2, 1)
+        # what a joint costs that is rolled as far as people can
+        costs[part] = (0.5 * np.minimum(((angles[..., ROLL] - middle) / half) ** 2, 1)
                        + np.where(beyond > 0, 1 + beyond / GRAVE, 0))
     return costs
 

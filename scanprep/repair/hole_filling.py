@@ -19,9 +19,6 @@ from .volumetric_diffusion import EMPTY, diffused_surface
 
 Method = Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"]
 MOST_EMPTY = 0.02                    # share of a good patch that may lie in space that was seen to be empty
-# pairs that run through each other, for each new triangle: merged views of people have 0.001 and 0.003, four views that
-# lie over each other 2.5, where patches are a cape from hand to hand
-TOUCHED, CROSSED = 0.05, 0.5
 
 
 @dataclass(frozen=True)
@@ -163,9 +160,11 @@ def filling_judgement(holes: Sequence[FilledHole], triangles: int) -> Judgement:
     crossing = sum(hole.intersections for hole in holes)
     reason = (f"the patches have {triangles} triangles and run through others {crossing} times: views that overlap "
               "are to be made one surface first (scape prep merge, scape prep template)")
-    if crossing > CROSSED * triangles:
+    # pairs that run through each other, for each new triangle: merged views of people have 0.001 and 0.003, four
+    # views that lie over each other 2.5, where patches are a cape from hand to hand
+    if crossing > 0.5 * triangles:
         return Judgement.of(reason)
-    return Judgement.of(check=[reason] if crossing > TOUCHED * triangles else [])
+    return Judgement.of(check=[reason] if crossing > 0.05 * triangles else [])
 
 
 def close(mesh: Mesh, config: FillConfig | None = None) -> Mesh:

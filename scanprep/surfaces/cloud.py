@@ -12,7 +12,6 @@ from ..geometry.mesh import Mesh
 from ..repair.manifold import repair
 
 MOST = 40_000                          # points that are meshed: 7 mm apart on a person, as the triangles of a template
-TRIM = 2.5                             # spacings from the nearest point, beyond which nothing was measured
 LEAST = 100                            # points of anything that has a surface
 AWAY = 2.5                             # metres from which cameras look at people
 
@@ -46,7 +45,8 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
     spacing = spacing_of(points)
     surface = screened_poisson(points, oriented_normals(points) if normals is None else normals, spacing)
     away = cKDTree(points).query(surface.vertices)[0]
-    surface = surface.submesh((away <= TRIM * spacing)[surface.faces].all(axis=1))[0]
+    # spacings from the nearest point, beyond which nothing was measured
+    surface = surface.submesh((away <= 2.5 * spacing)[surface.faces].all(axis=1))[0]
     if not len(surface.faces):
         raise ValueError("cloud: no surface lies between its points; are they of a surface?")
     surface = repair(surface, 0.02)

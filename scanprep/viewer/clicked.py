@@ -22,7 +22,6 @@ from ..pictures.shading import CLAY, Dots, Shape, Solid
 from ..pictures.thinning import thinned
 from .surface_clicks import Clickable
 
-MOST_DOTS = 150_000                  # of a cloud
 TRIED = 1500                         # points of a body by which it is turned as another
 KEPT = ".before"                     # ending of the copy of a landmark file as it was found
 
@@ -92,8 +91,9 @@ class Clicked:
         """What is drawn of it: no more triangles or points than one can see."""
         if self._shown is None:
             shape, points = self.body.shape, self.body.points
+            # of a cloud
             self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
-                Dots(points[::max(1, len(points) // MOST_DOTS)], CLAY, 0.004)
+                Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
         return self._shown
 
 

@@ -34,8 +34,6 @@ __all__ = ["App", "Message", "Send", "Server", "Stopped", "serve"]
 
 ADDRESS = "127.0.0.1"
 GRACE = 0.5                          # seconds that work gets to end
-LARGEST_REQUEST = 2**20              # bytes of a request that is no file
-STRANGERS = 64                       # connections at a time that have not shown the token; a browser opens six
 HERE = Path(__file__).parent
 
 
@@ -48,7 +46,8 @@ class _Door(HTTPServer):
 
     def handle_stream(self, stream: IOStream, address: tuple[str, int]) -> None:
         self.strangers = [one for one in self.strangers if not one.closed()]
-        if len(self.strangers) >= STRANGERS:         # each takes a file from this process, which may have few
+        # connections at a time that have not shown the token; a browser opens six
+        if len(self.strangers) >= 64:         # each takes a file from this process, which may have few
             self.strangers.pop(0).close()
         self.strangers.append(stream)
         super().handle_stream(stream, address)
@@ -173,7 +172,8 @@ class Server:
             routes, default_handler_class=handlers.Unknown, default_handler_args=own,      # type: ignore[arg-type]
             log_function=lambda handler: None, websocket_max_message_size=handlers.LARGEST_MESSAGE,
             websocket_ping_interval=30)
-        self._door = server = _Door(application, max_body_size=LARGEST_REQUEST)
+        # bytes of a request that is no file
+        self._door = server = _Door(application, max_body_size=(2**20))
         server.add_sockets(self._sockets)
         self._loop, self._ending = asyncio.get_running_loop(), asyncio.Event()
         self._ready.set()
