@@ -27,7 +27,15 @@ class Sheet:
     def __init__(self, target: Target, spacing: float) -> None:
         keep = thin(target.points, spacing)
         self.spacing = spacing
-        self.points, self.normals = _averaged(target, keep, spacing)
+        # points and normals, each the mean over those close by that face the same way: less noise
+        near_distance, near = cKDTree(target.points).query(target.points[keep], min(24, len(target.points)))
+        cosine = np.einsum("nkd,nd->nk", target.normals[near], target.normals[keep])
+        sign = np.where(cosine < 0, -1.0, 1.0) if not target.oriented else np.ones_like(cosine)
+        w = (near_distance < spacing) * (np.abs(cosine) if not target.oriented else cosine > 0.3)
+        w[:, 0] = 1.0
+        points = np.einsum("nk,nkd->nd", w, target.points[near]) / w.sum(axis=1, keepdims=True)
+        normals = np.einsum("nk,nkd->nd", w * sign, target.normals[near])
+        self.points, self.normals = points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         if not target.oriented:
             self.normals = _oriented(self.points, self.normals, self.REACH * spacing)
         self.surface = self._edges()
@@ -75,18 +83,6 @@ def _neighbours(between: np.ndarray) -> np.ndarray:
     i, j = np.repeat(np.arange(len(between)), near.shape[1]), near.ravel()
     linked = np.isfinite(between[i, j])
     return np.unique(np.sort(np.stack([i[linked], j[linked]], axis=1), axis=1), axis=0)
-
-
-def _averaged(target: Target, keep: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals, each the mean over those close by that face the same way: less noise."""
-    near_distance, near = cKDTree(target.points).query(target.points[keep], min(24, len(target.points)))
-    cosine = np.einsum("nkd,nd->nk", target.normals[near], target.normals[keep])
-    sign = np.where(cosine < 0, -1.0, 1.0) if not target.oriented else np.ones_like(cosine)
-    w = (near_distance < spacing) * (np.abs(cosine) if not target.oriented else cosine > 0.3)
-    w[:, 0] = 1.0
-    points = np.einsum("nk,nkd->nd", w, target.points[near]) / w.sum(axis=1, keepdims=True)
-    normals = np.einsum("nk,nkd->nd", w * sign, target.normals[near])
-    return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def _symmetric(i: np.ndarray, j: np.ndarray, length: np.ndarray, count: int) -> csr_array:

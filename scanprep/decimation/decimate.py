@@ -138,7 +138,15 @@ def _mean_colors(mesh: Mesh, owner: np.ndarray, count: int) -> np.ndarray | None
 
 def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
     if method == "even":
-        return _even(mesh, faces)
+        # shortest edges collapse to their middles, which are then put back onto the surface
+        import igl
+
+        vertices, triangles = igl.decimate(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces), faces)[:2]
+        smaller = Mesh(vertices, triangles)
+        placed = np.array(vertices)
+        inner = np.setdiff1d(np.arange(len(placed)), smaller.boundary_vertices)
+        placed[inner] = Surface(mesh).closest(placed[inner]).points
+        return smaller.with_vertices(placed)
     if method == "fast":
         mended = fast_collapses(mesh, faces)
         return mended if len(mended.faces) <= faces else collapse(mended, faces).mesh
@@ -147,18 +155,6 @@ def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
     else:
         from ..adapters.pymeshlab_filters import quadric_decimation
     return quadric_decimation(mesh, faces)
-
-
-def _even(mesh: Mesh, faces: int) -> Mesh:
-    """Shortest edges collapse to their middles, which are then put back onto the surface."""
-    import igl
-
-    vertices, triangles = igl.decimate(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces), faces)[:2]
-    smaller = Mesh(vertices, triangles)
-    placed = np.array(vertices)
-    inner = np.setdiff1d(np.arange(len(placed)), smaller.boundary_vertices)
-    placed[inner] = Surface(mesh).closest(placed[inner]).points
-    return smaller.with_vertices(placed)
 
 
 def fast_collapses(mesh: Mesh, faces: int) -> Mesh:

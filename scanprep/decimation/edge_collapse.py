@@ -144,7 +144,11 @@ class Rounds:
         good &= self._keeps_triangles(rows, goal[:, 0], star[~gone], of[~gone])
         self.refused[rows[~good]] = True
         good[good] = np.cumsum(removed[good]) - removed[good] < surplus
-        self._apply(rows[good], Q[good], goal[good])
+        # merge the ends of edges
+        keep, drop = self.ends[rows[good]].T
+        self.owner[drop] = keep
+        self.points[keep], self.quadrics[keep] = goal[good], Q[good]
+        self.areas[keep] += self.areas[drop]
         self._rejoin(rows, good, star, gone, of, near, of_near, outer, twin)
 
     def _keeps_topology(self, count: int, removed: np.ndarray, near: np.ndarray, of_near: np.ndarray,
@@ -183,13 +187,6 @@ class Rounds:
         good = np.ones(len(rows), dtype=bool)
         good[of[bad]] = False
         return good
-
-    def _apply(self, rows: np.ndarray, quadrics: np.ndarray, goal: np.ndarray) -> None:
-        """Merge the ends of edges."""
-        keep, drop = self.ends[rows].T
-        self.owner[drop] = keep
-        self.points[keep], self.quadrics[keep] = goal, quadrics
-        self.areas[keep] += self.areas[drop]
 
     def _rejoin(self, rows: np.ndarray, good: np.ndarray, star: np.ndarray, gone: np.ndarray, of: np.ndarray,
                 near: np.ndarray, of_near: np.ndarray, outer: np.ndarray, twin: np.ndarray) -> None:

@@ -14,7 +14,6 @@ LEAST_AREA, LEAST_RADIUS = 0.075, 0.08  # of what is seen of a body, and of the 
 BEHIND = 0.02                        # share of the picture that may seem to be behind a wall
 PIECE = 0.003                        # area below which a piece is noise
 APART = 0.08                         # pieces closer than this are one: an arm in front of its body
-NEAR = 0.15                          # pieces too small for a person are of the person who is so near: an arm behind
 THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, cosine within which points are on one
 
 
@@ -67,7 +66,12 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     if len(people) > 1:
         raise ValueError(f"picture: {len(people)} people, or things as large, are in it; one is expected: set the "
                          "depth of all else to 0, or give landmarks on the person")
-    mask = _with_neighbours(small, people[0], pieces, size)
+    # pieces too small for a person are of the person who is so near: an arm behind
+    points, mask = small.points(), people[0].copy()
+    tree = cKDTree(points[people[0]][::3])
+    for piece in pieces:
+        if piece is not people[0] and tree.query(points[piece][::3])[0].min() < 0.15 * size:
+            mask |= piece
     area = _shown(small, mask, size)[0]
     # two people that touch show more
     if area > 0.5:
@@ -154,16 +158,6 @@ def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.nda
                 group = [group[j] if g == group[i] else g for g in group]
     found = [np.any([pieces[i] for i in range(len(kept)) if group[i] == g], axis=0) & mask for g in sorted(set(group))]
     return sorted(found, key=lambda piece: -float((picture.depth[piece]**2).sum()))
-
-
-def _with_neighbours(picture: DepthPicture, person: np.ndarray, pieces: list[np.ndarray], size: float) -> np.ndarray:
-    """The mask (h, w) of a person with the pieces near."""
-    points, out = picture.points(), person.copy()
-    tree = cKDTree(points[person][::3])
-    for piece in pieces:
-        if piece is not person and tree.query(points[piece][::3])[0].min() < NEAR * size:
-            out |= piece
-    return out
 
 
 def _joined(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:

@@ -108,7 +108,10 @@ class _Columns:
         values = np.ascontiguousarray(values.reshape(len(values), -1))
         rows, width = values.shape
         if differences:
-            values = _zigzag(np.diff(values, axis=0, prepend=np.zeros_like(values[:1])))
+            # unsigned steps that may have wrapped around, as 0, -1, 1, -2, ... -> 0, 1, 2, 3,
+            steps = np.diff(values, axis=0, prepend=np.zeros_like(values[:1]))
+            signed = steps.view(steps.dtype.str.replace("u", "i"))
+            values = ((signed << 1) ^ (signed >> (8 * signed.itemsize - 1))).view(steps.dtype)
         kind = values.dtype.str[1:]
         planes = values.astype(values.dtype.newbyteorder("<")).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
         key = kind.encode() + planes
@@ -118,12 +121,6 @@ class _Columns:
                                    "differences": differences})
             self.data += planes
         return self._known[key]
-
-
-def _zigzag(steps: np.ndarray) -> np.ndarray:
-    """Unsigned steps that may have wrapped around, as 0, -1, 1, -2, ... -> 0, 1, 2, 3, ..."""
-    signed = steps.view(steps.dtype.str.replace("u", "i"))
-    return ((signed << 1) ^ (signed >> (8 * signed.itemsize - 1))).view(steps.dtype)
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

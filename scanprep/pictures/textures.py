@@ -80,7 +80,10 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
         raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
     lost = "; ".join(beside.problems.values())
     visual = loaded.visual
-    image = _picture(getattr(visual, "material", None))
+    # (H, W, 3) of a material of trimesh, or None
+    found = (getattr(getattr(visual, "material", None), name, None) for name in ("image", "baseColorTexture"))
+    image = next((image for image in found if image is not None), None)
+    image = None if image is None else np.asarray(image.convert("RGB"), dtype=np.float64) / 255
     uv = getattr(visual, "uv", None)
     if image is None or uv is None or len(uv) != len(loaded.vertices):
         warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
@@ -138,13 +141,6 @@ def _names_a_picture(path: Path) -> bool:
         return False
     data = load_bytes(path)
     return b"mtllib" in data if ending == ".obj" else b'"images"' in data
-
-
-def _picture(material: Any) -> np.ndarray | None:
-    """(H, W, 3) of a material of trimesh, or None."""
-    found = (getattr(material, name, None) for name in ("image", "baseColorTexture"))
-    image = next((image for image in found if image is not None), None)
-    return None if image is None else np.asarray(image.convert("RGB"), dtype=np.float64) / 255
 
 
 def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:

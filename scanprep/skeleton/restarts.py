@@ -44,7 +44,15 @@ class SkeletonFinder:
     def __init__(self, template: Mesh, poses: np.ndarray, config: SkeletonConfig,
                  progress: Callable[[int, int], None] | None = None, step: Step = once) -> None:
         check_template(template)
-        poses = _checked_poses(template, poses)
+        poses = np.asarray(poses, dtype=np.float64)
+        n = len(template.vertices)
+        if poses.ndim != 3 or poses.shape[1:] != (n, 3):
+            raise ValueError(f"poses: expected shape (M, {n}, 3) for this template, got {poses.shape}")
+        if len(poses) < 3:
+            raise ValueError(f"poses: expected at least 3, got {len(poses)}; where they differ the joints show")
+        bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
+        if len(bad):
+            raise ValueError(f"poses: {len(bad)} have vertices that are not finite, the first is pose {bad[0]}")
         self.template, self.config, self.symmetry = template, config, find_symmetry(template, poses)
         tied = self.symmetry.holds if config.symmetric is None else config.symmetric
         if tied and not self.symmetry.two_sided:
@@ -65,25 +73,17 @@ class SkeletonFinder:
         surface, config = self.surface, replace(self.config, parts=parts)
         label, links, tied = _of_count(run, surface, config)
         if tied:
-            label = _borders_untied(surface, config, label, links)
+            # labels of the same tree after the borders of both sides moved each by itself: no body is quite symmetric
+            free = PartSearch(surface, replace(config, patches=2))
+            moved = free.alternate(label, rounds=12, core=True)
+            touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
+            same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
+            label = moved if same else label
         joints = place_joints(surface, label, surface.core_motions(label), links)   # [Articulated] joints
         skeleton = _assembled(self.template, label, links, joints)
         if tied:
             skeleton = replace(skeleton, names=name_parts(self.template, skeleton, self.symmetry))
         return skeleton, tied
-
-
-def _checked_poses(template: Mesh, poses: np.ndarray) -> np.ndarray:
-    poses = np.asarray(poses, dtype=np.float64)
-    n = len(template.vertices)
-    if poses.ndim != 3 or poses.shape[1:] != (n, 3):
-        raise ValueError(f"poses: expected shape (M, {n}, 3) for this template, got {poses.shape}")
-    if len(poses) < 3:
-        raise ValueError(f"poses: expected at least 3, got {len(poses)}; where they differ the joints show")
-    bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
-    if len(bad):
-        raise ValueError(f"poses: {len(bad)} have vertices that are not finite, the first is pose {bad[0]}")
-    return poses
 
 
 def _progress(progress: Callable[[int, int], None] | None, restarts: int) -> Callable[[], None]:
@@ -201,15 +201,6 @@ def _of_count(best: Restart, surface: PosedSurface, config: SkeletonConfig) -> t
         if not tied or config.symmetric:
             raise
     return *tree_of(PartSearch(surface, config), best.label, best.links, config.parts), False
-
-
-def _borders_untied(surface: PosedSurface, config: SkeletonConfig, label: np.ndarray, links: np.ndarray) -> np.ndarray:
-    """Labels of the same tree after the borders of both sides moved each by itself: no body is quite symmetric."""
-    free = PartSearch(surface, replace(config, patches=2))
-    moved = free.alternate(label, rounds=12, core=True)
-    touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
-    same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
-    return moved if same else label
 
 
 def _assembled(template: Mesh, label: np.ndarray, links: np.ndarray, joints: np.ndarray) -> Skeleton:

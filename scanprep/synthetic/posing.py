@@ -63,24 +63,9 @@ class Poser:
 
     def _moved(self, pose: np.ndarray) -> np.ndarray:
         relative = rotations.exp(pose)
-        x = self._bulged(relative)
-        x = self._twisted(x, pose)
-        shift = self.girdle(relative)
-        for arm, field in zip((4, 7), girdle_masks(), strict=True):
-            x = x + (field * self.weights[:, 2])[:, None] * shift[arm]
-        R, place = self.part_motion(pose)
-        x = _dual_quaternion_blend(x, self.weights, self.main, R, place - np.einsum("pij,pj->pi", R, self.joints))
-        smooth = _smoothed(x)
-        mushed = smooth + np.einsum("nij,nj->ni", _detail_frames(smooth, load().mesh.faces), self._coordinates)
-        blend = mush_mask()[:, None]
-        return x + blend * (mushed - x)
-
-    def _bulged(self, relative: np.ndarray) -> np.ndarray:
         amounts = drivers(self.anatomy, self.axes, relative)
-        return self.rest + (masks() @ amounts)[:, None] * self.normals
-
-    def _twisted(self, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Turn the skin about the bones, so that a twist spreads along a limb."""
+        x = self.rest + (masks() @ amounts)[:, None] * self.normals
+        # turn the skin about the bones, so that a twist spreads along a limb
         for part, share in twist_shares():
             axis = self.axes[part if part not in (6, 9) else part - 1]
             twist = twist_about(pose[part], axis)
@@ -91,7 +76,15 @@ class Poser:
                 turn = Rotation.from_rotvec(angle[near, None] * axis)
                 x = x.copy()
                 x[near] = base + turn.apply(x[near] - base)
-        return x
+        shift = self.girdle(relative)
+        for arm, field in zip((4, 7), girdle_masks(), strict=True):
+            x = x + (field * self.weights[:, 2])[:, None] * shift[arm]
+        R, place = self.part_motion(pose)
+        x = _dual_quaternion_blend(x, self.weights, self.main, R, place - np.einsum("pij,pj->pi", R, self.joints))
+        smooth = _smoothed(x)
+        mushed = smooth + np.einsum("nij,nj->ni", _detail_frames(smooth, load().mesh.faces), self._coordinates)
+        blend = mush_mask()[:, None]
+        return x + blend * (mushed - x)
 
 
 @lru_cache(maxsize=1)
