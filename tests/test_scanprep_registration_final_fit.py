@@ -12,7 +12,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
-from scanprep.registration.final_fit import FinalFit, final_fit, smoothed_scan
+from scanprep.registration.final_fit import FinalFit, final_fit, smooth_scan
 from scanprep.registration.schedule import FinalFitConfig, FinalFitRound
 from scanprep.registration.stretches import Triangles
 
@@ -190,7 +190,7 @@ def test_a_smoothed_scan_is_smoother_than_the_scan_even_where_it_curves(truth):
     scan = target_of(cloud(truth, 20000))
     nearest = Surface(truth).closest(scan.points)
     sign = np.sign(np.einsum("nd,nd->n", scan.normals, truth.face_normals[nearest.faces]))
-    smooth = smoothed_scan(replace(scan, normals=sign[:, None] * scan.normals, oriented=True), 0.015)
+    smooth = smooth_scan(replace(scan, normals=sign[:, None] * scan.normals, oriented=True), 0.015)
     before, after = (Surface(truth).closest(p).distances.mean() for p in (scan.points, smooth.points))
     assert after < 0.45 * before
     agree = np.einsum("nd,nd->n", smooth.normals, truth.face_normals[nearest.faces])

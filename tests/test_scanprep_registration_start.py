@@ -13,7 +13,7 @@ from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import target_of
 from scanprep.registration.folds import vertex_rotations
-from scanprep.registration.limb_ends import RigidFit, find_ends, rotated_ends
+from scanprep.registration.limb_ends import RigidFit, find_ends, rotate_ends
 from scanprep.registration.matches import (
     Likeness,
     hint_pull,
@@ -196,7 +196,7 @@ def test_an_end_that_is_rotated_about_itself_is_found():
     truth = np.einsum("nij,nj->ni", rotations.exp(1.0 * share[:, None] * end.axis), mesh.vertices)
     target = target_of(Mesh(truth, mesh.faces))
     size = size_of(mesh)
-    rotated = rotated_ends(mesh, end, mesh.vertices, RigidFit(target, size), moved=0.0)[0]
+    rotated = rotate_ends(mesh, end, mesh.vertices, RigidFit(target, size), moved=0.0)[0]
     before = np.linalg.norm(mesh.vertices - truth, axis=1)[end.vertices].mean()
     assert np.linalg.norm(rotated - truth[end.vertices], axis=1).mean() < 0.35 * before
 
@@ -205,7 +205,7 @@ def test_an_end_that_fits_is_left_alone():
     mesh = body()
     end = find_ends(mesh, 2, 0.25)[0]
     size = size_of(mesh)
-    assert not rotated_ends(mesh, end, mesh.vertices, RigidFit(target_of(mesh), size))
+    assert not rotate_ends(mesh, end, mesh.vertices, RigidFit(target_of(mesh), size))
 
 
 # ---- confidence ---------------------------------------------------------------------------------------------

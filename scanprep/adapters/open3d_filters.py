@@ -32,7 +32,7 @@ def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(mesh.vertices)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
     closed, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    return recolored(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
+    return recolor(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
 
 
 def oriented_normals(points: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def ball_pivoting(points: np.ndarray, normals: np.ndarray, spacing: float) -> Me
     return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
 
 
-def recolored(mesh: Mesh, source: Mesh) -> Mesh:
+def recolor(mesh: Mesh, source: Mesh) -> Mesh:
     """The mesh with the colours of the closest points of another one, when that has any."""
     if source.colors is None:
         return mesh

@@ -98,12 +98,12 @@ def search(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config
     """Belief propagation over the places of one level, in domains pruned by what is known; the template rescaled."""
     spread = np.arange(min(level.places, len(surfaces.places)))
     unary = place_energy(surfaces.scan, surfaces.places[spread], surfaces.size)
-    wanted = unary if before is None else -_passed_on(surfaces, before, spread)
+    wanted = unary if before is None else -_expected_places(surfaces, before, spread)
     domains = np.argsort(wanted, axis=1)[:, :level.domain]
     field = _field(surfaces, spread[domains], np.take_along_axis(unary, domains, axis=1))
     beliefs = propagate(field, config.iterations)
     images = Images(spread[domains], beliefs, field.energy(beliefs.states))
-    return _rescaled(surfaces, images), images
+    return _rescale(surfaces, images), images
 
 
 def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Correspondences:
@@ -178,7 +178,7 @@ def _field(surfaces: Surfaces, domains: np.ndarray, unary: np.ndarray) -> PairFi
     return PairField(energies, surfaces.edges, pairwise)
 
 
-def _rescaled(surfaces: Surfaces, images: Images) -> Surfaces:
+def _rescale(surfaces: Surfaces, images: Images) -> Surfaces:
     """The template scaled by the edges whose images are known: bending changes paths, but not short edges."""
     i, j = surfaces.edges[images.found[surfaces.edges].all(axis=1)].T
     x, y = surfaces.scan.points, surfaces.places.points[images.chosen]
@@ -189,7 +189,7 @@ def _rescaled(surfaces: Surfaces, images: Images) -> Surfaces:
                    scale=grown * surfaces.scale)
 
 
-def _passed_on(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
+def _expected_places(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
     """Beliefs so far, spread over other places near by: (n, m), not normalised."""
     n, K = images.domains.shape
     reach = 0.012 * surfaces.size

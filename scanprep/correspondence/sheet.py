@@ -37,10 +37,10 @@ class Sheet:
         normals = np.einsum("nk,nkd->nd", w * sign, target.normals[near])
         self.points, self.normals = points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         if not target.oriented:
-            self.normals = _oriented(self.points, self.normals, self.REACH * spacing)
+            self.normals = _orient(self.points, self.normals, self.REACH * spacing)
         self.surface = self._edges()
         _, self.piece = connected_components(self.surface, directed=False)
-        self.graph = _joined(self.points, self.surface, self.piece)
+        self.graph = _join(self.points, self.surface, self.piece)
         self.tree = cKDTree(self.points)
         self._spread: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}
 
@@ -90,7 +90,7 @@ def _symmetric(i: np.ndarray, j: np.ndarray, length: np.ndarray, count: int) -> 
     return csr_array(coo_array((np.maximum(np.r_[length, length], 1e-9), (rows, columns)), shape=(count, count)))
 
 
-def _joined(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_array:
+def _join(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_array:
     """The graph with its larger pieces linked by the shortest straight bridges, as holes may part a body."""
     size = np.bincount(label)
     large = np.flatnonzero(size >= max(20, 0.002 * len(points)))
@@ -111,7 +111,7 @@ def _joined(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_arra
     return graph + _symmetric(i[used].astype(np.int64), j[used].astype(np.int64), length[used], len(points))
 
 
-def _oriented(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray:
+def _orient(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray:
     """Normals (n, 3) with signs that agree between neighbours and point outward on the whole."""
     i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
     along = points[j] - points[i]

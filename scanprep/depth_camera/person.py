@@ -56,7 +56,7 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     """
     small = picture.without_flying_pixels().halved()
     pieces = _pieces(small, small.seen & ~room_planes(small, size), size)
-    shown = [_shown(small, mask, size) for mask in pieces]
+    shown = [_area_and_radius(small, mask, size) for mask in pieces]
     people = [mask for mask, (area, radius) in zip(pieces, shown, strict=True)
               if area >= LEAST_AREA and radius >= LEAST_RADIUS]
     if not people:
@@ -72,7 +72,7 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     for piece in pieces:
         if piece is not people[0] and tree.query(points[piece][::3])[0].min() < 0.15 * size:
             mask |= piece
-    area = _shown(small, mask, size)[0]
+    area = _area_and_radius(small, mask, size)[0]
     # two people that touch show more
     if area > 0.5:
         raise ValueError(f"picture: what stands in it shows {area * size**2:.1f} m², more than a person does: two "
@@ -143,7 +143,7 @@ def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.nda
     """Masks (h, w) of what hangs together in space, largest first."""
     across, down = (np.abs(np.diff(picture.depth, axis=a)) < 1.5 * JUMP * np.maximum(
         np.nan_to_num(picture.depth[:, 1:] if a else picture.depth[1:]), 1) for a in (1, 0))
-    number = _joined(mask, across, down)
+    number = _label_pieces(mask, across, down)
     count = np.bincount(number[mask])
     area = np.bincount(number[mask], weights=picture.depth[mask]**2) / np.prod(np.diag(picture.intrinsics)[:2])
     kept = [i for i in np.argsort(-area) if area[i] > PIECE * size**2 and count[i] > 20]
@@ -160,7 +160,7 @@ def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.nda
     return sorted(found, key=lambda piece: -float((picture.depth[piece]**2).sum()))
 
 
-def _joined(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+def _label_pieces(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
     """(h, w) numbers of pieces of a mask whose neighbours hang together; `across` (h, w - 1), `down` (h - 1, w)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -173,7 +173,7 @@ def _joined(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarra
     return np.asarray(connected_components(graph, directed=False)[1].reshape(mask.shape))
 
 
-def _shown(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:
+def _area_and_radius(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:
     """Area of a piece, and radius of the largest circle in it, in sizes; the border of the picture is no end."""
     z = np.where(mask, np.nan_to_num(picture.depth), 0.0)
     fx, fy = np.diag(picture.intrinsics)[:2]

@@ -46,13 +46,13 @@ def load_bytes(path: Path) -> bytes:
     """The whole file, unpacked when its name ends in `.gz`; MeshFileError for one that is missing, damaged or empty."""
     data = storage.read_bytes(path, error=MeshFileError)
     if path.suffix.lower() == ".gz":
-        data = _unpacked(path, data)
+        data = _unpack(path, data)
     if not data:
         raise EmptyFileError(f"{path}: the file is empty")
     return data
 
 
-def _unpacked(path: Path, data: bytes) -> bytes:
+def _unpack(path: Path, data: bytes) -> bytes:
     """What a gzip file holds, up to far more than any mesh can be packed."""
     most = 2**20 + 50 * len(data)
     try:
@@ -233,7 +233,7 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     size, begin = sizes[of], start[of]
     faces = np.stack([corners[begin + first[of]], corners[begin + (within + 1) % size],
                       corners[begin + (within + 2) % size]], axis=1)
-    if vertices is not None and len(folded := _folded(vertices, faces, of)):
+    if vertices is not None and len(folded := _find_folds(vertices, faces, of)):
         warnings.warn(f"{path}: {number_of(len(folded), 'polygon folds', 'polygons fold')} over where cut into "
                       f"triangles, the first is face {folded[0]}: cut them in the program they are from", stacklevel=4)
     return faces
@@ -253,7 +253,7 @@ def strip_triangles(corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     return np.asarray(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
 
 
-def _folded(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
+def _find_folds(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
     """The polygons some of whose triangles (F, 3), `of` (F,) them, face away from the whole."""
     c = vertices[faces]
     with np.errstate(all="ignore"):                          # what is not finite is refused later

@@ -112,7 +112,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             for primitive in tree["meshes"][node["mesh"]]["primitives"]:
                 if primitive.get("mode", 4) not in shown:
                     continue
-                primitive, own, data = _unpacked(path, tree, binary, primitive)
+                primitive, own, data = _unpack(path, tree, binary, primitive)
                 points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
                 local = accessor(own, data, points[0], "VEC3").astype(np.float64)
                 if own is not tree or points not in placed:
@@ -151,7 +151,7 @@ def _instances(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix
     return [matrix @ _matrix({key: values[i] for key, values in rows.items()}) for i in range(count)]
 
 
-def _unpacked(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
+def _unpack(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
               ) -> tuple[dict[str, Any], dict[str, Any], bytes]:
     """A primitive, and the tree and buffer that hold its numbers: one of its own where Draco has compressed them."""
     packed = primitive.get("extensions", {}).get(_DRACO)

@@ -36,7 +36,7 @@ def read(path: Path, data: bytes) -> Contents:
         table = np.frombuffer(data, row, count, start)
         columns = {name: table[name] for name in row.names or ()}
     elif how == b"binary_compressed":
-        columns = _compressed(path, data[start:], row, count)
+        columns = _decompress(path, data[start:], row, count)
     else:
         raise MeshFileError(f"{path}: expected DATA ascii, binary or binary_compressed in the PCD header, "
                             f"found {quote(how)}")
@@ -87,7 +87,7 @@ def _ascii(lines: Lines, row: np.dtype, count: int) -> dict[str, np.ndarray]:
     return columns
 
 
-def _compressed(path: Path, data: bytes, row: np.dtype, count: int) -> dict[str, np.ndarray]:
+def _decompress(path: Path, data: bytes, row: np.dtype, count: int) -> dict[str, np.ndarray]:
     """The columns one after the other, packed as a whole; before them their packed and unpacked sizes."""
     packed, size = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
     if len(data) < 8 + packed or size != row.itemsize * count:

@@ -131,7 +131,7 @@ def _binary_element(path: Path, data: bytes, element: Element, start: int, order
         fields.append((f"value{i}", order + p.kind, (n,) if p.length_kind else ()))
         at += n * int(p.kind[1])
         if at > len(data) and element.count:
-            raise _truncated(path, element, 0)
+            raise _truncation(path, element, 0)
     row = np.dtype(fields)
     if start + row.itemsize * element.count > len(data):
         return _binary_rows(path, data, element, start, order)
@@ -161,7 +161,7 @@ def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: s
             if n < 0:
                 raise MeshFileError(f"{path}: row {row} of element {element.name}: a list of {n} values")
             if end > len(data):
-                raise _truncated(path, element, row)
+                raise _truncation(path, element, row)
             size.append(n)
             item += data[start:end]
             start = end
@@ -176,7 +176,7 @@ def _length(data: bytes, at: int, kind: str, order: str) -> int:
     return int.from_bytes(data[at:at + int(kind[1])], "big" if order == ">" else "little", signed=kind[0] == "i")
 
 
-def _truncated(path: Path, element: Element, found: int) -> MeshFileError:
+def _truncation(path: Path, element: Element, found: int) -> MeshFileError:
     return MeshFileError(f"{path}: truncated: expected {element.count} rows of element {element.name}, "
                          f"found {found}")
 
@@ -185,7 +185,7 @@ def ascii_element(lines: Lines, element: Element, start: int) -> tuple[dict[str,
     """All rows at once where there are no lists, or one of whole numbers that has always the same length."""
     stop = start + element.count
     if stop > len(lines):
-        raise _truncated(lines.path, element, max(len(lines) - start, 0))
+        raise _truncation(lines.path, element, max(len(lines) - start, 0))
     properties, width = element.properties, len(element.properties)
     kind = np.int64 if all(p.kind[0] in "iu" for p in properties) else np.float64
     if not any(p.length_kind for p in properties):

@@ -195,7 +195,7 @@ def read_xyz(path: Path, data: bytes) -> Contents:
     lines.text = _with_decimal_points(lines, first)
     table = lines.table(range(first, len(lines)), "numbers 'x y z', as many on every line", 3)
     if names:
-        return _named_columns(lines, names, table)
+        return _columns_by_name(lines, names, table)
     # normals and colours among the columns from `start` on; a column that begins neither is skipped
     start = 4 if path.name.lower().endswith(".pts") and table.shape[1] in (4, 7) else 3
     normals = colors = None
@@ -240,7 +240,7 @@ def _with_decimal_points(lines: Lines, first: int) -> list[bytes]:
     return [*lines.text[:first], *body.split(b"\n")]
 
 
-def _named_columns(lines: Lines, names: list[str], table: np.ndarray) -> Contents:
+def _columns_by_name(lines: Lines, names: list[str], table: np.ndarray) -> Contents:
     """The columns that a heading names; MeshFileError where it does not name x, y and z or has other columns."""
     if len(names) > table.shape[1]:
         raise lines.fail(0, f"a heading of {table.shape[1]} columns, as the points have")

@@ -76,7 +76,7 @@ def _cut_up(new: np.ndarray, scan: Mesh, most: int) -> tuple[np.ndarray, np.ndar
         if not bad.any() or len(faces) > most:              # cuts end: vertices of the scan cannot be cut
             return new, faces
         members = np.flatnonzero(bad[new])
-        piece = _joined(new, members, scan.faces) if first else np.arange(len(members))
+        piece = _join(new, members, scan.faces) if first else np.arange(len(members))
         touched = np.unique(corners[bad[corners].any(axis=1)])
         old = np.r_[np.flatnonzero(~bad), np.full(piece.max() + 1, -1)]     # numbers before, of what is left, then cut
         new[members] = len(bad) + piece
@@ -84,7 +84,7 @@ def _cut_up(new: np.ndarray, scan: Mesh, most: int) -> tuple[np.ndarray, np.ndar
         asked, first = (old < 0) | np.isin(old, touched), False
 
 
-def _joined(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _join(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(M,) the piece of each of the vertices `members` (M,): edges join those that have become the same one."""
     row = np.full(len(new), -1)
     row[members] = np.arange(len(members))

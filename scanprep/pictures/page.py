@@ -144,8 +144,8 @@ class Page:
         """What makes bodies turn: the scenes, the viewer, and its start; nothing on a page of pictures alone."""
         if not self._scenes:
             return ""
-        scenes = "".join(_carried(f"scene{i + 1}", scene) for i, scene in enumerate(self._scenes))
-        return f"{scenes}{_carried('viewer', _viewer_code())}<script>{START}</script>\n"
+        scenes = "".join(_embed(f"scene{i + 1}", scene) for i, scene in enumerate(self._scenes))
+        return f"{scenes}{_embed('viewer', _viewer_code())}<script>{START}</script>\n"
 
     def write(self, path: str | Path) -> None:
         """Write the page, whole or not at all."""
@@ -162,7 +162,7 @@ def _with_code(text: str) -> str:
     return CODE.sub(r"<code>\1</code>", escape(text))
 
 
-def _carried(name: str, data: bytes) -> str:
+def _embed(name: str, data: bytes) -> str:
     return f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n'
 
 

@@ -74,10 +74,10 @@ def write_figures(folder: Path, figures: Iterable[ScanFigures]) -> None:
     rows = sorted(figures, key=lambda f: f.name)
     names = [f.name for f in _TABLED]
     tables.write_table(folder / TIMES, ["name", "seconds"], [(f.name, f"{f.seconds:.2f}") for f in rows])
-    tables.write_table(folder / FIGURES, names, [[_tabled(getattr(row, name)) for name in names] for row in rows])
+    tables.write_table(folder / FIGURES, names, [[_as_cell(getattr(row, name)) for name in names] for row in rows])
 
 
-def _tabled(value: Any) -> Any:
+def _as_cell(value: Any) -> Any:
     return NONE if isinstance(value, float) and np.isnan(value) else value
 
 

@@ -82,19 +82,19 @@ class SmoothedScan:
     spacing: float
 
 
-def smoothed_scan(target: Target, width: float, neighbours: int = 40) -> SmoothedScan:
+def smooth_scan(target: Target, width: float, neighbours: int = 40) -> SmoothedScan:
     """A scan with a quadratic surface fitted around every point; others count by a Gaussian of `width` metres."""
     P, n = target.points, target.normals
     apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=search_threads(len(P)))
     # two thousand points at once: their neighbours fit into the cache
     some = (slice(first, first + 2000) for first in range(0, len(P), 2000))
-    fitted = [_fitted_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in some]
+    fitted = [_fit_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in some]
     points, normals, rest = (np.concatenate(part) for part in zip(*fitted, strict=True))
     spacing = np.median(apart[:, min(4, apart.shape[1] - 1)])
     return SmoothedScan(points, normals, target.border, float(np.sqrt(np.median(rest))), float(spacing))
 
 
-def _fitted_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.ndarray, apart: np.ndarray,
+def _fit_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.ndarray, apart: np.ndarray,
                      width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points and normals (m, 3) moved to the quadratic surface through their neighbours (m, k, 3).
 
@@ -128,7 +128,7 @@ class _SurfaceFit:
         self.triangles = triangles_of(template)
         self.areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
         target = orient(target, template.with_vertices(start), NORMALS * size)
-        self.scan = smoothed_scan(target, config.noise_width * size)
+        self.scan = smooth_scan(target, config.noise_width * size)
         self.held = pull(N, np.arange(N), start, 1e-9 * self.areas)
         if landmarks is not None:
             self.held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))

@@ -19,7 +19,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.target import orient
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, refine_motion
 from .graph_energy import UNKNOWNS, node_pattern, terms
-from .limb_ends import End, RigidFit, bending, find_ends, rotated_ends
+from .limb_ends import End, RigidFit, bending, find_ends, rotate_ends
 from .matches import NORMALS, Fit, Inputs, Pull, landmark_pull, pull, wanted_by
 from .schedule import GraphStage, RegistrationConfig
 
@@ -123,7 +123,7 @@ def rotate_end(inputs: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> Gr
         return float(scan.error(body.vertices, body.vertex_normals) @ areas) + strain + bent
 
     trials = [fit]
-    for places in rotated_ends(template, end, fit.x, scan):
+    for places in rotate_ends(template, end, fit.x, scan):
         drawn = held + pull(len(fit.x), end.vertices, places, areas[end.vertices])
         trials.append(fit_stage(inputs, fit.minimise(drawn, stage, size, 8), replace(stage, hints=0.0, paths=0.0)))
     return min(trials, key=misfit) if len(trials) > 1 else fit

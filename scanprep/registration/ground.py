@@ -110,7 +110,7 @@ def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, 
         return None
     height = floor.height(body.vertices)
     shown = (height > 0) & (cKDTree(points).query(body.vertices)[0] < REACH)
-    bent = max(_bent(reference, body, shown & (foot == number)) for number in np.unique(foot[foot > 0]))
+    bent = max(_bending(reference, body, shown & (foot == number)) for number in np.unique(foot[foot > 0]))
     below = np.maximum(-height, 0)
     # Metres, RMS, that feet are bent from which on they say less of their soles than the end of the scan: synthetic
     # feet are bent by 0.9 to 1.9 mm on other synthetic people and know the soles to 3 mm; by 4 to 9 mm on real men,
@@ -121,7 +121,7 @@ def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, 
                     (float(below.max()), float(pressed * below.max())))
 
 
-def _bent(reference: Mesh, body: Mesh, shown: np.ndarray) -> float:
+def _bending(reference: Mesh, body: Mesh, shown: np.ndarray) -> float:
     """By how much a foot had to change its shape where it was shown, (N,) bool, metres; far if it was not."""
     if shown.sum() < 20:
         return UNSEEN

@@ -54,7 +54,7 @@ def find_ends(template: Mesh, count: int, radius: float) -> tuple[End, ...]:
     return tuple(ends)
 
 
-def rotated_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01) -> list[np.ndarray]:
+def rotate_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01) -> list[np.ndarray]:
     """Places (n, 3) of the vertices of an end after rotations that fit well as a rigid piece, two at most.
 
     One may slide along the rest of the body, the other hangs on its base: where much of a bent hand is hidden, it is

@@ -47,7 +47,7 @@ def person_parts(template: Mesh, progress: Callable[[int, int], None] | None = N
     `progress` is called as progress(done, total). What was found is remembered as long as the template lives.
     """
     if template not in _known:
-        _known[template] = _found(template, progress or (lambda done, total: None))
+        _known[template] = _find_parts(template, progress or (lambda done, total: None))
     return _known[template]
 
 
@@ -69,7 +69,7 @@ def stature(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> float:
     return height * bones(vertices) / bones(template.vertices)
 
 
-def _found(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
+def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
     """The parts of a template that was not seen before."""
     person, fit = average_person(), _person_on(template, None, RegistrationConfig(), tell)
     if fit is None:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from ..ranges import Cell, Count, Positive, Settings
 
@@ -112,7 +113,8 @@ def stages(table: str) -> tuple[GraphStage, ...]:
     2
     """
     names, *rows = (line.partition("|")[0].split() for line in table.strip().splitlines())
-    return tuple(GraphStage(**{name: float(value) if "." in value else int(value)
+    number: dict[str, Any] = {"nodes": int, "rounds": int, "ends": int}
+    return tuple(GraphStage(**{name: number.get(name, float)(value)
                                for name, value in zip(names, row, strict=True) if value != "-"}) for row in rows)
 
 

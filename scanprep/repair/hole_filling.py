@@ -13,9 +13,9 @@ from ..judgement import Judgement
 from ..ranges import Count, Positive, Range, Settings
 from .hole_patch import Patch
 from .intersections import intersecting_faces
-from .loops import group_loops, joined_polygon
+from .loops import group_loops, join_polygons
 from .manifold import repair, split_vertices
-from .volumetric_diffusion import EMPTY, diffused_surface
+from .volumetric_diffusion import EMPTY, diffuse_surface
 
 Method = Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"]
 MOST_EMPTY = 0.02                    # share of a good patch that may lie in space that was seen to be empty
@@ -213,7 +213,7 @@ class _Filling:
         local = np.full(len(mesh.vertices), -1)
         local[used] = np.arange(len(used))
         patch = Patch(around, rim[used])
-        polygons = [joined_polygon(around.vertices, [local[loop] for loop in group]) for group in groups]
+        polygons = [join_polygons(around.vertices, [local[loop] for loop in group]) for group in groups]
         patch.triangulate(polygons, self.rays, progress)
         patch.refine(self.config.density)
         start = patch.mesh.vertices
@@ -239,7 +239,7 @@ class _Filling:
         reach = 4 * np.linalg.norm(mesh.vertices[rim] - middle, axis=1).max()
         near = np.linalg.norm(mesh.corners.mean(axis=1) - middle, axis=1) < reach
         part, used = mesh.submesh(near | np.isin(mesh.faces, rim).any(axis=1))
-        guide = diffused_surface(part, np.searchsorted(used, np.unique(rim)), self.seen)
+        guide = diffuse_surface(part, np.searchsorted(used, np.unique(rim)), self.seen)
         filled = self.fair_patches(mesh, [group], guide)
         made = self.rate(filled, mesh, [group], "diffusion")[0]
         if fair is None or made.faults < fair.faults:

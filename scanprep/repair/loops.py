@@ -28,7 +28,7 @@ def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
             for number in np.unique(label, return_index=True)[1]]
 
 
-def joined_polygon(vertices: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
+def join_polygons(vertices: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
     """One polygon (m,) from several loops, cut open along the shortest lines between them.
 
     The vertices at the ends of a cut are named twice. All loops run as the sides of the triangles at the border do.

@@ -110,7 +110,7 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     if mesh.is_vertex_manifold:
         return mesh
     fan = mesh.corner_fans
-    number = (_joined_by_holes(mesh, fan)[fan] if across_holes else fan).ravel()
+    number = (_join_across_holes(mesh, fan)[fan] if across_holes else fan).ravel()
     _, first, new = np.unique(number, return_index=True, return_inverse=True)
     owner = mesh.faces.ravel()[first]
     order = np.lexsort((first, owner))
@@ -122,7 +122,7 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     return Mesh(mesh.vertices[source], place[new.reshape(-1)].reshape(-1, 3), colors)
 
 
-def _joined_by_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
+def _join_across_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
     """A common number for the fans at a vertex between which a simple border loop passes."""
     face, side = np.nonzero(mesh.edge_use[mesh.face_edges] == 1)
     ends = mesh.faces[face, side], mesh.faces[face, (side + 1) % 3]

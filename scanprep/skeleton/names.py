@@ -27,7 +27,7 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
     person = _person(template, skeleton, symmetry) if symmetry.holds else None
     if person is None:
         return skeleton.names
-    left = _left(template, skeleton, person)
+    left = _way_left(template, skeleton, person)
     if left is None:
         return skeleton.names
     names = dict(zip(person.spine, _spine_names(person), strict=True))
@@ -161,7 +161,7 @@ def _bones(template: Mesh, skeleton: Skeleton, limb: list[int]) -> np.ndarray:
     return np.array([*places, points[np.linalg.norm(points - places[0], axis=1).argmax()]])
 
 
-def _left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | None:
+def _way_left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | None:
     """The direction (3,) to the person's left: up × front, front where the soles reach; None if that is not clear."""
     front, length = np.zeros(3), 0.0
     for leg in person.legs:

@@ -127,7 +127,7 @@ def carry(shape: BodyShape, stages: int = 3) -> tuple[np.ndarray, Anatomy]:
         wanted = np.einsum("np,pij,nj->ni", weights, total, offset)
         gradient = None
         for _ in range(2):
-            vertices, gradient = _relaxed(field, vertices, wanted, gradient)
+            vertices, gradient = _relax(field, vertices, wanted, gradient)
         before = now
     value, gradient = _symmetric(field, vertices)
     step = np.clip(value / np.maximum((gradient**2).sum(axis=1), 0.1), -0.005, 0.005)
@@ -151,7 +151,7 @@ def _symmetric(field: Field, vertices: np.ndarray, gradient: np.ndarray | None =
     return value, gradient
 
 
-def _relaxed(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
+def _relax(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
             ) -> tuple[np.ndarray, np.ndarray]:
     """One Newton step onto the surface, then tangential steps towards the canonical neighbourhoods."""
     value, gradient = _symmetric(field, vertices, gradient)

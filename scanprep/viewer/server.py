@@ -89,7 +89,8 @@ class Server:
 
     def __enter__(self) -> Server:
         self.dropped = Path(tempfile.mkdtemp(prefix="scapekit-"))
-        self._worker, self._greeter = Worker("scapekit work", self._failed), Worker("scapekit greeting", self._failed)
+        self._worker = Worker("scapekit work", self._report_failure)
+        self._greeter = Worker("scapekit greeting", self._report_failure)
         self._thread.start()
         assert self._ready.wait(10), "the server did not start"
         return self
@@ -152,7 +153,7 @@ class Server:
         except RuntimeError:
             raise Stopped from None
 
-    def _failed(self, problem: BaseException) -> None:
+    def _report_failure(self, problem: BaseException) -> None:
         """A job failed: the tabs are told; the terminal too, once, where nobody foresaw it."""
         text = str(problem)
         if not isinstance(problem, ValueError):
@@ -194,7 +195,7 @@ def serve(app: App, port: int | None = None, open_browser: bool = True, say: Cal
         Start the browser of this machine, unless the user is logged in from another one.
     """
     remote = "SSH_CONNECTION" in os.environ
-    with contextlib.suppress(KeyboardInterrupt), _terminated_as_interrupted(), Server(app, port, say) as server:
+    with contextlib.suppress(KeyboardInterrupt), _terminate_as_interrupt(), Server(app, port, say) as server:
         say(f"{one_line(app.title)}: {server.address}\nCtrl-C ends it")
         if remote or not open_browser:
             say(f"from another machine: ssh -N -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
@@ -222,7 +223,7 @@ def _has_screen() -> bool:
 
 
 @contextlib.contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
+def _terminate_as_interrupt() -> Iterator[None]:
     """SIGTERM ends the block as Ctrl-C does."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -124,7 +124,7 @@ MUTATIONS = (
         ("seeds lie on the other end", "nearer = scan.to_seeds[edges[:, 1]] - scan.to_seeds[edges[:, 0]]",
          "nearer = scan.to_seeds[edges[:, 0]] - scan.to_seeds[edges[:, 1]]")),
     *of("scanprep/correspondence/belief_propagation.py", "scanprep_correspondence_beliefs",
-        ("a message comes back to its sender", "_scaled(belief[i] - back)", "_scaled(belief[i])"),
+        ("a message comes back to its sender", "_normalise(belief[i] - back)", "_normalise(belief[i])"),
         ("energies as probabilities", "belief = -np.asarray(field.unary", "belief = np.asarray(field.unary"),
         ("tables transposed", "onward = np.exp(-np.ascontiguousarray(field.pairwise.transpose(0, 2, 1)",
          "onward = np.exp(-np.ascontiguousarray(field.pairwise")),
