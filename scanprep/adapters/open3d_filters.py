@@ -10,7 +10,6 @@ from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 
 NEIGHBOURS = 20                        # points that tell a normal, and to which it is oriented
-DEEPEST = 10                           # octree of Poisson reconstruction: cells of 2 mm on a person
 
 
 class MissingLibrary(ImportError):
@@ -49,7 +48,8 @@ def screened_poisson(points: np.ndarray, normals: np.ndarray, spacing: float) ->
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals))
-    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(points, axis=0).max() / spacing)), 6, DEEPEST))
+    # octree of Poisson reconstruction: cells of 2 mm on a person
+    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(points, axis=0).max() / spacing)), 6, 10))
     found, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
 

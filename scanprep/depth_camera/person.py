@@ -7,11 +7,11 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from ..geometry.sparse import connected_pieces
 from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
 LEAST_AREA, LEAST_RADIUS = 0.075, 0.08  # of what is seen of a body, and of the largest circle in it: a leg has less
-BEHIND = 0.02                        # share of the picture that may seem to be behind a wall
 PIECE = 0.003                        # area below which a piece is noise
 APART = 0.08                         # pieces closer than this are one: an arm in front of its body
 THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, cosine within which points are on one
@@ -110,7 +110,7 @@ def room_planes(picture: DepthPicture, size: float) -> np.ndarray:
         mine = _on(p, n, normal, offset)
         behind = np.mean(points[picture.seen] @ normal - offset < -2 * _thickness(points[picture.seen]))
         # of floors and walls; of what something is behind: two backs are not that large
-        if _areas(picture, p[mine], n[mine]).sum() < (0.6 if behind > BEHIND else 0.2) * size**2:
+        if _areas(picture, p[mine], n[mine]).sum() < (0.6 if behind > 0.02 else 0.2) * size**2:
             break
         taken[picture.seen] |= np.abs(points[picture.seen] @ normal - offset) < _thickness(points[picture.seen])
         open_ &= ~taken
@@ -162,15 +162,11 @@ def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.nda
 
 def _label_pieces(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
     """(h, w) numbers of pieces of a mask whose neighbours hang together; `across` (h, w - 1), `down` (h - 1, w)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     index = np.arange(mask.size).reshape(mask.shape)
     right, below = across & mask[:, 1:] & mask[:, :-1], down & mask[1:] & mask[:-1]
     a = np.concatenate([index[:, :-1][right], index[:-1][below]])
     b = np.concatenate([index[:, 1:][right], index[1:][below]])
-    graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(mask.size, mask.size))
-    return np.asarray(connected_components(graph, directed=False)[1].reshape(mask.shape))
+    return connected_pieces(a, b, mask.size).reshape(mask.shape)
 
 
 def _area_and_radius(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:

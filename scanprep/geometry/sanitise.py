@@ -8,21 +8,17 @@ import itertools
 import warnings
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..threads import search_threads
 from ..words import number_of
 from .mesh import Mesh
 from .places import distinct_rows
+from .sparse import connected_pieces
 from .surface import Rays
 
-FLAT = 1e-9              # area over squared longest side: float32 files leave no flatter triangle that has a normal
 SAMPLES = 400            # triangles of each patch that look for what is in front of them and behind
-WAYS = 4                 # rays of each, to either side
 REACH = 0.15             # of the diagonal, that a ray goes: through a trunk, but not across a room
-SURE = 5.0               # standard deviations by which that must differ from chance
 
 
 def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
@@ -79,7 +75,8 @@ def _surface_triangles(mesh: Mesh) -> tuple[np.ndarray, list[str]]:
     """Which triangles (F,) bool are surface, and what the others are."""
     sides = mesh.corners - np.roll(mesh.corners, -1, axis=1)
     longest = np.einsum("fsd,fsd->fs", sides, sides).max(axis=1)
-    flat = mesh.face_areas <= FLAT * longest
+    # area over squared longest side: float32 files leave no flatter triangle that has a normal
+    flat = mesh.face_areas <= 1e-9 * longest
     notes = [f"{number_of(flat.sum(), 'triangle')} without area dropped"] if flat.any() else []
     group = distinct_rows(np.sort(mesh.faces, axis=1))
     if group is None:
@@ -116,14 +113,12 @@ def invert_against_neighbours(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     first, second = mesh.side_pairs.T
     a, b = first // 3, second // 3
     if mesh.is_edge_manifold:
-        links = coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
-        return np.zeros(count, dtype=bool), connected_components(links, directed=False)[1]
+        return np.zeros(count, dtype=bool), connected_pieces(a, b, count)
     forward = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).ravel()
     agree = forward[first] != forward[second]
     # Every triangle is there twice, as it is and inverted; what faces the same way hangs together.
     rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
-    _, patch = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count)),
-                                    directed=False)
+    patch = connected_pieces(rows, columns, 2 * count)
     as_is, turned = patch[:count], patch[count:]
     area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
     invert = area[turned] > area[as_is]
@@ -142,7 +137,8 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     order = order[np.argsort(patch[order], kind="stable")]
     size = np.bincount(patch)
     rank = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
-    some = np.repeat(order[rank < SAMPLES], WAYS)
+    # rays of each, to either side
+    some = np.repeat(order[rank < SAMPLES], 4)
     around, reach = _directions(mesh.face_normals[some], rng), REACH * float(np.linalg.norm(np.ptp(
         mesh.vertices, axis=0)))
     start, off = mesh.corners[some].mean(axis=1), 1e-4 * reach * mesh.face_normals[some]
@@ -154,7 +150,8 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     spread = np.sqrt(np.bincount(patch[some], vote**2, len(size)))
     share = total / np.maximum(np.bincount(patch[some], mesh.face_areas[some], len(size)), 1e-300)
     # share of the rays by which the front must be hidden more often than the back
-    known = (np.abs(share) > 0.05) & (np.abs(total) > SURE * spread)
+    # standard deviations by which that must differ from chance
+    known = (np.abs(share) > 0.05) & (np.abs(total) > 5.0 * spread)
     turn = known & (total > 0)
     if turn.any() and not known.all():
         turn |= ~known & _against_nearest(mesh, patch, known, turn)

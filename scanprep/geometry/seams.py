@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from .sparse import connected_pieces
 
 
 def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
@@ -27,7 +27,7 @@ def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     if not len(again):
         return None
     a, b = ends[order[again]].ravel(), ends[order[again + 1]].ravel()
-    _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(vertices),) * 2), directed=False)
+    label = connected_pieces(a, b, len(vertices))
     first = np.unique(label, return_index=True)[1]
     return np.argsort(np.argsort(first))[label]
 

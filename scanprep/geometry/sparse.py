@@ -22,6 +22,18 @@ def sum_groups(gather: csr_array, values: np.ndarray) -> np.ndarray:
     return (gather @ values.reshape(len(values), math.prod(values.shape[1:]))).reshape(-1, *values.shape[1:])
 
 
+def connected_pieces(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    """The number (count,) of the piece that each of so many things is in, which links from a (n,) to b (n,) join.
+
+    Examples
+    --------
+    >>> connected_pieces(np.array([0, 3]), np.array([1, 1]), 4).tolist()
+    [0, 0, 1, 0]
+    """
+    links = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1])
+
+
 def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
     """The solver, (n,) or (n, k) -> the same shape, of a sparse symmetric positive definite matrix, with SuperLU.
 

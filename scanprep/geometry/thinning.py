@@ -4,12 +4,11 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .mesh import Mesh
 from .places import distinct_rows
+from .sparse import connected_pieces
 
 MOST = 1_000_000         # triangles of a person about 1.8 mm long; what has less than twice as many is left as it is
 
@@ -90,9 +89,7 @@ def _join(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray
     row[members] = np.arange(len(members))
     a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     inner = (row[a] >= 0) & (new[a] == new[b])
-    links = coo_array((np.ones(np.count_nonzero(inner), dtype=bool), (row[a[inner]], row[b[inner]])),
-                      shape=(len(members), len(members)))
-    return np.asarray(connected_components(links, directed=False)[1])
+    return connected_pieces(row[a[inner]], row[b[inner]], len(members))
 
 
 def _without_pleats(faces: np.ndarray) -> np.ndarray:

@@ -21,7 +21,6 @@ from .scene import Pane, framed_alike, pack_scene, picture_panes
 from .sheets import png_bytes, webp_bytes
 
 VIEWER = Path(__file__).parents[1] / "viewer"
-PICTURE, WIDEST = 300, 1400          # pixels: height and width of pictures that stand for bodies
 # The viewer travels compressed: a browser that cannot take it apart, or has no WebGL, goes on showing the pictures.
 START = """(async () => {
 const raw = atob(document.getElementById("viewer").textContent), bytes = Uint8Array.from(raw, (c) => c.charCodeAt(0));
@@ -85,8 +84,9 @@ class Page:
         """
         panes = framed_alike(panes)
         if picture is None:
-            low, camera = min(height, PICTURE), panes[0].camera
-            columns = max(1, int(WIDEST / max(110, low * camera.width / camera.height + 18)))
+            # pixels: height and width of pictures that stand for bodies
+            low, camera = min(height, 300), panes[0].camera
+            columns = max(1, int(1400 / max(110, low * camera.width / camera.height + 18)))
             picture = picture_panes(panes, low, columns)
         self._parts.append(self.turning(pack_scene(panes), picture, caption, height))
         return self

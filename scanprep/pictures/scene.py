@@ -27,7 +27,6 @@ FORMAT = 1
 SCENE = "picture.scene"              # beside a picture, for the page of many
 SMALL = 8000                         # triangles of a shape in it
 MOST_TURN, MOST_BYTES = 20, 4_000_000        # figures that turn on a page of many
-FINE = 2e-5                          # metres: step of what one column adds to a motion
 NO_INDEX = 255                       # place in a palette of vertices without a value; it has as many colours before
 
 
@@ -193,7 +192,8 @@ def _hex(colors: np.ndarray) -> str:
 
 def _steps(values: np.ndarray, axes: int | tuple[int, ...], factor: np.ndarray | float) -> np.ndarray:
     """Steps that 16 bits can count, no smaller than is seen when the values are taken so many times."""
-    return np.maximum(np.abs(values).max(axis=axes, initial=1e-12) / 32767, FINE / np.maximum(factor, 1e-9))
+    # metres: step of what one column adds to a motion
+    return np.maximum(np.abs(values).max(axis=axes, initial=1e-12) / 32767, 2e-5 / np.maximum(factor, 1e-9))
 
 
 def _motion(moving: Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:

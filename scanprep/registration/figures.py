@@ -17,7 +17,6 @@ from .limbs import Doubt
 from .nonrigid import Registration, stretched_share
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
-CROWDED = 0.3                  # share of a scan off the template that may be a second person, who is half of it
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
 FIGURES, TIMES, FAILURES, LIMBS = "registration.csv", "times.csv", "failures.csv", "limbs.csv"
@@ -199,9 +198,10 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
 
 
 def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt]) -> Verdict:
+    # share of a scan off the template that may be a second person, who is half of it
     over = {
         f"{100 * f.missed:.1f}% of the scan lies off the template: "
-        + ("a second person, or clutter?" if f.missed > CROWDED else "an uncovered limb, or clutter"):
+        + ("a second person, or clutter?" if f.missed > 0.3 else "an uncovered limb, or clutter"):
             f.missed / limits.missed,
         f"{1000 * f.distance:.1f} mm from the scan on average": f.distance / (limits.distance * size),
         f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here: a part of the body, or one view?":

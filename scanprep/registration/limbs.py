@@ -22,7 +22,6 @@ from ..synthetic.people import NAMED_POSES, PARENTS, PARTS, named_pose, random_p
 from .limb_ends import bending
 from .person import PersonParts, average_person
 
-DRAWN = 60                             # random poses beside the named ones that show what people do
 ROLL, BEND, SIDE = range(3)
 MOVED = ("rolled", "bent", "bent sideways")
 # Degrees by which joints of real people go beyond those of the synthetic ones (roll, bend, side), found on 57 scans
@@ -36,9 +35,6 @@ SHAPE = {"pelvis": 0.01, "abdomen": 0.01, "chest": 0.01, "head": 0.006, "upper_a
 LIMBS = range(3, len(PARTS))           # head, arms and legs; a trunk tells of the build
 SCALE = 0.18                           # logarithm: how much one limb may grow against the whole body
 GRAVE = 30                             # degrees beyond what people do that double a doubt
-# Degrees of roll beyond what people do, of a limb and of the same on the other side: with left and right exchanged the
-# shins have 85 and 77, 71 poses and 46 men have none; a limb that came to lie rolled has none on the other side.
-EXCHANGED = 45
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,10 @@ def exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarray) ->
     beyond = measures.beyond[:, ROLL]
     both = np.where(MIRROR_PART == np.arange(len(PARTS)), 0.0, np.minimum(beyond, beyond[MIRROR_PART]))
     limb = int(both.argmax())
-    if both[limb] <= EXCHANGED:
+    # Degrees of roll beyond what people do, of a limb and of the same on the other side: with left and right
+    # exchanged the shins have 85 and 77, 71 poses and 46 men have none; a limb that came to lie rolled has none on
+    # the other side.
+    if both[limb] <= 45:
         return None
     told = " and ".join(f"the {in_words(names[p])} by {abs(measures.angles[p, ROLL]):.0f}"
                         for p in (limb, int(MIRROR_PART[limb])))
@@ -200,7 +199,8 @@ def people_do() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Measured on the skin of the average synthetic person in its named poses and some random ones, left and right alike.
     """
     person, rng = average_person(), np.random.default_rng(0)
-    poses = [*map(named_pose, NAMED_POSES), *(random_pose(rng) for _ in range(DRAWN))]
+    # random poses beside the named ones that show what people do
+    poses = [*map(named_pose, NAMED_POSES), *(random_pose(rng) for _ in range(60))]
     bodies = np.stack([person.posed(pose) for pose in poses])
     angles = joint_angles(person.skeleton.fit_rotations(person.mesh, bodies))
     bent = np.stack([part_bending(person.mesh, person.skeleton, body)[0] for body in bodies])

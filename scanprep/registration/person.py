@@ -26,8 +26,6 @@ from .nonrigid import Registration, register, stretched_share
 from .schedule import RegistrationConfig
 
 MATCHING = 30                          # per cent of the time, before the person is registered
-ENOUGH = 4                             # landmarks from which the average person finds the others
-ENDS = 5                               # of limbs: head, hands and feet
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,8 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
             seeds = find_seeds(person, template)
         except ValueError:             # it has too few ends of limbs
             return None
-        if len(seeds) < ENDS:
+        # of limbs: head, hands and feet
+        if len(seeds) < 5:
             return None
         pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
                                      progress=lambda done, total: tell(round(MATCHING * done / total), 100))
@@ -129,7 +128,8 @@ def find_landmarks(template: Mesh, known: Mapping[str, int],
     """
     marks, given = landmarks(), known_landmarks(known)
     names, vertices, places = match_landmarks(marks, given, minimum=0)
-    led = (vertices, template.vertices[places]) if len(names) >= ENOUGH else None
+    # landmarks from which the average person finds the others
+    led = (vertices, template.vertices[places]) if len(names) >= 4 else None
     fit = _person_on(template, led, RegistrationConfig.quick(), progress or (lambda done, total: None))
     if fit is None:
         return given

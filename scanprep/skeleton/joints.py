@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from ..geometry.mesh import Mesh
+from ..geometry.sparse import connected_pieces
 from .motions import Motions, PosedSurface
 from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
@@ -29,8 +30,7 @@ def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, n
 
 def linked(links: np.ndarray, count: int) -> bool:
     """Whether links (n, 2) join all of `count` parts."""
-    graph = coo_array((np.ones(len(links)), links.T), shape=(count, count))
-    return bool(connected_components(graph, directed=False)[0] == 1)
+    return not connected_pieces(*links.T, count).any()
 
 
 def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:

@@ -12,7 +12,6 @@ from .tree import Skeleton
 
 ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
 LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
-FAR = 0.6                            # of a limb: elbows and knees are at 0.41 to 0.44, wrists, ankles at 0.75 to 0.81
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
@@ -199,6 +198,7 @@ def _limb_names(template: Mesh, skeleton: Skeleton, limb: list[int], kinds: dict
     if len(limb) in (3, 4) and lengths[0] < 0.45 * lengths[1]:          # too short for an upper arm or thigh
         lengths, lead = lengths[1:], (first,)
     n, whole = len(lengths), kinds[1][0]
-    if n == 2 and lengths[0] > FAR * lengths.sum():                     # the knee was never seen to bend, the ankle was
+    # of a limb: elbows and knees are at 0.41 to 0.44, wrists, ankles at 0.75 to 0.81
+    if n == 2 and lengths[0] > 0.6 * lengths.sum():                     # the knee was never seen to bend, the ankle was
         return *lead, whole, kinds[3][-1]
     return (*lead, *kinds[n]) if n in kinds else tuple(f"{whole}{k + 1}" for k in range(n))
