@@ -7,7 +7,7 @@ rotation that best carries the whole skin of a part, so that skin that lags behi
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -39,10 +39,11 @@ GRAVE = 30                             # degrees beyond what people do that doub
 
 @dataclass(frozen=True)
 class Doubt:
-    """Something that no person can do: how grave, 1 where it begins, and in words."""
+    """Something that no person can do: how grave, 1 where it begins, in words, and with which part."""
 
     excess: float
     words: str
+    part: int = field(default=-1, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,31 +64,24 @@ class LimbMeasures:
 
     def doubts(self, skeleton: Skeleton) -> tuple[Doubt, ...]:
         """What is unlikely, the gravest first."""
-        return tuple(doubt for doubt, _ in self._found(skeleton))
-
-    def doubted(self, skeleton: Skeleton) -> list[int]:
-        """The parts that are, the gravest first."""
-        return list(dict.fromkeys(part for _, part in self._found(skeleton)))
-
-    def _found(self, skeleton: Skeleton) -> list[tuple[Doubt, int]]:
-        """Every doubt with its part, the gravest first."""
-        found: list[tuple[Doubt, int]] = []
+        found: list[Doubt] = []
         for part in range(1, len(PARTS)):
             name, parent = (in_words(skeleton.names[k]) for k in (part, skeleton.parents[part]))
             kind = int(self.beyond[part].argmax())
             if self.beyond[part, kind] > 0:
-                found.append((Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
-                                    f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
-                                    f"against the {parent}"), part))
+                # 30 degrees beyond what people do double a doubt
+                found.append(Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
+                                   f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
+                                   f"against the {parent}", part))
             if part in LIMBS and self.bending[part] > self.most[part]:
-                found.append((Doubt(float(self.bending[part] / self.most[part]),
-                                    f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
-                                    "rolled, or slid"), part))
+                found.append(Doubt(float(self.bending[part] / self.most[part]),
+                                   f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
+                                   "rolled, or slid", part))
             if part in LIMBS and abs(self.growth[part]) > SCALE:
-                found.append((Doubt(abs(float(self.growth[part])) / SCALE,
-                                    f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
-                                    f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template"), part))
-        return sorted(found, key=lambda pair: -pair[0].excess)
+                found.append(Doubt(abs(float(self.growth[part])) / SCALE,
+                                   f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
+                                   f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template", part))
+        return tuple(sorted(found, key=lambda doubt: -doubt.excess))
 
 
 def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:

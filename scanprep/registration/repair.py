@@ -19,7 +19,7 @@ from ..judgement import size
 from ..threads import one_thread
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform
 from .graph_fit import GraphFit, fit_stages
-from .limbs import Doubt, frames, limb_doubts, limb_measures
+from .limbs import Doubt, frames, limb_doubts
 from .matches import Landmarks, prepare
 from .nonrigid import Registration, fit_surface, measured, near_origin, principal_stretches, uncovered_share
 from .person import PersonParts
@@ -57,7 +57,7 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     x = fit.mesh.vertices
     if parts is None or not config.rolls or not stages:
         return fit
-    doubted = limb_measures(template, parts, x).doubted(parts.skeleton)
+    doubted = list(dict.fromkeys(doubt.part for doubt in limb_doubts(template, parts, x)))
     if not doubted:
         return fit
     # the last stages match by positions alone: no path to landmarks or hints is needed
