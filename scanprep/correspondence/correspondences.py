@@ -17,7 +17,6 @@ from ..geometry.mesh import Mesh
 KIND, VERSION = "correspondences", 1
 
 
-
 @dataclass(frozen=True, eq=False)
 class Correspondences:
     """Which vertex of the template lies where on the scan."""

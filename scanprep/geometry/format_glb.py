@@ -373,10 +373,14 @@ def encode(contents: Contents, double: bool) -> bytes:
     assert contents.faces is not None, "a GLB file is written for meshes"
     up = tallest(contents.vertices)
     glb, mesh = Glb(), Mesh(contents.vertices @ turn_up(up).T, contents.faces, contents.colors)
-    return glb.pack({
-        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [glb.add_surface(mesh)]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}]}, up)
+    material = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}
+    return glb.pack(one_mesh({"primitives": [glb.add_surface(mesh)]}, material, {}), up)
+
+
+def one_mesh(mesh: dict[str, Any], material: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+    """The document of a scene that shows one mesh in one node, for `Glb.pack`."""
+    return {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{**node, "mesh": 0}], "meshes": [mesh],
+            "materials": [material]}
 
 
 class Glb:

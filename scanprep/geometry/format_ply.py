@@ -266,8 +266,6 @@ def _strips(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return strip_triangles(corners[listed].astype(np.int64), np.unique(strip[listed], return_counts=True)[1])
 
 
-
-
 def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertices: np.ndarray) -> np.ndarray:
     """(F, 3) triangles between neighbours in the grid of a range scanner, whose cells hold one vertex or none."""
     if rows <= 0 or len(sizes) % rows or not np.isin(sizes, (0, 1)).all():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.format_common import load_bytes, metres_per_unit
-from ..geometry.format_glb import Glb, chunks_of, file_beside, some_normal, tallest, turn_up, up_of
+from ..geometry.format_glb import Glb, chunks_of, file_beside, one_mesh, some_normal, tallest, turn_up, up_of
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
 from ..geometry.surface import Rays, barycentric
@@ -190,9 +190,8 @@ def write_textured(path: str | Path, texture: Texture) -> None:
     material = skin_material((1, 1, 1))
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
-    write(path, glb.pack({
-        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
-        "meshes": [{"primitives": [surface]}], "images": [image], "textures": [{"source": 0}]}, up))
+    document = one_mesh({"primitives": [surface]}, material, {"name": "body"})
+    write(path, glb.pack({**document, "images": [image], "textures": [{"source": 0}]}, up))
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
