@@ -11,7 +11,7 @@ from scanprep.registration.deformation_graph import build_graph, deform
 from scanprep.registration.graph_fit import start_fit
 from scanprep.registration.limbs import beyond_people, exchanged_sides, frames, joint_angles, limb_doubts
 from scanprep.registration.matches import prepare
-from scanprep.registration.nonrigid import Registration, measured
+from scanprep.registration.nonrigid import Registration, measure_fit
 from scanprep.registration.person import PersonParts, average_person, person_parts
 from scanprep.registration.repair import better, motion_of, repaired, rolled
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
@@ -39,7 +39,7 @@ def parts(person):
 def registration(person, scan, x):
     """What a registration with vertices (N, 3) says of itself."""
     fit = replace(start_fit(person.mesh, np.eye(4), 300), x=x, moved=0.0)
-    return measured(prepare(person.mesh, scan), fit, scan)
+    return measure_fit(prepare(person.mesh, scan), fit, scan)
 
 
 def with_rolled_skin(person, body, part, angle):

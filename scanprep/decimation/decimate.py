@@ -12,7 +12,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.remeshing import improve_triangles
 from ..geometry.surface import Surface
 from ..ranges import FLAG, Settings
-from .edge_collapse import FIXED, HOLD, Rounds, followed
+from .edge_collapse import FIXED, HOLD, Rounds, final_owner
 from .quadrics import lowest, sum_at, surface_quadrics
 
 Method = Literal["quadric", "even", "fast", "open3d", "pymeshlab"]
@@ -175,7 +175,7 @@ def fast_collapses(mesh: Mesh, faces: int) -> Mesh:
     while True:
         owner = np.arange(len(mesh.vertices))
         owner[collapses[~undone, 1]] = collapses[~undone, 0]      # the second goes into the first
-        kept, number = np.unique(followed(owner), return_inverse=True)
+        kept, number = np.unique(final_owner(owner), return_inverse=True)
         corners = number[mesh.faces]
         whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
         left = Mesh(lowest(sum_at(number[:, None], quadrics, len(kept))) + centre, corners[whole])

@@ -17,7 +17,7 @@ from ..geometry.landmarks import read_landmark_vertices, write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
 from ..skeleton.tree import Skeleton
-from .edge_collapse import FIXED, Rounds, checked_vertices, kept_curves, wall_quadrics
+from .edge_collapse import FIXED, Rounds, check_vertices, curves_to_keep, wall_quadrics
 from .quadrics import lowest, sum_at, surface_quadrics
 
 Progress = Callable[[int, int], None]
@@ -69,7 +69,7 @@ class DecimatedSet:
         kept = vertices[..., self.vertex_map, :]
         if self.config.placement == "vertices":
             return kept
-        curves = kept_curves(self.source, self.labels)
+        curves = curves_to_keep(self.source, self.labels)
         for place in np.ndindex(vertices.shape[:-2]):
             kept[place] = self._solve(vertices[place], curves)
         return kept
@@ -131,7 +131,7 @@ def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: D
     if skeleton is not None and len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"skeleton: expected {len(template.faces)} faces as the template has, "
                          f"got {len(skeleton.part_of_face)}")
-    keep = checked_vertices(template, np.zeros(0) if keep is None else keep)
+    keep = check_vertices(template, np.zeros(0) if keep is None else keep)
     labels = None if skeleton is None else skeleton.part_of_face
     points = _different_meshes(template, poses, config.meshes)
     rounds = Rounds(template, points.swapaxes(0, 1), keep, labels, onto_vertices=config.placement == "vertices")

@@ -328,7 +328,7 @@ def as_bytes(colors: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)
 
 
-def structured(columns: Iterable[tuple[Sequence[str], str, np.ndarray | None]]) -> np.ndarray:
+def as_rows(columns: Iterable[tuple[Sequence[str], str, np.ndarray | None]]) -> np.ndarray:
     """Rows with named fields, little-endian, of arrays (N, k) with the names of their columns and their kind."""
     given = [(names, kind, values) for names, kind, values in columns if values is not None]
     rows = np.zeros(len(given[0][2]), dtype=[(name, "<" + kind) for names, kind, _ in given for name in names])

@@ -20,11 +20,11 @@ from .format_common import (
     MeshFileError,
     as_bytes,
     as_colors,
+    as_rows,
     fields_of,
     polygons,
     quote,
     strip_triangles,
-    structured,
 )
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -300,7 +300,7 @@ def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertice
 def encode(contents: Contents, double: bool) -> bytes:
     """A binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
     number = "f8" if double else "f4"
-    rows = structured([(("x", "y", "z"), number, contents.vertices), (("nx", "ny", "nz"), number, contents.normals),
+    rows = as_rows([(("x", "y", "z"), number, contents.vertices), (("nx", "ny", "nz"), number, contents.normals),
                        (_COLORS[0], "u1", None if contents.colors is None else as_bytes(contents.colors))])
     words = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]

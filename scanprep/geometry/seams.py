@@ -41,7 +41,7 @@ def _border(faces: np.ndarray, count: int) -> np.ndarray:
     return half[order[new[1:] & new[:-1]]]
 
 
-def merged_mean(values: np.ndarray, vertex_of: np.ndarray) -> np.ndarray:
+def mean_of_merged(values: np.ndarray, vertex_of: np.ndarray) -> np.ndarray:
     """(n, k) the mean over the vertices that became one; `values` (N, k), `vertex_of` (N,) as of `seams_closed`."""
     total = np.zeros((vertex_of.max() + 1, values.shape[1]))
     np.add.at(total, vertex_of, values)

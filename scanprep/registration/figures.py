@@ -14,7 +14,7 @@ from ..judgement import Judgement
 from ..ranges import Settings
 from ..words import number_of
 from .limbs import Doubt
-from .nonrigid import Registration, stretched_share
+from .nonrigid import Registration, share_stretched
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 NONE = "none"                  # what a table says where a figure has no value
@@ -48,7 +48,7 @@ def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanF
     return ScanFigures(
         name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)
+        share_stretched(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)
 
 
 _TABLED = [f for f in fields(ScanFigures) if f.name not in ("seconds", "doubts")]

@@ -135,10 +135,10 @@ class _SurfaceFit:
 
     def fields(self, x: np.ndarray, stage: FinalFitRound) -> tuple[Field, Field]:
         """The field of rotations and stretches measured, and the smooth one, in which what disagrees counts little."""
-        measured = self.triangles.measured(x)
+        measured = self.triangles.measure(x)
         weights = np.ones(len(self.template.faces))
         for _ in range(2):
-            smooth = self.triangles.smoothed(measured, stage.field * self.size, weights)
+            smooth = self.triangles.smooth(measured, stage.field * self.size, weights)
             off = np.linalg.norm(measured.gradient - smooth.gradient, axis=(1, 2))
             weights = 1 / (1 + (off / 0.5) ** 2) ** 2
         return measured, smooth

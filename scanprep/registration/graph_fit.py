@@ -20,7 +20,7 @@ from ..geometry.target import orient
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, refine_motion
 from .graph_energy import UNKNOWNS, node_pattern, terms
 from .limb_ends import End, RigidFit, bending, find_ends, rotate_ends
-from .matches import NORMALS, Fit, Inputs, Pull, landmark_pull, pull, wanted_by
+from .matches import NORMALS, Fit, Inputs, Pull, landmark_pull, pull, pull_of_stage
 from .schedule import GraphStage, RegistrationConfig
 
 
@@ -99,7 +99,7 @@ def fit_stage(inputs: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
     target, sample = inputs.target.thinned(cell), thin(template.vertices, cell)
     fit = fit.refine(template, stage.nodes)
     for _ in range(stage.rounds):
-        fit = fit.minimise(wanted_by(inputs, stage, fit.x, target, sample), stage, inputs.size, 1)
+        fit = fit.minimise(pull_of_stage(inputs, stage, fit.x, target, sample), stage, inputs.size, 1)
     return fit
 
 

@@ -116,11 +116,11 @@ def limb_measures(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> L
 
 def beyond_people(angles: np.ndarray) -> np.ndarray:
     """By how much joint angles (..., 16, 3), degrees, are beyond what any person does."""
-    low, high = allowed()
+    low, high = angle_limits()
     return np.maximum(np.maximum(low - angles, angles - high), 0)
 
 
-def allowed() -> tuple[np.ndarray, np.ndarray]:
+def angle_limits() -> tuple[np.ndarray, np.ndarray]:
     """The lowest and the highest joint angles (16, 3), degrees, that are not doubted."""
     low, high, _ = people_do()
     slack = np.array([SLACK[part_kind(part)] for part in PARTS])

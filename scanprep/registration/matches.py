@@ -238,7 +238,7 @@ def hint_pull(hints: Correspondences, x: np.ndarray, reach: float, area: float) 
     return pull(len(x), hints.template_vertices, hints.scan_points, area * weights)
 
 
-def wanted_by(inputs: Inputs, stage: GraphStage, x: np.ndarray, target: Target, sample: np.ndarray) -> Pull:
+def pull_of_stage(inputs: Inputs, stage: GraphStage, x: np.ndarray, target: Target, sample: np.ndarray) -> Pull:
     """What landmarks, matches and hints want of vertices (N, 3); those in the sample (n,) look for a match."""
     size, template = inputs.size, inputs.template
     wanted = landmark_pull(len(x), inputs.landmarks, stage.landmarks * size**2)

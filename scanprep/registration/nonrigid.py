@@ -151,7 +151,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     fit = METHODS[config.method](inputs, T, config, lambda done, total: tell(90 * done // total, 100))
     fit = fit_surface(inputs, fit, config)
     tell(100, 100)
-    return measured(inputs, fit, scan)
+    return measure_fit(inputs, fit, scan)
 
 
 def fit_surface(inputs: Inputs, fit: Fit, config: RegistrationConfig) -> Fit:
@@ -169,7 +169,7 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
     `marked` is whether landmarks led it.
     """
     points = scan.vertices if isinstance(scan, Mesh) else scan
-    far, seen, stretch = fit.uncovered, float(fit.seen.mean()), stretched_share(template, fit.mesh)
+    far, seen, stretch = fit.uncovered, float(fit.seen.mean()), share_stretched(template, fit.mesh)
     off = fit.landmark_rms > HAND * size(template)
     # with left and right exchanged 0.13 are not covered and 0.10 stretched. A part alone, with which the rest of the
     # template is only invented: shins and feet give 0.15 of it data, one half 0.49, one view 0.26 to 0.46. The more of
@@ -187,7 +187,7 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
             f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")
 
 
-def measured(inputs: Inputs, fit: Fit, scan: Mesh | np.ndarray) -> Registration:
+def measure_fit(inputs: Inputs, fit: Fit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
     body, size = inputs.template.with_vertices(fit.x), inputs.size
     found = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
@@ -262,7 +262,7 @@ def uncovered_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, sampl
     return float((Surface(registered).closest(points).distances > far).mean())
 
 
-def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
+def share_stretched(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
     """Share of the template's area that is longer by `factor`, or shorter, in some direction than most of the body is.
 
     Somebody smaller or slimmer than the template is nowhere stretched: one right registration had 0.058 that were half

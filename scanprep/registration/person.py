@@ -22,7 +22,7 @@ from ..geometry.surface import Surface
 from ..skeleton.tree import Skeleton
 from ..synthetic.landmarks import landmarks
 from ..synthetic.people import PARENTS, PARTS, Person
-from .nonrigid import Registration, register, stretched_share
+from .nonrigid import Registration, register, share_stretched
 from .schedule import RegistrationConfig
 
 MATCHING = 30                          # per cent of the time, before the person is registered
@@ -100,7 +100,7 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
         fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(
             round(MATCHING + (100 - MATCHING) * done / total), 100))
     # shares of a template and of the person on it beyond which it is no person
-    return None if fit.uncovered > 0.02 or stretched_share(person, fit.mesh) > 0.05 else fit
+    return None if fit.uncovered > 0.02 or share_stretched(person, fit.mesh) > 0.05 else fit
 
 
 def find_landmarks(template: Mesh, known: Mapping[str, int],

@@ -21,7 +21,7 @@ from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform
 from .graph_fit import GraphFit, fit_stages
 from .limbs import Doubt, frames, limb_doubts
 from .matches import Landmarks, prepare
-from .nonrigid import Registration, fit_surface, measured, near_origin, principal_stretches, uncovered_share
+from .nonrigid import Registration, fit_surface, measure_fit, near_origin, principal_stretches, uncovered_share
 from .person import PersonParts
 from .rolls import other_rolls
 from .schedule import RegistrationConfig
@@ -80,7 +80,7 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     best = min(looks, key=lambda look: look[:2], default=None)
     if best is not None and best[0] + LESS_DOUBTED < now:
         end = fit_surface(inputs, fit_stages(inputs, best[2], stages[len(coarse) - 1:]), config)
-        found = measured(inputs, end, scan)
+        found = measure_fit(inputs, end, scan)
         if better(template, parts, found, fit):
             fit = replace(found, rolled=True)
     tell(len(tries) + 1, len(tries) + 1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..geometry import rotations
 from ..synthetic.people import PARENTS, PARTS
-from .limbs import GRAVE, LIMBS, ROLL, allowed, angles_of_joint, frames
+from .limbs import GRAVE, LIMBS, ROLL, angle_limits, angles_of_joint, frames
 from .person import PersonParts
 
 STEPS = 24                             # rolls that are tried, all round
@@ -49,7 +49,7 @@ def joint_costs(R: np.ndarray) -> np.ndarray:
     World rotations R (16, 3, 3) are against the rest of the synthetic people.
     """
     turns = 2 * np.pi / STEPS * np.arange(STEPS)
-    low, high = allowed()
+    low, high = angle_limits()
     costs = np.zeros((len(PARTS), STEPS, STEPS))
     for part in range(1, len(PARTS)):
         above, own = (R[p] @ rotations.exp(turns[:, None] * frames()[p, 0]) for p in (PARENTS[part], part))

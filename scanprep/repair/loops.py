@@ -20,7 +20,8 @@ def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
         facing = np.array([_met(points, owner, ahead, number, len(loops)) for number in large])
         both = np.zeros((len(loops), len(loops)), dtype=bool)
         both[large] = facing > 0.6
-        label = connected_pieces(*np.nonzero(both & both.T), len(loops))
+        a, b = np.nonzero(both & both.T)
+        label = connected_pieces(a, b, len(loops))
     return [[loops[k] for k in np.flatnonzero(label == label[number])]
             for number in np.unique(label, return_index=True)[1]]
 

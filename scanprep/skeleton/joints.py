@@ -30,7 +30,7 @@ def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, n
 
 def linked(links: np.ndarray, count: int) -> bool:
     """Whether links (n, 2) join all of `count` parts."""
-    return not connected_pieces(*links.T, count).any()
+    return not connected_pieces(links[:, 0], links[:, 1], count).any()
 
 
 def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ from .joints import (
 from .motions import PosedSurface
 from .names import name_parts
 from .parts import FADING, PartSearch, SkeletonConfig, find_parts
-from .symmetry import Symmetry, find_symmetry, mirrored_poses
+from .symmetry import Symmetry, find_symmetry, mirror_poses
 from .tree import Skeleton, reorder
 
 Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
@@ -63,7 +63,7 @@ class SkeletonFinder:
         symmetry = self.symmetry if tied else None
         runs = _restarts(self.surface, config, symmetry, tell, kept)                # [Articulated] E- and M-steps
         if tied and self.symmetry.holds and _is_held_back(_best(runs)):     # few poses: a limb bends on one side alone
-            both = np.concatenate([poses, mirrored_poses(template, poses, self.symmetry)])
+            both = np.concatenate([poses, mirror_poses(template, poses, self.symmetry)])
             self.surface = PosedSurface(template, both)
             runs = _restarts(self.surface, config, symmetry, tell, kept, "mirrored")
         self.first, self.runs = runs[0], sorted(runs, key=lambda run: run.score)

@@ -62,7 +62,7 @@ class Symmetry(MirrorPlane):
         return bool(self.left.any()) and not bool(self.left.all())
 
 
-def mirrored_poses(template: Mesh, poses: np.ndarray, symmetry: Symmetry) -> np.ndarray:
+def mirror_poses(template: Mesh, poses: np.ndarray, symmetry: Symmetry) -> np.ndarray:
     """Poses (M, N, 3), metres, with left and right exchanged: what a body does on one side it can do on the other."""
     body = template if symmetry.pose < 0 else template.with_vertices(poses[symmetry.pose])
     image = Surface(body).closest(symmetry.image)
