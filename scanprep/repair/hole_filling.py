@@ -140,7 +140,7 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
     groups = group_loops(mesh, loops) if config.join else [[loop] for loop in loops]
     work = _Filling(mesh, config, SeenSpace(views) if len(views) else None, Rays(mesh))
     # fair patches for all of them; holes with a bad one, or all where only diffusion is wanted, are left open
-    fair: list[FilledHole | None] = [None] * len(groups)
+    fair = list[FilledHole | None]([None] * len(groups))
     filled = mesh
     if config.method != "diffusion":
         filled = work.fair_patches(mesh, groups, progress=progress)
