@@ -21,7 +21,7 @@ _SOME = 20                           # of them at a time
 def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: str | None = None,
                  names: Names | None = None, ground: bool = False, front: bool = False
                  ) -> tuple[Rig, np.ndarray, np.ndarray]:
-    """The same body and motion as animation programs expect them; what GLB, BVH and USD files are written from.
+    """The same body and motion as animation programs expect them; what GLB and BVH files are written from.
 
     The surface moves as before, but for `ground` and `front`, which place the whole anew. Bones get axes along the
     limbs (`aimed`).
