@@ -189,7 +189,12 @@ def lifted_slopes(lift: Lift, pose: np.ndarray) -> np.ndarray:
 
 def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
     """The features of a model file, or ValueError."""
-    J, kind = len(skeleton.parents), header["lift"]
+    J = len(skeleton.parents)
+    if "direction_count" in arrays:             # of the first version, which had linear ones only
+        kept = storage.numbers(arrays, "direction_count", J)
+        directions = storage.numbers(arrays, "directions", int(kept.sum()), 3)
+        return linear_features(skeleton, tuple(np.split(directions.T, np.cumsum(kept)[:-1], axis=1)))
+    kind = header["lift"]
     if kind == RadialLift.kind:
         radius = storage.numbers(arrays, "lift_radius", J)
         if not (radius > 0).all():

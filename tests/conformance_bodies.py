@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from completion_bodies import MEAN, SD
 from model_bodies import worm, worm_model, worm_skeleton
+from toy_kind import ToyModel
 
 from model.blend_weights import diffused_weights
 from model.body import BodyModel
@@ -81,6 +82,12 @@ def skinned_worm(correctives: bool) -> SkinningModel:
                          float(variances.sum()), **LEARNED)
 
 
+def toy_worm() -> ToyModel:
+    """The worm as the kind that only the tests know."""
+    skin = skinned_worm(False)
+    return ToyModel(skin.template, skin.skeleton, skin.weights, **LEARNED)
+
+
 def radial_lift() -> RadialLift:
     """Three bells a joint."""
     rng = np.random.default_rng(3)
@@ -107,4 +114,5 @@ KINDS: dict[str, Callable[[], BodyModel]] = {
     "blendscape": blendscape_worm,
     "skinning-plain": lambda: skinned_worm(False),
     "skinning-linear": lambda: skinned_worm(True),
+    "toy": toy_worm,
 }

@@ -17,10 +17,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import save_arrays
 
 from ..body import BodyModel
-from ..features import RotationLift
 from ..linear import Subject
 from ..rig import Correctives, Rig, make_rig
-from ..skinning import SkinningModel
 
 AT_ONCE = 256                        # frames that are held at a time, of a few points
 SEEN = 100                           # frames whose whole bodies say what is lacking: 200 say the same to 0.02 mm
@@ -142,8 +140,8 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
         "shapedirs": np.moveaxis(rig.shapes, 0, -1).astype(np.float32),
         "part_names": np.array(model.skeleton.names, dtype=str), "betas_unit": np.array("standard deviation"),
         "length_unit": np.array("metre")}
-    if isinstance(model, SkinningModel) and model.features.lift.kind == RotationLift.kind and len(model.correctives):
-        arrays["posedirs"] = np.moveaxis(model.correctives, 0, -1)
+    if model.pose_directions is not None:
+        arrays["posedirs"] = model.pose_directions
     elif draws and J > 1:
         poses = sample_poses(model, draws, np.random.default_rng(0))
         arrays["posedirs"] = pose_directions(rig, poses, model.subject(mean).vertices(poses)).astype(np.float32)

@@ -3,11 +3,11 @@
     python tests/benchmarks/other_programs.py --folder DIR [-m MODEL.npz --motion MOTION.npz] [-o FILE]
         [--bpy PYTHON] [--npm DIR]
 
-The motion, else a walk of a synthetic person, is exported as GLB, BVH and, by the command of model/README.md, FBX, a body
-at rest as static GLB. Every file is opened in Blender (a Python that has `bpy`, named by `--bpy` or `$BPY`), GLB in three.js (headless Chromium, skinned on the processor); the Khronos
-validator checks GLB. `--npm` or `$NPM` is a folder in which `npm install three gltf-validator` was called. Programs
-that are not there are left out. The result holds a row
-for each file and program; a new file is a new entry of `cases`, a new program a new entry of `PROGRAMS`.
+The motion, else a walk of a synthetic person, is exported as GLB, BVH and, by the command of model/README.md, FBX, a
+body at rest as static GLB. Every file is opened in Blender (a Python that has `bpy`, named by `--bpy` or `$BPY`), GLB
+in three.js (headless Chromium, skinned on the processor); the Khronos validator checks GLB. `--npm` or `$NPM` is a
+folder in which `npm install three gltf-validator` was called. Programs that are not there are left out. The result
+holds a row for each file and program; a new file is a new entry of `cases`, a new program one of `PROGRAMS`.
 """
 from __future__ import annotations
 
