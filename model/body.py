@@ -196,8 +196,8 @@ class BodyModel(ABC):
             "vertices": self.template.vertices, "faces": self.template.faces.astype(np.int32),
             "part_of_face": skeleton.part_of_face.astype(np.int32), "parents": skeleton.parents,
             "joints": skeleton.joints, "feature_part": features.part, "feature_mix": features.mix,
-            **{f"lift_{name}": array for name, array in features.lift.arrays().items()}, "pose_mean": self.pose_mean,
-            "pose_covariance": self.pose_covariance, "pose_examples": self.pose_examples, **self.arrays()}
+            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance, "pose_examples": self.pose_examples,
+            **self.arrays()}
         header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
                   "versions": versions(), "names": list(skeleton.names), "lift": features.lift.kind, "info": self.info}
         storage.save(path, self.kind, VERSION, arrays, {**header, **self.notes()})

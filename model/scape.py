@@ -236,7 +236,7 @@ class ScapeModel(BodyModel):
         moved = _with_pose_space(moved, poses, follow.positions(self.subject(None).vertices(poses)), rounds)
         return _with_shape_space(moved, self, follow, poses[:8], rounds, progress) if self.n_betas else moved
 
-    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, np.ndarray]:
+    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, Any]:
         """What a kind built on this one keeps besides, on other triangles."""
         return {}
 
@@ -348,7 +348,7 @@ class BlendScapeModel(ScapeModel):
     def arrays(self) -> dict[str, np.ndarray]:
         return {**super().arrays(), "blend": self.blend}
 
-    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, np.ndarray]:
+    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, Any]:
         blend = np.empty((sum(len(piece.new_faces) for piece in pieces), self.blend.shape[1]))
         for piece in pieces:
             blend[piece.new_faces] = piece.average(self.blend[piece.old_faces])

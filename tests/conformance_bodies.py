@@ -11,7 +11,7 @@ from toy_kind import ToyModel
 
 from model.blend_weights import diffused_weights
 from model.body import BodyModel
-from model.features import Lift, PoseFeatures, QuadraticLift, RadialLift
+from model.features import Lift, PoseFeatures, QuadraticLift, QuaternionLift
 from model.learning.skinning import corrective_features
 from model.pose_space import PoseSpace
 from model.scape import BlendScapeModel, ScapeModel
@@ -88,12 +88,6 @@ def toy_worm() -> ToyModel:
     return ToyModel(skin.template, skin.skeleton, skin.weights, **LEARNED)
 
 
-def radial_lift() -> RadialLift:
-    """Three bells a joint."""
-    rng = np.random.default_rng(3)
-    return RadialLift(rng.normal(0, 0.5, (4, 3, 3)), rng.uniform(0.5, 1.0, 4))
-
-
 def stiff_bodies() -> dict[str, BodyModel]:
     """Models of one part, without anything that deforms it."""
     plain = scape_worm()
@@ -110,7 +104,7 @@ def stiff_bodies() -> dict[str, BodyModel]:
 KINDS: dict[str, Callable[[], BodyModel]] = {
     "scape-linear": scape_worm,
     "scape-quadratic": lambda: scape_worm(QuadraticLift()),
-    "scape-radial": lambda: scape_worm(radial_lift()),
+    "scape-quaternion": lambda: scape_worm(QuaternionLift()),
     "blendscape": blendscape_worm,
     "skinning-plain": lambda: skinned_worm(False),
     "skinning-linear": lambda: skinned_worm(True),
