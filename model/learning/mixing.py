@@ -28,9 +28,8 @@ from .config import LearnConfig
 from .regression import Design, compress, make_design
 from .scape import Progress, Work, check_skeleton, checked_bodies, fit_poses, pose_examples, pose_prior
 
-# What `learn_scape_mix` takes by default. `refinements` is the number of rounds: of up to six, held-out bodies were met best
-# after two.
-# Of a mix products of twists say more than of one person: 1.46 against 1.68 mm on new people.
+# What `learn_scape_mix` takes by default. `refinements` is the number of rounds: of up to six, held-out bodies were met
+# best after two. Of a mix products of twists say more than of one person: 1.46 against 1.68 mm on new people.
 MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005,
                   refinements=2)
 CORRECTIONS = 2                      # of Q and of S in a round, by what the stitched model leaves
