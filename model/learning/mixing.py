@@ -19,14 +19,14 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
-from ..digests import body_digests, digest
+from ..digests import body_digests, checked_bodies, digest
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
 from .regression import Design, compress, make_design
-from .scape import Progress, Work, check_skeleton, checked_bodies, fit_poses, pose_examples, pose_prior
+from .scape import Progress, Work, check_skeleton, fit_poses, pose_examples, pose_prior
 
 # What `learn_scape_mix` takes by default. `refinements` is the number of rounds: of up to six, held-out bodies were met
 # best after two. Of a mix products of twists say more than of one person: 1.46 against 1.68 mm on new people.
@@ -97,7 +97,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
                          f"{config.regressor!r} and {config.refinements}")
     check_template(template)
     check_skeleton(template, skeleton)
-    bodies = checked_bodies(template, bodies, "bodies")
+    bodies = checked_bodies(template, bodies, "bodies", 2)
     who, parts = number_people(subjects, len(bodies)), BlendedTemplate(template, skeleton, rigid_weights(skeleton))
     mix, inputs = Mix(parts, bodies, who, config), (parts, bodies, who, config)
 

@@ -1,7 +1,7 @@
 """A character as the mean of a body model: betas are then offsets from it, and poses bend it as they bend people."""
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
@@ -14,11 +14,9 @@ from scanprep.ranges import FLAG, Settings
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 
-from ..body import BodyModel
+from ..body import BodyModel, Progress
 from ..learning.sexes import PLANE
 from ..linear import check_pose
-
-Progress = Callable[[int, int], None]
 
 # registrations of the template, each from where the last one left it: one alone does not stretch so far
 REGISTRATIONS = 2

@@ -5,7 +5,6 @@ solves it at the scan's vertices and interpolates, which is the same where the s
 """
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -20,11 +19,11 @@ from scanprep.geometry.surface import OrientedPoints, Rays, Surface
 from scanprep.ranges import FLAG, Positive, Range, Settings
 from scanprep.threads import search_threads
 
+from ...body import Progress
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from .normal_volume import Crossings, find_crossings, interpolate, limits, not_inverted, outer_layers
 from .texels import Lattice, Texels, find_texels
 
-Progress = Callable[[int, int], None]
 SPACING = 0.002                      # metres between the places of the scan that draw the surface over folds
 
 
