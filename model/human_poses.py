@@ -19,9 +19,7 @@ Moments = tuple[np.ndarray, np.ndarray]         # mean (J, 3) and covariance (3J
 TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 WORTH = 8                            # training poses that what people do with their joints counts as
-LOOSE = 0.25                         # radians by which joints of this body may differ from those of all people
 DRAWN = 400                          # poses for its mean and covariance
-SHOULDER = 0.3                       # of an upper arm's rotation against the chest happens in the shoulder itself
 HELD = ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")   # parts that stay at rest
 
 
@@ -79,7 +77,8 @@ def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.nd
     people = human_poses(template, skeleton, DRAWN, np.random.default_rng(0))
     if people is None:
         return mean, covariance
-    loose = np.full(mean.size, LOOSE)
+    # radians by which joints of this body may differ from those of all people
+    loose = np.full(mean.size, 0.25)
     loose[:3] = 0                                                                 # the root is at rest
     theirs = people.mean(axis=0), np.cov(people.reshape(DRAWN, -1).T) + np.diag(loose**2)
     return mixed((mean, covariance), theirs, count / (count + WORTH))
@@ -106,7 +105,8 @@ def _follow_limb(template: Mesh, skeleton: Skeleton, chain: list[int], kind: str
     for i, part in enumerate(chain):
         k, same = segment[i], np.flatnonzero(segment == segment[i])
         if k == 0 and len(same) > 1 and i == 0:                                   # a shoulder goes some of the way
-            source[part] = int(PARENTS[parts[0]]), parts[0], SHOULDER
+            # of an upper arm's rotation against the chest three tenths happen in the shoulder itself
+            source[part] = int(PARENTS[parts[0]]), parts[0], 0.3
             continue
         source[part] = parts[k], parts[k], 0.0
         if kind == "arm" or k < 2:

@@ -14,8 +14,6 @@ from ..features import PoseFeatures, QuadraticLift, linear_features, part_featur
 from ..pose_space import PoseSpace, faces_of_part, kept_directions, nearest_joints
 from .config import LearnConfig
 
-TUBE = 2e-4                          # metres: smaller errors of an edge cost nothing to support-vector regression
-
 
 @dataclass(frozen=True, eq=False)
 class Design:
@@ -227,7 +225,8 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
     size = np.sqrt(modes.shape[1])
     slopes, offsets = np.zeros((X.shape[1], len(unit))), np.zeros(len(unit))
     for c in range(len(unit)):
-        machine = SVR(kernel="linear", C=1 / max(M * ridge, 1e-12), epsilon=min(TUBE * size / unit[c], 0.5))
+        # metres: smaller errors of an edge cost nothing to support-vector regression
+        machine = SVR(kernel="linear", C=1 / max(M * ridge, 1e-12), epsilon=min(2e-4 * size / unit[c], 0.5))
         machine.fit(X, normal[:, c])
         slopes[:, c], offsets[c] = machine.coef_[0], machine.intercept_[0]
     back = (unit[:, None] * modes[good]).reshape(len(unit), *mean.shape) / weight
