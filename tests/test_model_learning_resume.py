@@ -266,7 +266,7 @@ def test_a_mix_goes_on(tmp_path):
         for i, body in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
             whole = whole.add(f"p{person}_{i}", body, subject=f"p{person}")
     whole.with_skeleton(truth.skeleton)
-    file = config_file(tmp_path, mixed={"refinements": 2, "components": 2})
+    file = config_file(tmp_path, mixed={"refinements": 3, "components": 2})
     given = ["--poses", str(tmp_path / "set"), "--kind", "mixed", "--config", str(file)]
     assert run(learn, "scape learn", [*given, "-o", str(tmp_path / "a.npz")]) == 0
     argv = [*given, "-o", str(tmp_path / "b.npz")]
