@@ -17,7 +17,7 @@ from scanprep.batch.opening import beside
 from scanprep.command_line import run
 from scanprep.skeleton import restarts
 
-STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "_learned"), "people": (scape, "shape_gradients"),
+STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
 QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
 SKIN = {"rounds": 2, "components": 4}
@@ -135,7 +135,7 @@ def test_killed_twice_in_the_poses(bodies, monkeypatch):
     killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the second
     real, calls = scape._refined, []
     monkeypatch.setattr(scape, "_refined", lambda *given, **named: calls.append(1) or real(*given, **named))
-    monkeypatch.setattr(scape, "_first", None)
+    monkeypatch.setattr(scape, "by_edges", None)
     assert learned(bodies, "b.npz", refinements=3) == undisturbed
     assert len(calls) == 1
 
@@ -266,7 +266,7 @@ def test_a_mix_goes_on(tmp_path):
         for i, body in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
             whole = whole.add(f"p{person}_{i}", body, subject=f"p{person}")
     whole.with_skeleton(truth.skeleton)
-    file = config_file(tmp_path, mixed={"refinements": 2, "components": 2})
+    file = config_file(tmp_path, mixed={"refinements": 3, "components": 2})
     given = ["--poses", str(tmp_path / "set"), "--kind", "mixed", "--config", str(file)]
     assert run(learn, "scape learn", [*given, "-o", str(tmp_path / "a.npz")]) == 0
     argv = [*given, "-o", str(tmp_path / "b.npz")]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from model.files import KINDS
 from model.motion.files import is_motion
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import camera_file, is_picture
@@ -27,8 +28,7 @@ def kind_of(path: Path) -> str:
         if storage.HEADER not in names:
             return "motion" if is_motion(path) else f"an archive of {', '.join(sorted(names)) or 'nothing'}"[:100]
         kind = storage.kind_of(path)
-        return {"scape": "model", "blendscape": "model", "skinning": "model", "completion": "completion"}.get(
-            kind, f"a file of kind '{kind}'")
+        return "model" if kind in KINDS else kind if kind == "completion" else f"a file of kind '{kind}'"
     suffix = path.suffix.lower()
     if suffix == ".bvh":
         return "motion"

@@ -1,7 +1,7 @@
 """`scape model export`: a model in the files of other programs."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,6 @@ from .conventions import for_programs, standing
 from .correctives import motion_correctives, off_exact, pose_features, write_body_npz
 from .glb import write_skinned_glb
 from .names import Names, names_of
-from .usd import USD, write_points_usd, write_skinned_usd
 
 MEASURED = 40                        # poses in which the files are compared with the exact model
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
@@ -45,17 +44,16 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
     and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names; with --motion of a
     model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl, .off: the mesh at rest. A folder: the
-    exact mesh of every frame of the motion. OUT.usd, .usda, .usdc, .usdz: as GLB, in UsdSkel. OUT.points.usd: the exact
-    mesh of every frame in one file.
+    exact mesh of every frame of the motion.
 
-    GLB, USD, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from
-    the model's own. In GLB and USD further morph targets bring a motion to it.
+    GLB, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from the
+    model's own. In GLB further morph targets bring a motion to it.
 
     Example: scape model export model.npz --motion walk/motion.npz --root pelvis --names mixamo --ground -o walk.glb
 
     Args:
         model: Model file.
-        output: File or folder to write: .glb, .usd, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
+        output: File or folder to write: .glb, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
         betas: Shape in standard deviations, the first of them; else that of the motion, else the mean person.
         own_body: The template's own body.
         motion: Motion file of scape animate (.npz), or BVH or AMASS, which is brought onto the body.
@@ -64,11 +62,11 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         correctives: Further morph targets by which the motion comes nearer to the exact one; as many as bring it within
             half a millimetre, at most 48; 0 for plain skinning.
         unit: Of the lengths in a BVH file; cm.
-        up: Axis of the model that points up, which GLB, USD and BVH turn to y; else that of the largest extent.
+        up: Axis of the model that points up, which GLB and BVH turn to y; else that of the largest extent.
         root: Part that the skeleton hangs on, as pelvis.
         names: Whose names the bones of a person have: mixamo, vrm, h-anim or opensim.
         ground: Soles on height 0, of the body and of the lowest frame.
-        front: Face to the viewer: +z in GLB, USD and BVH, -y of a mesh with z up.
+        front: Face to the viewer: +z in GLB and BVH, -y of a mesh with z up.
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
         rate: Frames a second of the motion's file, where it does not say or says it wrongly.
     """
@@ -190,22 +188,6 @@ def _folder(order: Order) -> list[Metric]:
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
 
 
-def _points(order: Order) -> list[Metric]:
-    """The exact mesh of every frame, in one file."""
-    subject, moves = order.model.subject(order.person), order.motion("the points of its frames")
-    count = len(moves.poses)
-    rest = order.model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
-    axis = upright(rest)[0] if order.up is None else order.up
-    with bar("writing meshes") as progress:
-        def frames() -> Iterator[np.ndarray]:
-            for t in range(count):
-                yield subject.vertices(moves.poses[t], moves.trans[t])
-                progress(t + 1, count)
-
-        write_points_usd(order.output, rest, frames(), count, moves.rate, axis)
-    return [_size(order.output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
-
-
 def _bvh(order: Order) -> list[Metric]:
     """The skeleton and its motion."""
     rig = make_rig(order.model, order.person)
@@ -288,8 +270,6 @@ WRITERS = {
     ".glb": Writer("glb", _BONES | {"morphs", "correctives"}, partial(_skin, write=write_skinned_glb)),
     ".bvh": Writer("bvh", _BONES | {"unit"}, _bvh),
     ".npz": Writer("npz", {"motion", "fps", "rate"}, _npz),
-    **dict.fromkeys(USD, Writer("usd", _BONES | {"morphs", "correctives"}, partial(_skin, write=write_skinned_usd))),
-    **{f".points{ending}": Writer("point cache", _MOVES | {"up"}, _points) for ending in USD},
     **dict.fromkeys((".obj", ".ply", ".stl", ".off", ".ply.gz"), Writer("mesh", _PLACED, _mesh)),
     "": Writer("folder", _MOVES, _folder),
 }

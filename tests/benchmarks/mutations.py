@@ -232,8 +232,6 @@ MUTATIONS = (
         ("left-out poses know their own mean", "+ 1 / len(X)", "+ 0 / len(X)"),
         ("SVR with the penalty turned over", "C=1 / max(M * ridge, 1e-12)", "C=M * ridge")),
     *of("model/features.py", "model_features",
-        ("bells that grow", "np.exp(-0.5 * (off**2)", "np.exp(0.5 * (off**2)"),
-        ("slope of bells", "slope = -value[..., None] * off", "slope = value[..., None] * off"),
         ("derivative of quaternions", "by_turn = np.concatenate([w * np.eye(3) + rotations.hat(v)",
          "by_turn = np.concatenate([w * np.eye(3) - rotations.hat(v)"),
         ("squares counted twice", "t[..., _FIRST] * t[..., _SECOND]",
