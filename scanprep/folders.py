@@ -68,6 +68,7 @@ class FolderCommand:
             results = space.run(work, tasks, workers, progress)
         return self.write(space, results, len(tasks))
 
+
     def write(self, space: Workspace, results: Results, count: int, failed: Sequence[str] = ()) -> Outcome:
         """The page of results in an output that is open, and what was called there; what is told of so many things.
 
@@ -112,6 +113,13 @@ class FolderCommand:
                     -np.inf if np.isnan(error) else -error, name)
 
         return sorted(names, key=gravity)
+
+
+def do_one(doing: str, space: Workspace, work: Any, task: Task, settings: Mapping[str, Any], following: str) -> Outcome:
+    """One thing alone, into the output itself, where the work writes its page."""
+    with bar(doing) as progress:
+        rows = space.run(work, [task], inside=progress).only
+    return Outcome(space.folder, rows, settings, judgement=judgement_of(rows), following=following)
 
 
 def as_line(metric: Metric) -> str:

@@ -36,11 +36,9 @@ from .person import PersonParts, person_parts, stature
 from .repair import repaired
 from .schedule import RegistrationConfig
 
-TargetArg = Annotated[Path, Place("TARGET")]
 
-
-def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,
-          unit: Unit | None = None, config: RigidConfig = RigidConfig()) -> Outcome:  # noqa: B008
+def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
+          unit: Unit | None = None, config: RigidConfig = RigidConfig()) -> Outcome:
     """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
 
     Example: scape prep align front.ply back.ply -o front_aligned.ply
@@ -72,19 +70,14 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
             f"it did not converge, at {MM * found.rms:.0f} mm RMS: a start far from the target?"]))
 
 
-NO_LANDMARKS = Path("none")          # as `--landmarks none`
-
-
 def _given(scan: Path, landmarks: Path | None) -> Path | None:
     """The landmark file of a scan: the one named, else the one beside it; `none` is none."""
-    if landmarks == NO_LANDMARKS and not landmarks.exists():
-        return None
-    return landmarks or landmarks_beside(scan)
+    return None if landmarks == Path("none") and not landmarks.exists() else landmarks or landmarks_beside(scan)
 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
                template_landmarks: Path | None = None, unit: Unit | None = None,
-               config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:  # noqa: B008
+               config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:
     """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
     Example: scape prep correspond scan.ply --template template.ply --landmarks scan.json -o pairs.json
@@ -112,9 +105,8 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-                 template_landmarks: Path | None = None,
-                 correspondences: Path | None = None, unit: Unit | None = None,
-                 config: RegistrationConfig = RegistrationConfig()) -> Outcome:  # noqa: B008
+                 template_landmarks: Path | None = None, correspondences: Path | None = None, unit: Unit | None = None,
+                 config: RegistrationConfig = RegistrationConfig()) -> Outcome:
     """Bend the template onto one scan.
 
     Example: scape prep register scan.ply --template template.ply --landmarks scan.json -o registered.ply
