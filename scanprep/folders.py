@@ -26,7 +26,6 @@ from .words import number_of
 
 PAGE = "page"                        # name of the result that keeps what failed, beside the page
 PICTURE = "picture.png"              # of one of the things, in its folder
-GRAVEST = ("failed", "check", "good", "new")                          # verdicts, and what was not done yet
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class FolderCommand:
         def gravity(name: str) -> tuple[int, float, str]:
             judgement = judgement_on(name, results)
             error = self.error(results.values[name]) if name in results.values else np.inf
-            return (GRAVEST.index("new" if judgement is None else judgement.verdict),
+            return (("failed", "check", "good", "new").index("new" if judgement is None else judgement.verdict),
                     -np.inf if np.isnan(error) else -error, name)
 
         return sorted(names, key=gravity)

@@ -32,7 +32,6 @@ from .statues import read_statue
 PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
 SHOWN = ("surface", "picture", "model", "motion", "markers")
-TABLES = (".csv", ".tsv", ".txt", ".bvh")    # not shown of folders: they may hold anything, or be of any body
 ENOUGH = 3                           # labels that a recording and a motion have in common
 DEEP = 3                             # folders inside folders that are looked into
 
@@ -207,7 +206,9 @@ class Files:
                     continue
                 if path.is_dir() and deep:
                     yield from self._inside(path, f"{name}/{path.name}", deep - 1)
-                elif path.is_file() and path.suffix.lower() not in TABLES and kind_of(path) in SHOWN:
+                # tables may hold anything, and BVH be of any body
+                elif path.is_file() and path.suffix.lower() not in (".csv", ".tsv", ".txt", ".bvh") \
+                        and kind_of(path) in SHOWN:
                     yield self._of_file(path, f"{name}/{path.name}")
 
     def _of_set(self, folder: Path, name: str) -> Iterator[Entry]:

@@ -36,7 +36,7 @@ from ..skeleton.tree import Skeleton
 from ..words import number_of
 
 PICTURES, PAGE = "pictures", "report.html"
-WIDTH, HEIGHT, TALL = 150, 216, 300
+WIDTH, HEIGHT = 150, 216
 FEW = 6                     # scans that turn where fewer need a look
 MOST_CARRIED = 4_000_000    # bytes of pictures in the page itself, of the worst scans; the others stay files beside it
 FAR = 0.005                 # of the template's size: the dark end of the distances
@@ -171,7 +171,7 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
 def _shown(page: Page, folder: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
     """A scan that turns, or its picture: the page carries that, or finds it in the folder when it is scrolled to."""
     if picture is not None and scene is not None:
-        return page.turning(scene, picture, height=TALL)
+        return page.turning(scene, picture, height=300)
     if picture is None and not (folder / PICTURES / f"{name}.webp").exists():
         return ""
     source = data_uri(picture) if picture is not None else f"{PICTURES}/{quote(name)}.webp"
