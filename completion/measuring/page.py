@@ -72,12 +72,12 @@ def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, lab
     mesh = tapes.template.with_vertices(vertices)
     up, left, ahead = mine.axes
     curves: dict[str, list[np.ndarray]] = {"girths": [], "lengths and widths": [], "heights": []}
-    words, side = list[str](), float((vertices @ left).max())
+    words, side = list[str](), float((vertices @ left).max()) + BESIDE
     for term, reading in mine.readings.items():
         tape, curve = tapes.found[term], reading.curve
         if isinstance(tape, Height):
+            curve = curve + (side + len(words) * BESIDE - curve @ left)[:, None] * left
             words.append(term.replace("_", " "))
-            curve = curve + (side + BESIDE * len(words) - curve @ left)[:, None] * left
         curves["girths" if isinstance(tape, Girth) else "heights" if isinstance(tape, Height)
                else "lengths and widths"].append(curve)
     beside = curves["heights"]

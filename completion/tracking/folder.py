@@ -115,15 +115,6 @@ START = "frames/"                    # of the names of what is kept
 
 
 @dataclass(frozen=True, eq=False)
-class Chunk:
-    """What came of some frames."""
-
-    ready: tuple[TrackedFrame, ...]
-    state: TrackerState             # after them
-    problems: tuple[str, ...]       # what was wrong with their files, the folder left out
-
-
-@dataclass(frozen=True, eq=False)
 class Followed:
     """All frames of a folder."""
 
@@ -148,7 +139,9 @@ def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: 
         key = space.digests.of(key, files)
         names.append(f"{START}{first:08d}" if mine else f"{START}end")
 
-        def follow(folder: Path, mine: range = mine, before: TrackerState = state) -> Chunk:
+        def follow(folder: Path, mine: range = mine, before: TrackerState = state
+                   ) -> tuple[tuple[TrackedFrame, ...], TrackerState, tuple[str, ...]]:
+            """The frames that are ready, the state after them, and what was wrong with files, the folder left out."""
             nonlocal fresh
             fresh += len(mine)
             if tracker.state.number != before.number:
@@ -160,12 +153,11 @@ def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: 
                 write_mesh(folder / "surfaces" / f"{frame.number:06d}.ply", tracker.surface(frame), "single")
             problems = tuple(text.removeprefix(str(frames.folder)) for text in frames.problems[known:])
             del frames.problems[known:]
-            return Chunk(tuple(without_points(frame) for frame in ready), tracker.state, problems)
+            return tuple(without_points(frame) for frame in ready), tracker.state, problems
 
-        chunk = space.step(names[-1], key, follow)
-        state = chunk.state
-        done += chunk.ready
-        frames.problems += [f"{frames.folder}{text}" for text in chunk.problems]
+        ready, state, problems = space.step(names[-1], key, follow)
+        done += ready
+        frames.problems += [f"{frames.folder}{text}" for text in problems]
         if progress is not None:
             progress(first + len(mine), len(frames))
     space.drop_others(START, names)                          # the recording was longer
