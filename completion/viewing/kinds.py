@@ -18,8 +18,6 @@ from scanprep.geometry.mesh import Mesh
 from ..mocap.files.markers import READERS
 from ..mocap.marker_sets.layout import MarkerLayout
 
-CACHED = "cached at "                # in reports, before the file of the model of synthetic people
-
 
 def kind_of(path: Path) -> str:
     """What a file is: model, motion, completion, markers, surface, picture, or words for what it is instead."""
@@ -46,7 +44,7 @@ def reported_model(path: Path) -> Path | None:
         name = str(settings["model"])
     except (storage.StorageError, AttributeError, KeyError, TypeError):
         return None
-    return Path(name.split(CACHED)[-1])
+    return Path(name.split("cached at ")[-1])          # after which stands the file of the synthetic people's model
 
 
 def worst_first(whole: RegisteredSet) -> list[tuple[str, str]]:

@@ -70,7 +70,11 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
         rate: Frames a second of the motion's file, where it does not say or says it wrongly.
     """
-    writer = _writer(output)
+    # how the output is written, and whether all that was asked for says something about it
+    ending = max((ending for ending in WRITERS if output.name.lower().endswith(ending)), key=len)
+    if not ending and name_of(output) != output.name and not output.is_dir():
+        raise ValueError(f"{output}: expected a name ending in {', '.join(filter(None, WRITERS))}, or a folder")
+    writer = WRITERS[ending]
     given = {"betas": betas, "own_body": own_body, "motion": motion, "morphs": shapes,
              "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root, "names": names,
              "ground": ground, "front": front, "fps": fps, "rate": rate}
@@ -78,16 +82,21 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if wrong:
         hint = "; name a folder for the meshes of a motion" if (writer.kind, wrong[0]) == ("mesh", "motion") else ""
         raise UsageError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {writer.kind}{hint}")
+    # the motion, and the betas of the body that is asked for; None is the template's own
     loaded = load_model(model)
-    judgement = person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement()
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
     moves = None if motion is None else read_motion(motion, loaded, chosen, rate=rate)
     if moves is not None and fps is not None:
         moves = moves.at_rate(fps)
-    person = _person(model, loaded, betas, own_body, moves) if "betas" in writer.takes else None
+    if own_body and betas:
+        raise UsageError("--own-body: the template's own body has no betas")
+    person = np.array(betas) if betas else None if own_body else moves.betas if moves is not None else np.zeros(1)
+    if person is not None and not loaded.n_betas and "betas" in writer.takes:
+        raise ValueError(f"{model}: it has no shape components; ask for --own-body")
     order = Order(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
                   None if up is None else "xyz".index(up), root, names, ground, front)
-    return Outcome(output, writer.write(order), judgement=judgement)
+    return Outcome(output, writer.write(order),
+                   judgement=person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement())
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,18 +137,6 @@ def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans:
     return paths
 
 
-def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: BodyMotion | None
-            ) -> np.ndarray | None:
-    """Betas of the body that is asked for; None is the template's own."""
-    if own_body and betas:
-        raise UsageError("--own-body: the template's own body has no betas")
-    if own_body or (moves is not None and moves.betas is None and not betas):
-        return None
-    if not model.n_betas:
-        raise ValueError(f"{path}: it has no shape components; ask for --own-body")
-    return np.array(betas) if betas else moves.betas if moves is not None else np.zeros(1)
-
-
 def _mesh(order: Order) -> list[Metric]:
     """The body at rest."""
     model = order.model
@@ -151,9 +148,15 @@ def _mesh(order: Order) -> list[Metric]:
 
 def _npz(order: Order) -> list[Metric]:
     """The model as linear blend skinning; with a motion, that motion as AMASS has it."""
-    if order.moves is not None:
-        return _amass(order, order.moves)
-    model = order.model
+    model, moves = order.model, order.moves
+    if moves is not None:
+        family = str(model.info.get("family") or "")
+        if not family:
+            raise ValueError(f"{order.path}: a motion under the names of AMASS is one of an imported model of the SMPL "
+                             f"family (scape model import); write {order.output.stem}.bvh, .glb or a folder")
+        write_amass(order.output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+        return [_size(order.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+                Metric("surface_model_type", family)]
     arrays = write_body_npz(order.output, model)
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean)
@@ -167,16 +170,6 @@ def _npz(order: Order) -> list[Metric]:
             *_distances("exact body, skinning alone", np.linalg.norm(rig.vertices(poses) - exact, axis=-1)),
             *_distances("exact body, with pose directions",
                         np.linalg.norm(rig.vertices(poses, changes=changes) - exact, axis=-1))]
-
-
-def _amass(order: Order, moves: BodyMotion) -> list[Metric]:
-    family = str(order.model.info.get("family") or "")
-    if not family:
-        raise ValueError(f"{order.path}: a motion under the names of AMASS is one of an imported model of the SMPL "
-                         f"family (scape model import); write {order.output.stem}.bvh, .glb or a folder")
-    write_amass(order.output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
-    return [_size(order.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
-            Metric("surface_model_type", family)]
 
 
 def _folder(order: Order) -> list[Metric]:
@@ -273,11 +266,3 @@ WRITERS = {
     **dict.fromkeys((".obj", ".ply", ".stl", ".off", ".ply.gz"), Writer("mesh", _PLACED, _mesh)),
     "": Writer("folder", _MOVES, _folder),
 }
-
-
-def _writer(output: Path) -> Writer:
-    name = output.name.lower()
-    ending = max((ending for ending in WRITERS if name.endswith(ending)), key=len)
-    if not ending and name_of(output) != output.name and not output.is_dir():
-        raise ValueError(f"{output}: expected a name ending in {', '.join(filter(None, WRITERS))}, or a folder")
-    return WRITERS[ending]
