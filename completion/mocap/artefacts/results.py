@@ -15,6 +15,7 @@ from ..files.c3d import point_table, replace_points, write_c3d
 from ..files.c3d_points import add_points
 from ..files.markers import MarkerSequence, subject_columns, write_markers
 from ..files.text import MarkerFileError
+from ..pose.marked_body import stretches
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> 
                 frames.setdefault((min(a, b), max(a, b)), []).append(int(t))
     out = []
     for (a, b), times in frames.items():
-        for run in np.split(np.array(times), np.flatnonzero(np.diff(times) > 1) + 1):
+        for run in stretches(np.array(times)):
             there = run[seen[run, a] | seen[run, b]]
             if len(there):
                 out.append(Swap(labels[a], labels[b], int(there[0]), int(there[-1])))

@@ -165,6 +165,11 @@ class MarkerLayout:
                              f"layout: {', '.join(self.labels)}; sequence: {', '.join(labels) or 'none'}")
         return found
 
+    def worn(self, labels: Sequence[str], minimum: int = 3) -> tuple[np.ndarray, MarkerLayout]:
+        """Which columns (n,) of a sequence the layout knows, as `matched` finds them, and their part of the layout."""
+        known = self.matched(labels, minimum)
+        return np.array([list(labels).index(label) for label in known], dtype=int), self.select(known)
+
     def spelled(self, labels: Sequence[str]) -> MarkerLayout:
         """The same with those labels as aliases that differ from its own only in case, dots, blanks or dashes."""
         meant: dict[str, set[str]] = {}

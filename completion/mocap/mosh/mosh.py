@@ -22,9 +22,8 @@ from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import animate
-from ..pose.settings import RATE, AnimateConfig
-from ..soft_tissue.follow import follow_soft_tissue
-from ..soft_tissue.settings import SoftTissueConfig
+from ..pose.marked_body import RATE, AnimateConfig
+from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
 from ..subject.worn_elsewhere import Worn, find_worn

@@ -11,9 +11,8 @@ from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 
 from ..marker_sets.layout import MarkerLayout
 from .initialise import search
-from .marked_body import MarkedBody
-from .robust import LabelWatch, judge, marker_weights, misfit
-from .settings import AnimateConfig
+from .marked_body import AnimateConfig, MarkedBody, judge, marker_weights, misfit
+from .swaps import LabelWatch
 
 STEPS = 3                            # most for a frame
 LOST = 0.08                          # metres, median residual of a frame above which it is searched anew
@@ -75,10 +74,9 @@ class MarkerStream:
             raise ValueError("config: expected ground=False and low_pass=0 for a stream, both need later frames")
         if not rate > 0:
             raise ValueError(f"rate: expected a number above 0, got {rate}")
-        known = layout.matched(labels)
-        self.rows = np.array([list(labels).index(label) for label in known])
+        self.rows, worn = layout.worn(labels)
         self.n_labels = len(labels)
-        body = MarkedBody(subject, layout.select(known), config.prior_weight, config.prior_shrinkage)
+        body = MarkedBody(subject, worn, config.prior_weight, config.prior_shrinkage)
         self.tracker = Tracker(body, config, rate)
 
     def push(self, positions: np.ndarray) -> Frame:

@@ -12,8 +12,7 @@ from scanprep.geometry import rotations
 
 from ..marker_sets.layout import MarkerLayout
 from ..pose.initialise import search
-from ..pose.marked_body import MarkedBody
-from ..pose.settings import AnimateConfig
+from ..pose.marked_body import AnimateConfig, MarkedBody
 
 MEAN_PERSON = AnimateConfig(marker_sd=0.03)     # metres: the mean person carries the markers only roughly
 LOST = 0.1                           # metres, median distance of a frame's markers above which it is searched anew
