@@ -453,7 +453,7 @@ MUTATIONS = (
         ("swaps that lose", "own[:, a] + own[:, b] - (0.0 if", "-own[:, a] - own[:, b] + (0.0 if")),
     *of("completion/mocap/pose/coverage.py", "completion_coverage",
         ("all markers but eight", "len(self.used) < FEWEST", "len(self.used) > FEWEST"),
-        ("half of the markers", "HALF * self.count", "self.count / HALF"),
+        ("half of the markers", "0.5 * self.count", "self.count / 0.5"),
         ("parts that were seen", "area[~told].sum() / area.sum()", "area[told].sum() / area.sum()"),
         ("ways up to the root", "way[:way.index(top) + 1]", "way[:]")),
     *of("completion/mocap/files/c3d.py", "completion_markers_c3d completion_markers_files completion_markers_foreign",

@@ -39,7 +39,7 @@ class Floor:
         low, high = vertices.min(axis=1), vertices.max(axis=1)
         axis = int((high - low).mean(axis=0).argmax())
         flat, support = np.delete(vertices, axis, axis=2), []
-        for sign, end in ((1, low), (-1, high)):
+        for sign, end in ((1.0, low), (-1.0, high)):
             # how far the feet, or the top of the head, reach sideways, on average over the frames
             height = sign * vertices[..., axis] - (sign * vertices[..., axis]).min(axis=1, keepdims=True)
             near = height < 0.06 * height.max()

@@ -119,15 +119,9 @@ class Seats:
         return self.share * marker_levels(self.places[frames, rows, None], positions[:, None],
                                           self.deviation[frames, None, None])
 
-    def own(self, positions: np.ndarray) -> np.ndarray:
-        """What it counts (T, L) that labels at positions (T, L, 3) are the markers of the same rows."""
-        return self.share * marker_levels(self.places, positions, self.deviation[:, None])
-
-    def exchanged(self, positions: np.ndarray, a: int, b: int) -> np.ndarray:
-        """What it counts (T,) that the markers of two rows bear each other's label."""
-        two = [a, b]
-        return self.share * marker_levels(self.places[:, two], positions[:, two[::-1]],
-                                          self.deviation[:, None]).sum(axis=1)
+    def own(self, positions: np.ndarray, rows: slice | list[int] = slice(None)) -> np.ndarray:
+        """What it counts (T, R) that labels at positions (T, R, 3) are the markers of some rows, one each."""
+        return self.share * marker_levels(self.places[:, rows], positions, self.deviation[:, None])
 
 
 def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: np.ndarray) -> np.ndarray:
@@ -173,7 +167,7 @@ def _best_spans(tracks: Tracks, seats: Seats | None, touched: set[int]) -> list[
     out = []
     for a, b in sorted(pairs):
         begins = tracks.loose_ends(a, b)
-        gain = own[:, a] + own[:, b] - (0.0 if seats is None else seats.exchanged(at, a, b))
+        gain = own[:, a] + own[:, b] - (0.0 if seats is None else seats.own(at[:, [b, a]], [a, b]).sum(axis=1))
         total, swapped = best_stretches(tracks, a, b, begins, np.add.reduceat(gain, begins))
         if total > WORTH:
             out.append((total, a, b, swapped))
@@ -263,10 +257,6 @@ class LabelWatch:
     def __init__(self, count: int, outlier: float) -> None:
         self.outlier = outlier
         self.order = np.arange(count)
-
-    def forget(self) -> None:
-        """Take the labels as they come."""
-        self.order = np.arange(len(self.order))
 
     def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """Which column (L,) each marker is taken from, for places on the body and markers as they came (L, 3)."""
