@@ -6,8 +6,8 @@ its zero, its signs and what stands in for landmarks that a skeleton does not ha
 """
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -108,55 +108,38 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
     if "humanoid_root" not in roles or pair is None or not low or not high:
         raise ValueError(f"joint angles are of people: expected parts named pelvis, thigh_left, ..., head, found "
                          f"{', '.join(names)}"[:300])
-    body = _body_axes(joints[roles[pair[1]]] - joints[roles[pair[0]]], joints[high].mean(0) - joints[low].mean(0))
-    parts = {"pelvis": roles["humanoid_root"]}
-    trunk = _carrier(parents, roles)
-    if trunk is not None:
-        parts["trunk"] = trunk
-    if "skullbase" in roles:
-        parts["head"] = roles["skullbase"]
-    frames = dict.fromkeys(parts, body)
-    for side in "rl":
-        _limbs(side, roles, joints, body, parts, frames)
-    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
-
-
-def _body_axes(right: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(3, 3) columns ahead, up, right: up is the axis of the model nearest to a direction, right as level."""
-    up = _nearest_axis(high)
+    # ahead, up and right: up is the axis of the model nearest to where the head is, right as level
+    up = _nearest_axis(joints[high].mean(0) - joints[low].mean(0))
+    right = joints[roles[pair[1]]] - joints[roles[pair[0]]]
     right = right - (right @ up) * up
     if not np.linalg.norm(right) > 1e-6:
         raise ValueError("joint angles: expected hips or shoulders beside each other at rest")
     right = right / np.linalg.norm(right)
-    return np.stack([np.cross(up, right), up, right], axis=1)
+    body, parts = np.stack([np.cross(up, right), up, right], axis=1), {"pelvis": roles["humanoid_root"]}
 
-
-def _carrier(parents: np.ndarray, roles: Mapping[str, int]) -> int | None:
-    """The part that carries the arms; None where it is the pelvis."""
+    # the trunk is the part that carries the arms, unless that is the pelvis
     chains = [above(parents, roles.get(f"{side}_sternoclavicular", roles[f"{side}_shoulder"]))[1:]
               for side in "lr" if f"{side}_shoulder" in roles]
     both = [j for j in chains[0] if all(j in chain for chain in chains)] if chains else []
-    return both[0] if both and both[0] != roles["humanoid_root"] else None
+    if both and both[0] != roles["humanoid_root"]:
+        parts["trunk"] = both[0]
+    if "skullbase" in roles:
+        parts["head"] = roles["skullbase"]
+    frames = dict.fromkeys(parts, body)
 
-
-def _limbs(side: str, roles: Mapping[str, int], joints: np.ndarray, body: np.ndarray, parts: dict[str, int],
-           frames: dict[str, np.ndarray]) -> None:
-    """Adds the segments of the limbs of one side that have both their ends."""
-    for name, (start, end) in _LIMBS.items():
+    # the segments of the limbs that have both their ends; without a joint beyond, they are as they are held at rest
+    for side, (name, (start, end)) in product("rl", _LIMBS.items()):
         begin, stop = roles.get(f"{side}_{start}"), roles.get(f"{side}_{end}")
         if begin is None or (end is not None and stop is None):
             continue
-        if end is None:                                      # no joint beyond: as it is held at rest
-            before = frames.get(f"forearm_{side}")
-            frame = body if name == "foot" else before
-            if frame is None:
-                continue
-        else:
-            assert stop is not None, "both ends"
+        frame = body if name == "foot" else frames.get(f"forearm_{side}")
+        if stop is not None:
             frame = _long_axes(joints[begin] - joints[stop], body, by_front=start in ("shoulder", "elbow"))
             if name == "forearm":                            # thumbs point ahead at rest: half way to pronation
                 frame = frame @ _turn(1, np.pi / 2 if side == "r" else -np.pi / 2)
-        parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
+        if frame is not None:
+            parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
+    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
 
 
 def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray:
