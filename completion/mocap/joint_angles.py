@@ -17,10 +17,6 @@ from scanprep.skeleton.roles import above, numbered_roles
 
 from ..motion import Motion
 
-UPRIGHT = 0.6                        # cosine: who leans no further on average stands by the model's own axes
-SINGULAR = 1e-9                      # sine of the angle between the first and the third axis
-SIZE = 0.05                          # of how much a frame's angles count, against a jump
-SEQUENCES = {"zxy": (2, 0, 1), "yxy": (1, 0, 1)}
 _SIDED = {                           # column without its side: (proximal segment, distal one, sequence, its signs)
     ("hip_flexion", "hip_adduction", "hip_rotation"): ("pelvis", "thigh", "zxy", (1, 1, 1)),
     ("knee_angle", "knee_adduction", "knee_rotation"): ("thigh", "shank", "zxy", (-1, 1, 1)),
@@ -204,7 +200,8 @@ def ground_axes(axes: np.ndarray, R: np.ndarray) -> np.ndarray:
     somebody who turns round the first frame.
     """
     mean = R.mean(axis=0)
-    up = axes[:, 1] if (mean @ axes[:, 1]) @ axes[:, 1] > UPRIGHT else _nearest_axis(mean @ axes[:, 1])
+    # who leans no further on average stands by the model's own axes
+    up = axes[:, 1] if (mean @ axes[:, 1]) @ axes[:, 1] > 0.6 else _nearest_axis(mean @ axes[:, 1])
     ways = [way - (way @ up) * up for way in (mean @ axes[:, 0], R[0] @ axes[:, 0], R[0] @ axes[:, 1])]
     x = _nearest_axis(next((way for way in ways if np.linalg.norm(way) > 0.1), ways[-1]))
     return np.stack([x, up, np.cross(x, up)], axis=1)
@@ -228,9 +225,9 @@ def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
     else:
         lost = np.hypot(R[:, 0, 1], R[:, 2, 1])
         a, b = np.arctan2(-R[:, 0, 1], -R[:, 2, 1]), -np.arctan2(lost, R[:, 1, 1])
-    known = np.maximum.accumulate(np.where(lost > SINGULAR, np.arange(len(R)), -1))
+    known = np.maximum.accumulate(np.where(lost > 1e-9, np.arange(len(R)), -1))
     a = np.where(known < 0, 0.0, a[known])
-    left = _turn(0, -b) @ _turn(SEQUENCES[sequence][0], -a) @ R
+    left = _turn(0, -b) @ _turn(2 if sequence == "zxy" else 1, -a) @ R
     angles = np.stack([a, b, np.arctan2(left[:, 0, 2], left[:, 0, 0])], axis=1)
     return np.unwrap(_smaller(angles) if sequence == "zxy" else angles, axis=0)
 
@@ -239,7 +236,8 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
     """Of each frame's two solutions that of smaller angles (T, 3), radians; the least jumps are worth as much."""
     both = np.stack([angles, angles * [1, -1, 1] + np.pi])               # (2, T, 3)
     both -= 2 * np.pi * np.rint(both / (2 * np.pi))
-    size = SIZE * np.abs(both).sum(axis=2)
+    # a frame's angles count little against a jump
+    size = 0.05 * np.abs(both).sum(axis=2)
     jump = np.abs(np.exp(1j * both[:, None, 1:]) - np.exp(1j * both[None, :, :-1])).sum(axis=3)      # (2, 2, T - 1)
     cost, came = size[:, 0].tolist(), np.zeros((len(angles), 2), dtype=int)
     for t, (((a, b), (c, d)), (first, second)) in enumerate(zip(jump.transpose(2, 0, 1).tolist(), size.T[1:].tolist(),

@@ -21,8 +21,6 @@ from ...motion import Motion
 from ..joint_angles import JointAngles, anatomical_angles, ground_axes
 from .markers import MarkerSequence, write_markers
 
-_AXES = "+x", "+y", "+z", "-x", "-y", "-z"
-
 
 def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
                   markers: MarkerSequence | None = None, told: np.ndarray | None = None) -> None:
@@ -100,7 +98,7 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
     table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :first], angles.pelvis,
                   angles.degrees[:, first:]]
     names = ("time", *angles.names[:first], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[first:])
-    axes = [_AXES[int(np.abs(axis).argmax()) + (3 if axis.sum() < 0 else 0)] for axis in angles.ground.T]
+    axes = [f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]}" for axis in angles.ground.T]
     lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
              "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
              f"Axes x, y, z are {', '.join(axes)} of the recording.",

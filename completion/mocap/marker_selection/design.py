@@ -8,8 +8,9 @@ import numpy as np
 
 from model.body import BodyModel
 
+from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
-from .fits import DesignConfig, Progress, vertex_errors
+from .fits import DesignConfig, vertex_errors
 from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, symmetric_groups, walk
 from .linear import LinearBodies, fit_bodies, shared_shape
 

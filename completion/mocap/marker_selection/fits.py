@@ -98,10 +98,6 @@ class BodyPoints:
         return moving_points(np.stack([y for y, _ in found]), by_pose, self.shaped.shape_jacobian(pose))
 
 
-Tell = Callable[[int], None]
-Progress = Callable[[int, int], None]
-
-
 @dataclass(frozen=True, eq=False)
 class Prior:
     """What is known of the unknowns x of a body before it is measured: a Gaussian."""
@@ -137,7 +133,7 @@ def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> 
 
 
 def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, prior: Prior, start: np.ndarray,
-               iterations: int, tell: Tell | None = None) -> np.ndarray:
+               iterations: int, tell: Callable[[int], None] | None = None) -> np.ndarray:
     """Unknowns (Z, P) with which points come nearest to targets (Z, L, 3), metres, weighted (L,). [MoSh] Eq. 26"""
     root, found = np.sqrt(weights)[:, None], np.empty_like(start)
     size = min(24, points.batch)  # bodies that are minimised at once

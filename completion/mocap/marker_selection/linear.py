@@ -13,8 +13,9 @@ from model.posing.transfer import own_body
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
 
+from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
-from .fits import BodyPoints, DesignConfig, Prior, Progress, fit_points, prior_around, rough_poses
+from .fits import BodyPoints, DesignConfig, Prior, fit_points, prior_around, rough_poses
 
 FIT_ITERATIONS = 20                  # most steps of that fit, and of a full refit
 

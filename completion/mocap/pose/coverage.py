@@ -18,8 +18,6 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
 FEWEST = 8                           # markers that tell of a body; six hold a pelvis and a head, and no limb
-# share of the skin on parts that no marker saw: both hands have 5% of it, a head 7%, all above the waist 60%
-UNSEEN_SKIN = 0.25
 # trajectories without a name, as Vicon, Motive and Qualisys write them
 UNNAMED = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"
 # points that Plug-in Gait computes: centres of mass, and of every segment its origin and the ends of its three axes
@@ -69,7 +67,8 @@ class Coverage:
             failed.append(f"all markers used are on one part of the body, the {self.parts[0]}")
         elif len(self.used) < 0.5 * self.count:
             check.append(f"{some}: other labels than the marker set's? (scape layout show)")
-        if self.skin > UNSEEN_SKIN:
+        # both hands have 5% of the skin, a head 7%, all above the waist 60%
+        if self.skin > 0.25:
             check.append(f"no marker saw {', '.join(self.unseen)}: a guess, and their angles are left out")
         return Judgement.of(failed, check)
 

@@ -14,9 +14,6 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
 DOUBTFUL = 0.018                     # of the size, 25 mm on a man; good motions are 4 to 25 mm off, shuffled frames 31
-# Sizes a second at which the median marker moves, 7 m/s on a man, over steps of so many seconds. Walking has 1, running
-# 4; a walk told ten times too fast 12, one with shuffled frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
-HASTY, STEP = 5.0, 1 / 30
 
 
 def markers_told(motions: Sequence[Motion]) -> Metric:
@@ -68,14 +65,16 @@ def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], 
 
 def haste(markers: MarkerSequence, body: Mesh) -> str | None:
     """Why markers of a recording cannot have moved so, with the likely cause; None where they can."""
+    # Sizes a second at which the median marker moves, 7 m/s on a man. Walking has 1, running 4; a walk told ten times
+    # too fast 12, one with shuffled frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
     speed = marker_speed(markers)
     return f"the markers move at {speed:.0f} m/s: frames in another order, or the wrong rate?" \
-        if speed > HASTY * size(body) else None
+        if speed > 5.0 * size(body) else None
 
 
 def marker_speed(markers: MarkerSequence) -> float:
     """Median speed of all markers, metres per second, over steps of about a thirtieth of a second."""
-    step = max(1, round(markers.rate * STEP))
+    step = max(1, round(markers.rate / 30))
     moved = np.linalg.norm(markers.positions[step:] - markers.positions[:-step], axis=2)
     known = moved[np.isfinite(moved)]
     return float(np.median(known)) * markers.rate / step if len(known) else 0.0

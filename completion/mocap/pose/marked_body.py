@@ -111,15 +111,13 @@ class MarkedBody:
               stiff: float = 1.0) -> Minimum[np.ndarray]:
         """The best unknowns near x (B, P), each row by itself; arguments as of `system`, without B if all are alike."""
         targets, weights = (np.broadcast_to(of, (len(x), *of.shape[-k:])) for of, k in ((targets, 2), (weights, 1)))
-        ends = [levenberg_marquardt(partial(self._rows, targets[some], weights[some], stiff), x[some], iterations,
-                                    tolerance, retract=self.retract) for some in batches(len(x), MOST)]
+        ends = [levenberg_marquardt(partial(self.system, targets=targets[some], weights=weights[some], stiff=stiff),
+                                    x[some], iterations, tolerance, retract=self.retract)
+                for some in batches(len(x), MOST)]
         return ends[0] if len(ends) == 1 else Minimum(
             np.concatenate([end.x for end in ends]),
             Dense(*map(np.concatenate, zip(*(end.equations for end in ends), strict=True))),
             np.concatenate([end.converged for end in ends]), max(end.iterations for end in ends))
-
-    def _rows(self, targets: np.ndarray, weights: np.ndarray, stiff: float, x: np.ndarray) -> Dense:
-        return self.system(x, targets, weights, stiff)
 
     def with_prior(self, data: Dense, pose: np.ndarray, stiff: float = 1.0) -> Dense:
         """Equations whose first unknowns are those of poses (B, J, 3), and the pose prior."""
