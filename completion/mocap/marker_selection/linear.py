@@ -54,8 +54,8 @@ class LinearBodies:
 
     def of(self, bodies: np.ndarray) -> LinearBodies:
         """Some of the bodies only."""
-        return LinearBodies(*(each[bodies] for each in (self.rows, self.gaps, self.gram, self.pull, self.rest)),
-                            self.precision, self.lean[bodies])
+        return LinearBodies(self.rows[bodies], self.gaps[bodies], self.gram[bodies], self.pull[bodies],
+                            self.rest[bodies], self.precision, self.lean[bodies])
 
 
 @dataclass(frozen=True, eq=False)
