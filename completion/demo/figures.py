@@ -13,7 +13,7 @@ from scanprep.dataset import RegisteredSet
 from scanprep.judgement import Judgement, judge_many
 from scanprep.pipeline.page import judge_set, judge_whole
 
-from ..mocap.pose.robust import motion_doubts
+from ..mocap.pose.judgement import motion_doubts
 from .chain import Demo
 from .truth import adjusted_rand, distance, joint_errors, mean_over_area, surface_error
 

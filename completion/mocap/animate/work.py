@@ -35,7 +35,7 @@ from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import find_coverage
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn

@@ -32,7 +32,7 @@ from ..files.opensim import centre_sequence, known_centres
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage
-from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
