@@ -7,9 +7,7 @@ from model.fitting import energy
 from model.fitting.named_points import anneal, lay_on_points
 from model.priors import typical_poses
 
-from .marked_body import MarkedBody
-from .robust import marker_weights, misfit
-from .settings import AnimateConfig
+from .marked_body import AnimateConfig, MarkedBody, marker_weights, misfit
 
 SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb has lost three quarters of its weight
 
