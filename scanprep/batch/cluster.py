@@ -49,11 +49,9 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
         def submit() -> None:
             """The next job; few at a time, so that shipped files do not pile up at the scheduler."""
             for job in waiting:
-                given, files = with_paths(job.given, Path.absolute), dict[Path, bytes]()
-                for path in paths_of(given) if ship else ():
-                    with contextlib.suppress(OSError):          # one that cannot be read is for the worker to miss
-                        files[path] = path.read_bytes()
-                future = client.submit(there, shared, pickle.dumps((job.name, job.place, given, files)), pure=False)
+                given = with_paths(job.given, Path.absolute)
+                sent = job.name, job.place, given, _files(given) if ship else {}
+                future = client.submit(there, shared, pickle.dumps(sent), pure=False)
                 job_of[future] = job
                 running.add(future)
                 return
@@ -134,6 +132,15 @@ def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[
         made = {path.relative_to(here / "made").as_posix(): path.read_bytes()
                 for path in sorted((here / "made").rglob("*")) if path.is_file()}
     return outcome, made, notes
+
+
+def _files(given: Any) -> dict[Path, bytes]:
+    """Path -> contents of the files of a job; one that cannot be read is left for the worker to miss."""
+    found: dict[Path, bytes] = {}
+    for path in paths_of(given):
+        with contextlib.suppress(OSError):
+            found[path] = path.read_bytes()
+    return found
 
 
 def _versions() -> dict[str, str]:
