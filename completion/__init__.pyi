@@ -29,7 +29,7 @@ from .mocap.mosh.mosh import SexedMosh as SexedMosh
 from .mocap.mosh.mosh import mosh as mosh
 from .mocap.mosh.mosh import mosh_by_sex as mosh_by_sex
 from .mocap.pose.follow import animate as animate
-from .mocap.pose.settings import AnimateConfig as AnimateConfig
+from .mocap.pose.marked_body import AnimateConfig as AnimateConfig
 from .mocap.pose.stream import Frame as Frame
 from .mocap.pose.stream import MarkerStream as MarkerStream
 from .mocap.retargeting.retarget import morphed_vertices as morphed_vertices

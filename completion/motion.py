@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from model.linear import Subject
-from model.motion.files import StoredMotion, check_ours, read_motion_file
+from model.motion.files import check_ours, read_motion_file
 from model.motion.onto import BodyMotion
 from scanprep.geometry import storage
 
@@ -113,16 +113,10 @@ class Motion:
         stored = read_motion_file(path, OF_MARKERS, rate=rate)
         check_ours(path, stored, f"; scape animate {Path(path).name} -m MODEL -o OUT puts it on a model")
         with storage.taking_apart(path, "a whole motion"):
-            return _restored(stored)
-
-
-def _restored(stored: StoredMotion) -> Motion:
-    """The motion of a file, with what it tells of markers."""
-    a, T = stored.more, len(stored.poses)
-    labels = tuple(str(label) for label in a.get("marker_labels", ()))
-    residuals = (storage.numbers(a, "marker_residuals", T, len(labels), finite=False) if "marker_residuals" in a
-                 else np.full((T, len(labels)), np.nan))
-    converged = storage.numbers(a, "converged", T, kinds="b") if "converged" in a else np.ones(T)
-    trusted = a.get("marker_trusted", np.zeros((0, 0)))
-    return Motion(stored.poses, stored.trans, stored.betas, stored.rate, residuals, labels, stored.gender,
-                  converged.astype(bool), trusted.astype(bool))
+            a, T = stored.more, len(stored.poses)
+            labels = tuple(str(label) for label in a.get("marker_labels", ()))
+            residuals = (storage.numbers(a, "marker_residuals", T, len(labels), finite=False)
+                         if "marker_residuals" in a else np.full((T, len(labels)), np.nan))
+            converged = storage.numbers(a, "converged", T, kinds="b") if "converged" in a else np.ones(T)
+            return Motion(stored.poses, stored.trans, stored.betas, stored.rate, residuals, labels, stored.gender,
+                          converged.astype(bool), a.get("marker_trusted", np.zeros((0, 0))).astype(bool))

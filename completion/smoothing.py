@@ -8,7 +8,7 @@ import numpy as np
 from scanprep.geometry.least_squares import retract_pose, step_between
 from scanprep.geometry.sparse import overlapping_windows, solve_smooth
 
-WINDOW, OVERLAP = 1000, 60           # frames solved at once, and those that each side lends to its neighbour
+WINDOW, OVERLAP = 880, 60           # frames solved at once, and those that each side lends to its neighbour
 
 
 def inertia(n_unknowns: int, rate: float, angle: float, place: float) -> np.ndarray:
@@ -24,18 +24,14 @@ def predicted(x: np.ndarray, before: np.ndarray, momentum: float) -> np.ndarray:
     return retract_pose(n)(x, momentum * step_between(before, x, n))
 
 
-def coupled_steps(x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+def coupled_steps(x: np.ndarray, equations: Callable[[slice], tuple[np.ndarray, np.ndarray]], stiffness: np.ndarray
+                  ) -> np.ndarray:
     """The step (T, P) of frames x (T, P), at least 3, constant velocity as a prior with `inertia` as its stiffness.
 
-    Of everything else come half the gradient (T, P) and the Gauss-Newton matrix (T, P, P), by small rotations of the
-    joints from the right. Velocities are differences of these, which is exact for slow motion.
+    Of everything else come half the gradient (n, P), which is used up, and the Gauss-Newton matrix (n, P, P) of some
+    frames at a time, by small rotations of the joints from the right. Velocities are differences of these, which is
+    exact for slow motion.
     """
-    return windowed_steps(x, lambda near: (gradient[near].copy(), hessian[near]), stiffness)
-
-
-def windowed_steps(x: np.ndarray, equations: Callable[[slice], tuple[np.ndarray, np.ndarray]], stiffness: np.ndarray
-                   ) -> np.ndarray:
-    """As `coupled_steps`; gradient and matrix are made of some frames at a time, so that few are held."""
     step = np.empty_like(x)
     for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):
         at, (pull, hessian) = x[near], equations(near)
@@ -54,5 +50,9 @@ def smooth(x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, stiffness: 
     at, n = x, x.shape[1] - 3
     for _ in range(rounds if len(x) > 2 else 0):
         slope = gradient + (hessian @ step_between(x, at, n)[..., None])[..., 0]
-        at = retract_pose(n)(at, coupled_steps(at, slope, hessian, stiffness))
+
+        def equations(near: slice, slope: np.ndarray = slope) -> tuple[np.ndarray, np.ndarray]:
+            return slope[near].copy(), hessian[near]
+
+        at = retract_pose(n)(at, coupled_steps(at, equations, stiffness))
     return at

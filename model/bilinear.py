@@ -49,6 +49,8 @@ class ShapedPoints(Points):
         betas = np.asarray(betas, dtype=np.float64)
         if betas.ndim != 1 or len(betas) > self.n_betas:
             raise ValueError(f"betas: expected at most {self.n_betas} numbers, got shape {betas.shape}")
+        if not np.isfinite(betas).all():
+            raise ValueError("betas: expected finite numbers")
         return betas
 
 

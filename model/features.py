@@ -43,10 +43,6 @@ class Lift(Protocol):
         """Derivatives (..., J, m, 3) of the values of each joint by its own twist (..., J, 3)."""
         ...
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What a file must hold to make the map again."""
-        ...
-
 
 @dataclass(frozen=True)
 class LinearLift:
@@ -64,9 +60,6 @@ class LinearLift:
     def derivative(self, t: np.ndarray) -> np.ndarray:
         return np.broadcast_to(np.eye(3), (*t.shape, 3))
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {}
-
 
 @dataclass(frozen=True)
 class QuadraticLift:
@@ -83,40 +76,16 @@ class QuadraticLift:
         product = t[..., _FIRST, None] * eye[_SECOND] + t[..., _SECOND, None] * eye[_FIRST]
         return np.concatenate([np.broadcast_to(eye, (*t.shape, 3)), product], axis=-2)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {}
-
-
-@dataclass(frozen=True, eq=False)
-class RadialLift:
-    """The twist, and Gaussian bells of standard deviation `radius` (J,) around twists `centres` (J, m, 3), radians.
-
-    [SCAPE-patent] §0087
-    """
-
-    centres: np.ndarray
-    radius: np.ndarray
-
-    kind = "radial"
-
-    @property
-    def width(self) -> int:
-        return 3 + self.centres.shape[1]
-
-    def _bells(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        off = (t[..., None, :] - self.centres) / self.radius[:, None, None]
-        return np.exp(-0.5 * (off**2).sum(axis=-1)), off
-
-    def evaluate(self, t: np.ndarray) -> np.ndarray:
-        return np.concatenate([t, self._bells(t)[0]], axis=-1)
-
-    def derivative(self, t: np.ndarray) -> np.ndarray:
-        value, off = self._bells(t)
-        slope = -value[..., None] * off / self.radius[:, None, None]
-        return np.concatenate([np.broadcast_to(np.eye(3), (*t.shape, 3)), slope], axis=-2)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"centres": self.centres, "radius": self.radius}
+    @staticmethod
+    def of_directions(directions: np.ndarray) -> np.ndarray:
+        """(9, k + k (k + 1) / 2) mixtures of the numbers: twists along directions (3, k), and products of these."""
+        pairs = [np.outer(directions[:, a], directions[:, b])
+                 for a, b in zip(*np.triu_indices(directions.shape[1]), strict=True)]
+        out = np.zeros((9, directions.shape[1] + len(pairs)))
+        out[:3, :directions.shape[1]] = directions
+        for column, pair in zip(out.T[directions.shape[1]:], pairs, strict=True):
+            column[3:] = np.where(_FIRST == _SECOND, 0.5, 1.0) * (pair + pair.T)[_FIRST, _SECOND]
+        return out
 
 
 @dataclass(frozen=True)
@@ -135,9 +104,6 @@ class RotationLift:
     def derivative(self, t: np.ndarray) -> np.ndarray:
         along = rotations.hat(np.swapaxes(rotations.right_jacobian(t), -1, -2))                # of every parameter
         return np.moveaxis(rotations.exp(t)[..., None, :, :] @ along, -3, -1).reshape(*t.shape[:-1], 9, 3)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {}
 
 
 @dataclass(frozen=True)
@@ -161,12 +127,9 @@ class QuaternionLift:
         by_turn = np.concatenate([w * np.eye(3) + rotations.hat(v), -v[..., None, :]], axis=-2) / 2
         return by_turn @ rotations.right_jacobian(t)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {}
 
-
-_PLAIN: dict[str, Lift] = {lift.kind: lift for lift in (LinearLift(), QuadraticLift(), RotationLift(),
-                                                        QuaternionLift())}
+LIFTS: dict[str, Lift] = {lift.kind: lift for lift in (LinearLift(), QuadraticLift(), RotationLift(),
+                                                       QuaternionLift())}
 
 
 def lifted(lift: Lift, pose: np.ndarray) -> np.ndarray:
@@ -189,16 +152,14 @@ def lifted_slopes(lift: Lift, pose: np.ndarray) -> np.ndarray:
 
 def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
     """The features of a model file, or ValueError."""
-    J, kind = len(skeleton.parents), header["lift"]
-    if kind == RadialLift.kind:
-        radius = storage.numbers(arrays, "lift_radius", J)
-        if not (radius > 0).all():
-            raise ValueError("lift_radius: expected positive numbers")
-        lift: Lift = RadialLift(storage.numbers(arrays, "lift_centres", J, None, 3), radius)
-    elif kind in _PLAIN:
-        lift = _PLAIN[kind]
-    else:
-        raise ValueError(f"features: '{kind}' is not known here (known: {', '.join(_PLAIN)}, {RadialLift.kind})")
+    J = len(skeleton.parents)
+    if "direction_count" in arrays:             # of the first version, which had linear ones only
+        kept = storage.numbers(arrays, "direction_count", J)
+        directions = storage.numbers(arrays, "directions", int(kept.sum()), 3)
+        return linear_features(skeleton, tuple(np.split(directions.T, np.cumsum(kept)[:-1], axis=1)))
+    if header["lift"] not in LIFTS:
+        raise ValueError(f"features: '{header['lift']}' is not known here (known: {', '.join(LIFTS)})")
+    lift = LIFTS[header["lift"]]
     part = storage.numbers(arrays, "feature_part", None)
     return PoseFeatures(skeleton, lift, part.astype(np.int64),
                         storage.numbers(arrays, "feature_mix", J, lift.width, len(part)))

@@ -8,8 +8,9 @@ from scanprep.geometry import storage
 
 from .body import BodyModel
 
-_KINDS = {"scape": ("scape", "ScapeModel"), "blendscape": ("scape", "BlendScapeModel"),
-          "skinning": ("skinning", "SkinningModel")}
+# by the name of the kind in files: the module and the class; a new kind is a new line
+KINDS = {"scape": ("model.scape", "ScapeModel"), "blendscape": ("model.scape", "BlendScapeModel"),
+         "skinning": ("model.skinning", "SkinningModel")}
 
 
 def load_model(path: str | Path) -> BodyModel:
@@ -21,8 +22,8 @@ def load_model(path: str | Path) -> BodyModel:
         Missing, damaged, or of a kind or version that is not known.
     """
     kind = storage.kind_of(path)
-    if kind not in _KINDS:
-        raise storage.StorageError(f"{path}: expected a body model of kind {', '.join(_KINDS)}, found '{kind}'")
-    room, name = _KINDS[kind]
-    model: BodyModel = getattr(importlib.import_module(f".{room}", __package__), name).load(path)
+    if kind not in KINDS:
+        raise storage.StorageError(f"{path}: expected a body model of kind {', '.join(KINDS)}, found '{kind}'")
+    module, name = KINDS[kind]
+    model: BodyModel = getattr(importlib.import_module(module), name).load(path)
     return model

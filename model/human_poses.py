@@ -5,9 +5,6 @@ skeleton by the directions of its bones. No scan was used.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
 from scanprep.geometry import rotations
@@ -22,9 +19,7 @@ Moments = tuple[np.ndarray, np.ndarray]         # mean (J, 3) and covariance (3J
 TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 WORTH = 8                            # training poses that what people do with their joints counts as
-LOOSE = 0.25                         # radians by which joints of this body may differ from those of all people
 DRAWN = 400                          # poses for its mean and covariance
-SHOULDER = 0.3                       # of an upper arm's rotation against the chest happens in the shoulder itself
 HELD = ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")   # parts that stay at rest
 
 
@@ -33,15 +28,37 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
 
     A body counts as a person by the names of its parts, see `name_parts`.
     """
-    person = _person(template, skeleton)
-    if person is None:
+    names = skeleton.names
+    chains = {(kind, side): limb_parts(names, skeleton.parents, skeleton.joints, kind, side)
+              for kind in LIMBS for side in ("left", "right")}
+    if not all(chains.values()):
         return None
+    # axes (3, 3) take directions of the synthetic people, whose left is +x and who face -y, to the template's
+    joint = {key: skeleton.joints[chain[0]] for key, chain in chains.items()}
+    hips, shoulders = (np.mean([joint[kind, side] for side in ("left", "right")], axis=0) for kind in ("leg", "arm"))
+    up = _unit(shoulders - hips)
+    left = joint["leg", "left"] - joint["leg", "right"] + joint["arm", "left"] - joint["arm", "right"]
+    left = _unit(left - up * (left @ up))
+    axes = np.stack([left, np.cross(up, left), up], axis=1)
+    scale = float(np.ptp(template.vertices @ up)) / average().shape.stature
+    # of every part: rotations of two of their parts, and how far from one to the other; what takes its bone to theirs
+    plain = [name.rstrip("0123456789") for name in names]
+    trunk = [{"neck": "head", "trunk": "abdomen"}.get(name, name if name in TRUNK else "pelvis") for name in plain]
+    source = [(PARTS.index(part), PARTS.index(part), 0.0) for part in trunk]
+    at_rest = np.tile(np.eye(3), (len(names), 1, 1))
+    for (kind, side), chain in chains.items():
+        _follow_limb(template, skeleton, chain, kind, side, scale, axes, source, at_rest)
     drawn = np.stack([random_pose(rng) for _ in range(count)])
     drawn[:, 0] = 0
-    R = person.axes @ _world(drawn) @ person.axes.T
-    world = np.stack([_between(R[:, a], R[:, b], share) for a, b, share in person.source], axis=1)
-    poses = skeleton.pose_of(world @ person.at_rest)
-    poses[:, [0, *(p for p, name in enumerate(skeleton.names) if is_held(name))]] = 0
+    R = rotations.exp(drawn)
+    for part in range(1, len(PARENTS)):
+        R[:, part] = R[:, PARENTS[part]] @ R[:, part]
+    R = axes @ R @ axes.T
+    world = np.stack([R[:, a] if share == 0 else
+                      R[:, a] @ rotations.exp(share * rotations.log(np.swapaxes(R[:, a], -1, -2) @ R[:, b]))
+                      for a, b, share in source], axis=1)
+    poses = skeleton.pose_of(world @ at_rest)
+    poses[:, [0, *(p for p, name in enumerate(names) if is_held(name))]] = 0
     return poses
 
 
@@ -60,7 +77,8 @@ def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.nd
     people = human_poses(template, skeleton, DRAWN, np.random.default_rng(0))
     if people is None:
         return mean, covariance
-    loose = np.full(mean.size, LOOSE)
+    # radians by which joints of this body may differ from those of all people
+    loose = np.full(mean.size, 0.25)
     loose[:3] = 0                                                                 # the root is at rest
     theirs = people.mean(axis=0), np.cov(people.reshape(DRAWN, -1).T) + np.diag(loose**2)
     return mixed((mean, covariance), theirs, count / (count + WORTH))
@@ -73,95 +91,37 @@ def mixed(one: Moments, other: Moments, share: float) -> Moments:
             share * one[1] + (1 - share) * other[1] + share * (1 - share) * np.outer(apart, apart))
 
 
-@dataclass(frozen=True, eq=False)
-class _Person:
-    """How the parts (J,) of a skeleton follow those of the synthetic people."""
-
-    axes: np.ndarray                            # (3, 3) takes directions of the synthetic people to the template's
-    source: list[tuple[int, int, float]]        # rotations of two of their parts, and how far from one to the other
-    at_rest: np.ndarray                         # (J, 3, 3) takes bones of the template to those of the synthetic rest
-
-
-def _person(template: Mesh, skeleton: Skeleton) -> _Person | None:
-    names = skeleton.names
-    chains = {(kind, side): limb_parts(names, skeleton.parents, skeleton.joints, kind, side)
-              for kind in LIMBS for side in ("left", "right")}
-    if not all(chains.values()):
-        return None
-    joint = {key: skeleton.joints[chain[0]] for key, chain in chains.items()}
-    hips, shoulders = (np.mean([joint[kind, side] for side in ("left", "right")], axis=0) for kind in ("leg", "arm"))
-    up = _unit(shoulders - hips)
-    left = joint["leg", "left"] - joint["leg", "right"] + joint["arm", "left"] - joint["arm", "right"]
-    left = _unit(left - up * (left @ up))
-    axes = np.stack([left, np.cross(up, left), up], axis=1)                       # their left is +x, they face -y
-    scale = float(np.ptp(template.vertices @ up)) / average().shape.stature
-    source = [(PARTS.index(part), PARTS.index(part), 0.0) for part in _trunk_parts(names)]
-    at_rest = np.broadcast_to(np.eye(3), (len(names), 3, 3)).copy()
-    for (kind, side), chain in chains.items():
-        _follow_limb(template, skeleton, chain, kind, side, scale, axes, source, at_rest)
-    return _Person(axes, source, at_rest)
-
-
-def _trunk_parts(names: Sequence[str]) -> list[str]:
-    """The synthetic part that each part of the trunk moves with; limbs are put in later."""
-    def nearest(name: str) -> str:
-        plain = name.rstrip("0123456789")
-        return {"neck": "head", "trunk": "abdomen"}.get(plain, plain if plain in TRUNK else "pelvis")
-
-    return [nearest(name) for name in names]
-
-
 def _follow_limb(template: Mesh, skeleton: Skeleton, chain: list[int], kind: str, side: str, scale: float,
                  axes: np.ndarray, source: list[tuple[int, int, float]], at_rest: np.ndarray) -> None:
     """Pair the parts of a limb with those of the synthetic people by their distance from its end."""
     a, parts = average(), [PARTS.index(f"{part}_{side}") for part in LIMBS[kind]]
     far = scale * _from_the_end(np.vstack([a.joints[parts], a.ends[parts[-1]]]))  # (4,), 0 at the fingers or toes
-    mine = np.vstack([skeleton.joints[chain], _tip(template, skeleton, chain[-1])])
+    skin = template.vertices[np.unique(template.faces[skeleton.part_of_face == chain[-1]])]
+    tip = skin[np.linalg.norm(skin - skeleton.joints[chain[-1]], axis=1).argmax()]
+    mine = np.vstack([skeleton.joints[chain], tip])
     away = _from_the_end(mine)
     middles = (away[1:] + away[:-1]) / 2
     segment = np.array([int((far[1:-1] > middle).sum()) for middle in middles])   # 0 upper arm, 1 forearm, 2 hand
     for i, part in enumerate(chain):
         k, same = segment[i], np.flatnonzero(segment == segment[i])
         if k == 0 and len(same) > 1 and i == 0:                                   # a shoulder goes some of the way
-            source[part] = int(PARENTS[parts[0]]), parts[0], SHOULDER
+            # of an upper arm's rotation against the chest three tenths happen in the shoulder itself
+            source[part] = int(PARENTS[parts[0]]), parts[0], 0.3
             continue
         source[part] = parts[k], parts[k], 0.0
         if kind == "arm" or k < 2:
             first = same[1] if k == 0 and len(same) > 1 else same[0]
             theirs = axes @ _unit(a.ends[parts[k]] - a.joints[parts[k]])
-            at_rest[part] = _shortest(_unit(mine[same[-1] + 1] - mine[first]), theirs)
+            own = _unit(mine[same[-1] + 1] - mine[first])
+            cross = np.cross(own, theirs)             # the least rotation from ours to theirs
+            sine = float(np.linalg.norm(cross))
+            at_rest[part] = rotations.exp(cross / max(sine, 1e-12) * np.arctan2(sine, float(own @ theirs)))
 
 
 def _from_the_end(places: np.ndarray) -> np.ndarray:
     """(n,) the way from each of a chain of points (n, 3) to the last."""
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     return np.r_[np.cumsum(steps[::-1])[::-1], 0.0]
-
-
-def _tip(template: Mesh, skeleton: Skeleton, part: int) -> np.ndarray:
-    """The end (3,) of a limb: the vertex of its last part farthest from its joint."""
-    mine = template.vertices[np.unique(template.faces[skeleton.part_of_face == part])]
-    return mine[np.linalg.norm(mine - skeleton.joints[part], axis=1).argmax()]
-
-
-def _world(poses: np.ndarray) -> np.ndarray:
-    """World rotations (n, 16, 3, 3) of the synthetic parts."""
-    R = rotations.exp(poses)
-    for part in range(1, len(PARENTS)):
-        R[:, part] = R[:, PARENTS[part]] @ R[:, part]
-    return R
-
-
-def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
-    """Rotations (n, 3, 3) a share of the way from one to the other."""
-    return a if share == 0 else a @ rotations.exp(share * rotations.log(np.swapaxes(a, -1, -2) @ b))
-
-
-def _shortest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The least rotation (3, 3) that takes direction a to b."""
-    cross = np.cross(a, b)
-    sine = float(np.linalg.norm(cross))
-    return rotations.exp(cross / max(sine, 1e-12) * np.arctan2(sine, float(a @ b)))
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -28,8 +28,6 @@ from .skinning import SkinningModel
 NEEDED = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 WANTED = (*NEEDED, "posedirs", "J_regressor")
 SHAPES = 300                         # of so many directions and more the first are of shape, the others of expression
-HELD = 0.05                          # radians by which fingers and face are expected to leave their mean
-EXAMPLES = 60                        # poses of people that stand for those of training
 
 BODY = ("pelvis", "thigh_left", "thigh_right", "abdomen", "shin_left", "shin_right", "abdomen2", "foot_left",
         "foot_right", "chest", "toes_left", "toes_right", "neck", "shoulder_left", "shoulder_right", "head",
@@ -126,7 +124,8 @@ def _skeleton(found: Published) -> Skeleton:
 def _poses(mesh: Mesh, skeleton: Skeleton, hands: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean (J, 3) and covariance (3J, 3J) of the poses people take, radians, and examples; fingers and face at rest."""
     J = len(skeleton.parents)
-    examples = human_poses(mesh, skeleton, EXAMPLES, np.random.default_rng(0))
+    # poses of people that stand for those of training
+    examples = human_poses(mesh, skeleton, 60, np.random.default_rng(0))
     if examples is None:
         examples, covariance = np.zeros((0, J, 3)), 0.5**2 * np.eye(3 * J)
         covariance[:3, :3] = 0
@@ -138,7 +137,8 @@ def _poses(mesh: Mesh, skeleton: Skeleton, hands: dict[str, np.ndarray]) -> tupl
             mean[mine] = examples[:, mine] = pose.reshape(-1, 3)
     held = np.repeat([is_held(name) for name in skeleton.names], 3)
     covariance[held], covariance[:, held] = 0, 0
-    covariance[held, held] = HELD**2
+    # radians by which fingers and face are expected to leave their mean
+    covariance[held, held] = 0.05**2
     return mean, covariance, examples
 
 

@@ -17,8 +17,11 @@ from .body import BodyModel
 def parts_panes(template: Mesh, skeleton: Skeleton) -> list[Pane]:
     """Parts in colour, then joints and bones inside a transparent body."""
     camera, = look_around(template, turns=(15,))
+    joints, child = skeleton.joints, np.arange(1, len(skeleton.joints))
+    inside: list[Shape] = [Solid(template, opacity=0.35), Dots(joints, radius=0.014, on_top=True),
+                           Bones(joints[skeleton.parents[child]], joints[child], on_top=True)]
     return [Pane([Solid(template, part_colors(skeleton.part_of_face))], camera, f"{len(skeleton.parents)} parts"),
-            Pane(_joints_inside(template, skeleton.joints, skeleton), camera, "joints")]
+            Pane(inside, camera, "joints")]
 
 
 def picture_parts(template: Mesh, skeleton: Skeleton, height: int = 640) -> np.ndarray:
@@ -67,10 +70,3 @@ def picture_character(model: BodyModel, count: int = 4, height: int = 420) -> np
              *(Pane([model.template.with_vertices(v)], look_around(body, v, (35,))[0], f"pose {k + 1}")
                for k, v in enumerate(bodies))]
     return picture_panes(panes, height)
-
-
-def _joints_inside(body: Mesh, joints: np.ndarray, skeleton: Skeleton) -> list[Shape]:
-    """Joints (J, 3) and bones inside a transparent body."""
-    child = np.arange(1, len(joints))
-    return [Solid(body, opacity=0.35), Dots(joints, radius=0.014, on_top=True),
-            Bones(joints[skeleton.parents[child]], joints[child], on_top=True)]

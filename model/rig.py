@@ -14,7 +14,6 @@ from scanprep.skeleton.tree import Skeleton, reorder
 from .blend_weights import CARRIERS, skin_weights, strongest
 from .body import BodyModel
 from .linear import Subject
-from .skinning import SkinningModel
 
 SLIDER = 3.0                         # standard deviations that a morph target of a beta reaches at weight 1
 
@@ -139,24 +138,18 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     if shapes and betas is None:
         raise ValueError(f"shapes: the template's own body has none, got {shapes}")
     rest = np.zeros((len(model.skeleton.parents), 3))
-    if weights is None and isinstance(model, SkinningModel):
-        weights = model.weights
-    rig = subject_rig(model, model.vertices(rest, betas), weights)
-    if isinstance(model, SkinningModel):                     # of STAR they do not follow all that betas do
-        rig = replace(rig, skeleton=replace(rig.skeleton, joints=model.rest_joints(betas)))
-    return replace(rig, shapes=np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)) if shapes else rig
+    mesh = model.template.with_vertices(model.vertices(rest, betas))
+    return Rig(mesh, replace(model.skeleton, joints=model.rest_joints(betas)),
+               strongest(model.skin_weights if weights is None else weights),
+               np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0))
 
 
-def subject_rig(body: BodyModel | Subject, rest: np.ndarray | None = None, weights: np.ndarray | None = None) -> Rig:
-    """The rig, without shapes, of a subject, or of a model with these vertices (N, 3) at rest; as `make_rig`."""
-    skeleton, template = body.skeleton, body.template
-    if rest is None:
-        assert isinstance(body, Subject), "a model has many bodies"
-        rest = body.vertices(np.zeros((len(skeleton.parents), 3)))
-    joints = body.joint_regressor @ rest
-    weights = skin_weights(template, skeleton) if weights is None else weights
-    return Rig(template.with_vertices(rest), replace(skeleton, joints=joints), strongest(weights),
-               np.zeros((0, *rest.shape)))
+def subject_rig(subject: Subject) -> Rig:
+    """The rig of a subject, without shapes."""
+    skeleton, template = subject.skeleton, subject.template
+    rest = subject.vertices(np.zeros(skeleton.joints.shape))
+    return Rig(template.with_vertices(rest), replace(skeleton, joints=subject.joint_regressor @ rest),
+               strongest(skin_weights(template, skeleton)), np.zeros((0, *rest.shape)))
 
 
 def rerooted(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tuple[Rig, np.ndarray, np.ndarray]:

@@ -1,9 +1,9 @@
 """SCAPE and BlendSCAPE: rotations of parts, deformation by pose and by person, stitched into a surface."""
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,15 +14,19 @@ from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
 from .blending import BlendedTemplate, rigid_weights
-from .body import BodyModel, restored_parts, restored_variances
-from .features import PoseFeatures, linear_features, restored_features
-from .linear import check_pose
-from .pose_space import PoseSpace
+from .body import BodyModel, Progress, restored_variances
+from .features import PoseFeatures
+from .gradients import GradientSystem, ShapeSolver, shape_gradients
+from .linear import Subject, check_pose
+from .pose_space import PoseSpace, faces_of_part
+from .priors import sample_poses
 from .products import Products, Terms
+from .resolution.transfer import Follower, Piece, gradients_of
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
-VERSION = 3                          # 1 had linear features only, 2 no pose examples
+NORMAL = 0.3                         # how much normals count beside edges: triangles thicken as they grow
+SHRINK = 1e-3                        # of the mean square: holds what the poses do not show
 AT_ONCE = 1000                       # triangles whose components are near the processor together
 
 
@@ -120,8 +124,8 @@ class ScapeModel(BodyModel):
         return self.stitching.stitch(edges)
 
     @property
-    def n_features(self) -> int:
-        return self.pose_space.features.count
+    def features(self) -> PoseFeatures:                                                     # type: ignore[override]
+        return self.pose_space.features
 
     def operator(self, betas: np.ndarray | None = None) -> Products:
         return self.parts.operator(self.pose_space, self.shape_space.gradients(betas))
@@ -166,54 +170,152 @@ class ScapeModel(BodyModel):
         by_pose += np.tensordot(delta, space.features.derivative(pose), axes=1)
         return by_pose.ravel(), by_betas.astype(np.float64)
 
-    def _arrays(self) -> dict[str, np.ndarray]:
-        return {
-            **self._common_arrays(self.pose_space.features),
-            "pose_coefficients": np.concatenate([a.ravel() for a in self.pose_space.coefficients]),
-            "shape_mean": self.shape_space.mean, "shape_components": self.shape_space.components,
-            "shape_variances": self.shape_space.variances,
-            "shape_total_variance": np.array(self.shape_space.total_variance)}
+    def recentred(self, vertices: np.ndarray, pose: np.ndarray) -> ScapeModel:
+        """S by Eq. 8, and again for what the stitched character then lacks.
 
-    def save(self, path: str | Path) -> None:
-        storage.save(path, self.kind, VERSION, self._arrays(), self._header(self.pose_space.features))
+        Two edges leave open how a triangle thickens. People are smooth enough to share it with their neighbours; where
+        a character is squeezed and stretched, poses that turn triangles out of their plane would then turn them over.
+        """
+        def with_normals(pairs: np.ndarray) -> np.ndarray:
+            """A third edge: square to both, as long as the triangle is wide. [Sumner]"""
+            cross = np.cross(pairs[:, 0], pairs[:, 1])
+            length = np.sqrt(np.linalg.norm(cross, axis=1, keepdims=True))
+            normal = cross / np.maximum(length, np.finfo(float).tiny)
+            return np.concatenate([pairs, NORMAL * normal[:, None]], axis=1)
+
+        posed, target = with_normals(self.posed_edges(pose)), with_normals(self.parts.local_edges(vertices, pose))
+        # a tenth of the paper's smoothness: a character's triangles share less of their shape than people's
+        solver, S = ShapeSolver(GradientSystem(self.template, 0.0001), posed), np.zeros((len(posed), 3, 3))
+        for _ in range(3):                      # twice what is left of the character is added to its shape
+            S += solver(target - posed @ np.swapaxes(S, -1, -2))
+        return replace(self, shape_space=replace(self.shape_space, mean=S.astype(np.float32)))
+
+    def exact_subject(self, vertices: np.ndarray, pose: np.ndarray, betas: np.ndarray | None) -> Subject:
+        """S of the betas, and Eq. 8 for what the stitched body then still lacks.
+
+        Eq. 8 for the whole body would take what stitching did to it near the borders of parts, in this one pose, for
+        its shape.
+        """
+        parts, Q, posed = self.parts, self.pose_space.gradients(pose), self.posed_edges(pose)
+        system, S = GradientSystem(self.template), self.shape_space.gradients(betas)
+        for _ in range(2):                      # twice what is left of the body is added to its shape
+            left = vertices - parts.stitched(S @ Q, pose)
+            S += shape_gradients(system, posed, posed + parts.local_edges(left, pose)) - np.eye(3)
+        return self.subject_of(parts.operator(self.pose_space, S), None)
+
+    def resampled(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> ScapeModel:
+        """Q and S carried part by part; then, in rounds, what is left in many poses is regressed and added, as in
+        learning.
+
+        [SCAPE] Eq. 4, Eq. 8
+        """
+        pieces = [Piece(self.template, template, old, new) for old, new in
+                  zip(faces_of_part(self.skeleton), faces_of_part(skeleton), strict=True)]
+        coefficients = []
+        for piece, a in zip(pieces, self.pose_space.coefficients, strict=True):
+            action = a.astype(np.float64)
+            average = np.stack([piece.average(each) for each in action])
+            coefficients.append(gradients_of(piece.v_hat, piece.edges(action), average).astype(a.dtype))
+        # S with which the parts, in the mean pose, have the shapes they had
+        old, F, Q = self.shape_space, len(template.faces), self.pose_space.gradients(self.pose_mean)
+        shapes = replace(old, mean=np.empty((F, 3, 3), dtype=old.mean.dtype),
+                         components=np.empty((old.count, F, 3, 3), dtype=old.components.dtype))
+        for piece in pieces:
+            S = np.concatenate([old.mean[None, piece.old_faces], old.components[:, piece.old_faces]]).astype(np.float64)
+            bent, average = Q[piece.old_faces], np.stack([piece.average(each) for each in S])
+            S = gradients_of(piece.edges(bent[None])[0], piece.edges(S @ bent), average)
+            shapes.mean[piece.new_faces], shapes.components[:, piece.new_faces] = S[0], S[1:]
+        space = PoseSpace(replace(self.features, skeleton=skeleton), tuple(coefficients))
+        moved = replace(self, template=template, skeleton=skeleton, pose_space=space, shape_space=shapes,
+                        **self._resampled_fields(pieces))
+        if not rounds:
+            return moved
+        # three poses for each feature of the part that has most
+        poses = sample_poses(self, max(40, 3 * int(np.bincount(self.features.part).max())), np.random.default_rng(0))
+        poses[0], follow = self.pose_mean, Follower(self.template, template)
+        moved = _with_pose_space(moved, poses, follow.positions(self.subject(None).vertices(poses)), rounds)
+        return _with_shape_space(moved, self, follow, poses[:8], rounds, progress) if self.n_betas else moved
+
+    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, Any]:
+        """What a kind built on this one keeps besides, on other triangles."""
+        return {}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"pose_coefficients": np.concatenate([a.ravel() for a in self.pose_space.coefficients]),
+                "shape_mean": self.shape_space.mean, "shape_components": self.shape_space.components,
+                "shape_variances": self.shape_space.variances,
+                "shape_total_variance": np.array(self.shape_space.total_variance)}
 
     @classmethod
-    def load(cls, path: str | Path) -> ScapeModel:
-        """Read a file of `save`; see `load_model`."""
-        header, a = storage.load(path, cls.kind, (1, 2, VERSION))
-        with storage.taking_apart(path, "a whole model"):
-            return cls._restored(header, a)
-
-    @classmethod
-    def _restored(cls, header: dict[str, Any], a: dict[str, np.ndarray]) -> ScapeModel:
-        """The model of a header and the arrays of a file."""
-        parts = restored_parts(header, a, VERSION)
+    def restored(cls, parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
+                 arrays: Mapping[str, np.ndarray]) -> ScapeModel:
         F, skeleton = len(parts["template"].faces), parts["skeleton"]
         if parts["template"].vertex_component.any():
             raise ValueError("vertices: expected one connected surface, which alone can be stitched")
-        features = _restored_features(skeleton, header, a)
         sizes, n = np.bincount(skeleton.part_of_face), np.bincount(features.part)
-        flat = storage.numbers(a, "pose_coefficients", 9 * int(n @ sizes))
+        flat = storage.numbers(arrays, "pose_coefficients", 9 * int(n @ sizes))
         blocks = np.split(flat, np.cumsum(9 * n * sizes)[:-1])
         coefficients = tuple(b.reshape(k, f, 3, 3) for b, k, f in zip(blocks, n, sizes, strict=True))
-        variances, total = restored_variances(a, "shape_total_variance")
-        shapes = ShapeSpace(storage.numbers(a, "shape_mean", F, 3, 3),
-                            storage.numbers(a, "shape_components", len(variances), F, 3, 3), variances,
-                            total)
-        return cls(pose_space=PoseSpace(features, coefficients), shape_space=shapes, **parts, **cls._extra(a))
+        variances, total = restored_variances(arrays, "shape_total_variance")
+        shapes = ShapeSpace(storage.numbers(arrays, "shape_mean", F, 3, 3),
+                            storage.numbers(arrays, "shape_components", len(variances), F, 3, 3), variances, total)
+        return cls(pose_space=PoseSpace(features, coefficients), shape_space=shapes, **parts, **cls._extra(arrays))
 
     @classmethod
-    def _extra(cls, a: dict[str, np.ndarray]) -> dict[str, Any]:
+    def _extra(cls, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
         """What a kind built on this one keeps besides."""
         return {}
 
 
-def _restored_features(skeleton: Skeleton, header: dict[str, Any], a: dict[str, np.ndarray]) -> PoseFeatures:
-    if header["version"] == 1:
-        count = storage.numbers(a, "direction_count", len(skeleton.parents))
-        directions = storage.numbers(a, "directions", int(count.sum()), 3)
-        return linear_features(skeleton, tuple(np.split(directions.T, np.cumsum(count)[:-1], axis=1)))
-    return restored_features(skeleton, header, a)
+def _with_pose_space(model: ScapeModel, poses: np.ndarray, wanted: np.ndarray, rounds: int) -> ScapeModel:
+    """The model with a pose space corrected on the template's own body, which is wanted (M, N, 3) in poses (M, J, 3).
+
+    [SCAPE] Eq. 4
+    """
+    for _ in range(rounds):
+        space, v_hat = model.pose_space, model.parts.v_hat
+        local = model.parts.local_edges(wanted - model.subject(None).vertices(poses), poses)
+        delta, coefficients = space.features.evaluate(poses), []
+        for p, faces in enumerate(space.faces_of_part):
+            X = delta[:, space.features.of_part(p)]
+            shrink = SHRINK * np.diag(np.maximum((X**2).sum(axis=0), 1e-12))
+            slope = np.linalg.solve(X.T @ X + shrink, X.T @ local[:, faces].reshape(len(X), -1))
+            more = gradients_of(v_hat[faces], slope.reshape(-1, len(faces), 2, 3))
+            coefficients.append((space.coefficients[p] + more).astype(space.coefficients[p].dtype))
+        model = replace(model, pose_space=PoseSpace(space.features, tuple(coefficients)))
+    return model
+
+
+def _with_shape_space(model: ScapeModel, teacher: ScapeModel, follow: Follower, poses: np.ndarray, rounds: int,
+                      progress: Progress) -> ScapeModel:
+    """The model with a mean person and shape components corrected in poses (M, J, 3), where those of the teacher are.
+
+    [SCAPE] Eq. 8
+    """
+    def people(of: ScapeModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The mean person (N, 3) in a pose, and the change (K, N, 3) by each beta."""
+        return of.vertices(pose, np.zeros(of.n_betas)), np.moveaxis(of.shape_jacobian(pose), -1, 0)
+
+    wanted, total = [], (rounds + 1) * len(poses)
+    for pose in poses:
+        mean, slope = people(teacher, pose)
+        wanted.append((follow.positions(mean), follow.displacements(slope).astype(np.float32)))
+        progress(len(wanted), total)
+    for number in range(1, rounds + 1):
+        square, product = np.zeros((3, 3)), np.zeros((3, 3))
+        for i, (pose, (y, dy)) in enumerate(zip(poses, wanted, strict=True), start=1):
+            mean, slope = people(model, pose)
+            local = model.parts.local_edges(np.concatenate([(y - mean)[None], dy - slope]), pose)
+            posed = model.posed_edges(pose)
+            square = square + np.swapaxes(posed, -1, -2) @ posed
+            product = product + np.swapaxes(local, -1, -2) @ posed
+            progress(number * len(poses) + i, total)
+        shrink = SHRINK * np.trace(square, axis1=-2, axis2=-1)[:, None, None] * np.eye(3)
+        more, space = product @ np.linalg.inv(square + shrink), model.shape_space
+        model = replace(model, shape_space=replace(
+            space, mean=(space.mean + more[0]).astype(space.mean.dtype),
+            components=(space.components + more[1:]).astype(space.components.dtype)))
+    return model
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -243,9 +345,15 @@ class BlendScapeModel(ScapeModel):
     def blend_weights(self) -> np.ndarray:
         return self.blend
 
-    def _arrays(self) -> dict[str, np.ndarray]:
-        return {**super()._arrays(), "blend": self.blend}
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {**super().arrays(), "blend": self.blend}
+
+    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, Any]:
+        blend = np.empty((sum(len(piece.new_faces) for piece in pieces), self.blend.shape[1]))
+        for piece in pieces:
+            blend[piece.new_faces] = piece.average(self.blend[piece.old_faces])
+        return {"blend": blend}
 
     @classmethod
-    def _extra(cls, a: dict[str, np.ndarray]) -> dict[str, Any]:
-        return {"blend": storage.numbers(a, "blend", None, None)}
+    def _extra(cls, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        return {"blend": storage.numbers(arrays, "blend", None, None)}

@@ -4,23 +4,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
 
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.tree import Skeleton
+from scanprep.skeleton.tree import Skeleton, affine_weights
 
 from .blended import Blended, ShapedBlended
-from .body import BodyModel, restored_parts, restored_variances
-from .features import PoseFeatures, restored_features
-from .linear import check_pose, picked
+from .body import BodyModel, Progress, restored_variances
+from .features import PoseFeatures, RotationLift
+from .linear import Subject, picked
 from .products import Products, Terms
+from .resolution.transfer import Follower
 
-VERSION = 3                          # 1 had no pose examples, 2 no joints of its own
 SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
 
 
@@ -97,10 +97,6 @@ class SkinningModel(BodyModel):
     @property
     def n_betas(self) -> int:
         return len(self.shape_components)
-
-    @property
-    def n_features(self) -> int:
-        return self.features.count
 
     @property
     def explained(self) -> np.ndarray:
@@ -186,8 +182,7 @@ class SkinningModel(BodyModel):
         return T[:, None]
 
     @cached_property
-    def _whole(self) -> ShapedBlended:
-        """All vertices as a function of pose and betas."""
+    def everywhere(self) -> ShapedBlended:
         J, origin = len(self.skeleton.parents), self.skeleton.joints[0]
         mix = self.features.mix[1:, :, self.features.constant == 0]
         bends = np.tensordot(mix, self.correctives.astype(np.float64), axes=1).swapaxes(-1, -2)
@@ -208,18 +203,10 @@ class SkinningModel(BodyModel):
         return ShapedBlended(own, mean, U, joints, np.zeros((len(U), 3)) if held else joints[:, 0],
                              np.array(middles).reshape(len(U), self._terms.count if held else 0, 1, 3))
 
-    def operator(self, betas: np.ndarray | None = None) -> Blended:
-        self.rest_vertices(betas)                                             # refuses what is wrong with betas
-        return self._whole.operator(betas)
-
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedBlended:
-        whole = self._whole if n_betas is None else self._whole.first(n_betas)
+        whole = self.everywhere if n_betas is None else self.everywhere.first(n_betas)
         return whole.combined(picked(len(self.rest), vertex_ids, weights))
-
-    def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
-        pose, _ = check_pose(self.skeleton, pose, None)
-        return (self._whole if vertex_ids is None else self.points(vertex_ids)).shape_jacobian(pose)
 
     def unposed(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(N, 3) rest vertices that the model carries onto a body (N, 3) exactly, joints of their own included.
@@ -235,37 +222,74 @@ class SkinningModel(BodyModel):
         x = bare - (pull.reshape(-1, 3 * J) @ joints).reshape(-1, 3)
         return np.asarray(x + self.skeleton.joints[0] - (A @ x)[0])
 
-    def save(self, path: str | Path) -> None:
-        arrays = {**self._common_arrays(self.features), **{name: getattr(self, name) for name in _STORED},
-                  "shape_variances": self.shape_variances, "shape_total": np.asarray(self.shape_total)}
+    def recentred(self, vertices: np.ndarray, pose: np.ndarray) -> SkinningModel:
+        return replace(self, shape_mean=self.unposed(vertices, pose))
+
+    def exact_subject(self, vertices: np.ndarray, pose: np.ndarray, betas: np.ndarray | None) -> Subject:
+        return replace(self, rest=self.unposed(vertices, pose)).subject(None)
+
+    @property
+    def skin_weights(self) -> np.ndarray:
+        return self.weights
+
+    @property
+    def pose_directions(self) -> np.ndarray | None:
+        rotations_alone = self.features.lift.kind == RotationLift.kind and len(self.correctives)
+        return np.moveaxis(self.correctives, 0, -1) if rotations_alone else None
+
+    def resampled(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> SkinningModel:
+        follow = Follower(self.template, template)
+
+        def displaced(field: np.ndarray) -> np.ndarray:
+            return follow.displacements(field.astype(np.float64)).astype(field.dtype)
+
+        weights = np.maximum(follow.values(self.weights), 0)
+        rest, shape_mean = (follow.positions(x.astype(np.float64)).astype(x.dtype)
+                            for x in (self.rest, self.shape_mean))
+        # the variance is summed over the vertices, of which there are now more or fewer
+        per_vertex = len(template.vertices) / len(self.template.vertices)
+        regressor = None
+        if self.regressor is not None:
+            # joints of its own: combinations of the new vertices nearest to those of before and to the joint
+            near, places, old = cKDTree(template.vertices), self.regressor @ self.template.vertices, self.regressor
+            rows = np.zeros((len(places), len(template.vertices)))
+            for j, place in enumerate(places):
+                theirs = self.template.vertices[old.indices[old.indptr[j]:old.indptr[j + 1]]]
+                chosen = np.union1d(near.query(theirs)[1], near.query(place, 8)[1])
+                rows[j, chosen] = affine_weights(template.vertices[chosen], place)
+            regressor = csr_array(rows)
+        return replace(
+            self, template=template, skeleton=skeleton, rest=rest, weights=weights / weights.sum(axis=1, keepdims=True),
+            features=replace(self.features, skeleton=skeleton), correctives=displaced(self.correctives),
+            shape_mean=shape_mean, shape_components=displaced(self.shape_components),
+            shape_variances=self.shape_variances * per_vertex, shape_total=self.shape_total * per_vertex,
+            regressor=regressor)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        out = {**{name: getattr(self, name) for name in _STORED}, "shape_variances": self.shape_variances,
+               "shape_total": np.asarray(self.shape_total)}
         if self.regressor is not None:
             sparse = self.regressor.tocoo()
-            arrays |= {"regressor_joint": sparse.coords[0], "regressor_vertex": sparse.coords[1],
-                       "regressor_weight": sparse.data}
-            arrays["joint_components"] = self._whole.joints
-        header = {**self._header(self.features), "own_joints": self.regressor is not None}
-        storage.save(path, self.kind, VERSION, arrays, header)
+            out |= {"regressor_joint": sparse.coords[0], "regressor_vertex": sparse.coords[1],
+                    "regressor_weight": sparse.data, "joint_components": self.everywhere.joints}
+        return out
+
+    def notes(self) -> dict[str, Any]:
+        return {"own_joints": self.regressor is not None}
 
     @classmethod
-    def load(cls, path: str | Path) -> SkinningModel:
-        """Read a file of `save`; see `load_model`."""
-        header, a = storage.load(path, cls.kind, (1, 2, VERSION))
-        with storage.taking_apart(path, "a whole model"):
-            parts = restored_parts(header, a, 2)
-            stored: dict[str, Any] = {name: storage.numbers(a, name, *(None,) * axes) for name, axes in _STORED.items()}
-            stored["shape_variances"], stored["shape_total"] = restored_variances(a, "shape_total")
-            return cls(features=restored_features(parts["skeleton"], header, a), **parts, **stored,
-                       **_restored_joints(parts["skeleton"], header, a))
-
-
-def _restored_joints(skeleton: Skeleton, header: Mapping[str, Any], a: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The joints that an imported model has of its own."""
-    if not header.get("own_joints"):
-        return {}
-    J, data = len(skeleton.parents), storage.numbers(a, "regressor_weight", None)
-    at = tuple(storage.numbers(a, f"regressor_{name}", len(data), kinds="iu") for name in ("joint", "vertex"))
-    return {"regressor": csr_array(coo_array((data, at), shape=(J, len(a["vertices"])))),
-            "joint_components": storage.numbers(a, "joint_components", None, J, 3)}
+    def restored(cls, parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
+                 arrays: Mapping[str, np.ndarray]) -> SkinningModel:
+        stored: dict[str, Any] = {name: storage.numbers(arrays, name, *(None,) * axes)
+                                  for name, axes in _STORED.items()}
+        stored["shape_variances"], stored["shape_total"] = restored_variances(arrays, "shape_total")
+        if header.get("own_joints"):
+            J, data = len(parts["skeleton"].parents), storage.numbers(arrays, "regressor_weight", None)
+            at = tuple(storage.numbers(arrays, f"regressor_{name}", len(data), kinds="iu")
+                       for name in ("joint", "vertex"))
+            stored["regressor"] = csr_array(coo_array((data, at), shape=(J, len(arrays["vertices"]))))
+            stored["joint_components"] = storage.numbers(arrays, "joint_components", None, J, 3)
+        return cls(features=features, **parts, **stored)
 
 
 _STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3}

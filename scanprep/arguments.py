@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
-from .ranges import marks, range_of
+from .ranges import marks
 
 GROUPS = {      # an argument has the same name and meaning in all commands; what is not listed belongs to the method
     "input": "model template poses shapes train_shapes bodies body target source motion control first registered "
@@ -150,10 +150,6 @@ class Argument:
             return given if self.type is bool else _value(self.type, given)
         except _Unknown as wrong:
             raise UsageError(f"{self.flag}: {wrong}") from None
-
-    def check_numbers(self, value: Any) -> None:
-        """OutOfRange for a number outside its range."""
-        range_of(self.annotation).check(value, self.flag)
 
     def check_files(self, value: Any) -> None:
         """FileNotFoundError for a file to read that is not there, with the nearest name beside it."""

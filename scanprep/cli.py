@@ -52,8 +52,7 @@ def group(argv: list[str]) -> int:
     return dispatch(COMMANDS, "scape prep", argv, "From raw scans to registered meshes and a skeleton.")
 
 
-def read_poses(folder: Path, template: Path | None, subject: str | None, unit: Unit | None
-               ) -> tuple[Mesh, np.ndarray]:
+def read_poses(folder: Path, template: Path | None, subject: str | None, unit: Unit | None) -> tuple[Mesh, np.ndarray]:
     """Template and vertices (M, N, 3) of one person from a registered set or a folder of meshes."""
     from .dataset import RegisteredSet
     from .geometry.files import read_mesh, read_registered

@@ -24,7 +24,7 @@ from .interrupts import tidy_up
 from .threads import one_thread
 from .words import OUR_MODULES
 
-OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
+SPACE, FORCE = "space", "force"        # parameters of commands that are dealt with here
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
 
 
@@ -47,9 +47,9 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             spelled.append(call.arguments.as_flags)
             wrong = 1
             tidy_up()
-            outcome, report = call.carried_out(start, notes)
+            outcome, report = call.carry_out(start, notes)
         except KeyboardInterrupt:
-            goes_on = call is not None and call.wants_space
+            goes_on = call is not None and call.arguments.wants_space
             say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if goes_on else
                                             "nothing was written"))
             return 130
@@ -157,9 +157,9 @@ class Arguments:
         self.text, told = sentences(function)
         self.listed = [Argument(p.name, hints[p.name], p.default, told.get(p.name, "")) for p in parameters
                        if p.name != SPACE and p.name not in self.settings.values]
-        self.output_name = next((a.name for a in self.listed if a.name in OUTPUTS), None)
+        self.output_name = next((a.name for a in self.listed if a.name in ("output", "out")), "")
         flags = self.settings.flags
-        if self.output_name is not None:
+        if self.output_name:
             flags[FORCE] = Flag((), bool, False, "Do all anew, whatever is done already.")
         self.listed += [Argument(name, flag.annotation, flag.value, flag.sentence) for name, flag in flags.items()]
 
@@ -171,7 +171,7 @@ class Arguments:
         """The values of a command line, every number in its range; nothing is done yet."""
         given = read_line(self.prog, self.text, self.listed, argv)
         for argument in self.listed:
-            argument.check_numbers(given[argument.name])
+            ranges.range_of(argument.annotation).check(given[argument.name], argument.flag)
         return given
 
     def as_flags(self, text: str) -> str:
@@ -189,15 +189,10 @@ class _Call:
     def __init__(self, function: Callable[..., Outcome], prog: str, argv: list[str]) -> None:
         self.function, self.command = function, f"{prog} {' '.join(argv)}"
         self.arguments = Arguments(function, prog, argv)
-        self.wants_space, self.beside = self.arguments.wants_space, self.arguments.beside
-        self.output_name = self.arguments.output_name
         self.read = self.arguments.read(argv)
         self.given = self.arguments.settings.taken_from(dict(self.read))
         self.force = self.given.pop(FORCE, False)
-        self.output: Path | None = self.given.get(self.output_name or "")
-        # what stands at its place is the thing itself that a command works on; flags name what is taken along
-        self.inputs = _paths(self.given.get(argument.name) for argument in self.arguments.listed if argument.place)
-        self.used = _paths(value for name, value in self.given.items() if name != self.output_name)
+        self.output: Path | None = self.given.get(self.arguments.output_name)
         self._staged: Path | None = None
 
     def real(self, text: str) -> str:
@@ -205,40 +200,43 @@ class _Call:
         staged, output = self._staged, self.output
         return text if staged is None or output is None else text.replace(str(staged), str(output.parent))
 
-    def judged(self, outcome: Outcome) -> Outcome:
-        """An outcome whose judgement has what was told of the files that it was made of."""
-        if outcome.judgement is None:
-            assert outcome.output is None, "what was made has a judgement"
-            return outcome
-        return dataclasses.replace(outcome, judgement=outcome.judgement.joined(self.before))
-
-    def carried_out(self, start: float, notes: Sequence[str]) -> tuple[Outcome, Path | None]:
+    def carry_out(self, start: float, notes: Sequence[str]) -> tuple[Outcome, Path | None]:
         """What the function did, and where its report is, which has the notes too."""
         from .batch.opening import beside, workspace
         from .batch.workspace import NothingMadeError
         from .judgement import carry_judgements
 
-        for argument in self.arguments.listed:
+        asked = self.arguments
+        for argument in asked.listed:
             argument.check_files(self.read[argument.name])
-        # before anything is written: an output may be one of the inputs
-        self.before = carry_judgements(self.inputs, self.used)
+        # What results before say of themselves, read before anything is written: an output may be one of the inputs.
+        # What stands at its place is the thing itself that a command works on; flags name what is taken along.
+        before = carry_judgements(_paths(self.given.get(argument.name) for argument in asked.listed if argument.place),
+                                  _paths(value for name, value in self.given.items() if name != asked.output_name))
+
+        def call(**more: Any) -> Outcome:
+            outcome = self.function(**{**self.given, **more})
+            if outcome.judgement is None:
+                assert outcome.output is None, "what was made has a judgement"
+                return outcome
+            return dataclasses.replace(outcome, judgement=outcome.judgement.joined(before))
+
         if self.output is None:
-            return self.judged(self.function(**self.given)), None
-        if self.wants_space and not self.beside:
+            return call(), None
+        if asked.wants_space and not asked.beside:
             with workspace(self.output, self.force) as space:
-                outcome = self.judged(self.function(**self.given, space=space))
+                outcome = call(space=space)
                 if outcome.failures and space.all_failed and space.is_new:
                     raise NothingMadeError(outcome.failures)
                 return outcome, keep_report(space, outcome, self.command, time.perf_counter() - start, notes)
         with beside(self.output, self.force) as space, space.staging("output") as staged:
             self._staged = staged.folder
-            given = {**self.given, str(self.output_name): staged.folder / self.output.name}
-            outcome = self.judged(self.function(**given, **({SPACE: space} if self.wants_space else {})))
+            outcome = call(**{asked.output_name: staged.folder / self.output.name},
+                           **({SPACE: space} if asked.wants_space else {}))
             made = outcome.output or staged.folder / self.output.name
             top = made if made.is_dir() else made.parent
-            written = {p.relative_to(top).as_posix(): space.digests.of_file(p) for p in sorted(top.rglob("*"))
-                       if p.is_file()}
-            return outcome, write_report(outcome, self.command, time.perf_counter() - start, notes, written)
+            return outcome, write_report(outcome, self.command, time.perf_counter() - start, notes,
+                                         space.digests.of_files(top))
 
 
 def _paths(values: Iterable[Any]) -> list[Path]:

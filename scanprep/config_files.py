@@ -111,8 +111,9 @@ def _lines(config: Any, table: Path_) -> Iterator[str]:
             inner.append((value, (*table, field.name)))
             continue
         if isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
-            items = ", ".join(_inline(item) for item in value)
-            text: str | None = f"[{items}]"
+            rows = [", ".join(f"{f.name} = {tomlkit.item(getattr(item, f.name)).as_string()}"
+                              for f in dataclasses.fields(item) if getattr(item, f.name) is not None) for item in value]
+            text: str | None = "[" + ", ".join("{" + row + "}" for row in rows) + "]"
         else:
             text = None if value is None else tomlkit.item(list(value) if isinstance(value, tuple) else value
                                                           ).as_string()
@@ -121,14 +122,6 @@ def _lines(config: Any, table: Path_) -> Iterator[str]:
     for value, name in inner:
         yield ""
         yield from _lines(value, name)
-
-
-def _inline(item: Any) -> str:
-    import tomlkit
-
-    parts = ", ".join(f"{f.name} = {tomlkit.item(getattr(item, f.name)).as_string()}"
-                      for f in dataclasses.fields(item) if getattr(item, f.name) is not None)
-    return "{" + parts + "}"
 
 
 def read(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
@@ -191,36 +184,25 @@ class _Place:
 
 def _changed(config: Settings, tree: Any, table: Path_, place: _Place) -> Settings:
     """Settings with the values of a table."""
+    import msgspec
+
     if not isinstance(tree, dict):
         raise place.error(table[-1], table[:-1], f"expected a table, got {tree!r}")
     hints, names = _hints(type(config)), [f.name for f in dataclasses.fields(config)]
     for name, value in tree.items():
         place.check_name(name, names, table, "setting")
         now = getattr(config, name)
-        inner = now if isinstance(now, Settings) else _optional_settings(hints[name])
+        # a field that may hold settings, or None, begins with the default ones
+        options = typing.get_args(hints[name]) if typing.get_origin(hints[name]) in (typing.Union, types.UnionType) \
+            else ()
+        inner = now if isinstance(now, Settings) else next(
+            (option() for option in options if isinstance(option, type) and issubclass(option, Settings)), None)
         try:
-            new = _changed(inner, value, (*table, name), place) if inner is not None else _converted(value, hints[name])
+            new = msgspec.convert(value, hints[name]) if inner is None else \
+                _changed(inner, value, (*table, name), place)
             config = dataclasses.replace(config, **{name: new})
         except OutOfRange as error:
             raise place.error(name, table, error.args[1]) from None
-        except TypeError as error:
-            raise place.error(name, table, str(error)) from None
+        except msgspec.ValidationError as error:
+            raise place.error(name, table, str(error).replace("`", "").replace("$", "value")) from None
     return config
-
-
-def _optional_settings(hint: Any) -> Settings | None:
-    """Default settings of a field that may hold some, or None."""
-    for option in typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ():
-        if isinstance(option, type) and issubclass(option, Settings):
-            return option()
-    return None
-
-
-def _converted(value: Any, hint: Any) -> Any:
-    """A value of TOML in the type of a field; TypeError says what was expected."""
-    import msgspec
-
-    try:
-        return msgspec.convert(value, hint)
-    except msgspec.ValidationError as error:
-        raise TypeError(str(error).replace("`", "").replace("$", "value")) from None

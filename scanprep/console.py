@@ -55,9 +55,6 @@ class Outcome:
     following: str = ""
 
 
-MOST_ROWS = 12                       # of the closing table: what is read at a glance
-
-
 def details(metrics: Iterable[Metric]) -> list[Metric]:
     """The same rows for the page and report.json only."""
     return [dataclasses.replace(m, detail=True) for m in metrics]
@@ -84,7 +81,17 @@ def bar(what: str) -> Iterator[Progress]:
 
     Bars that are open at the same time stand below each other.
     """
-    with _display() as shown:
+    from rich import progress
+    from rich.console import Console
+
+    with contextlib.ExitStack() as stack:
+        if not _open_displays:
+            columns = (progress.TextColumn("{task.description:<34}", markup=False), progress.BarColumn(),
+                       progress.MofNCompleteColumn(), progress.TimeElapsedColumn(), progress.TextColumn("left"),
+                       progress.TimeRemainingColumn())
+            _open_displays.append(stack.enter_context(progress.Progress(*columns, console=Console(stderr=True))))
+            stack.callback(_open_displays.pop)
+        shown = _open_displays[-1]
         task = shown.add_task(visible(what), total=None, start=False, visible=False)
 
         def tell(done: int, total: int) -> None:
@@ -97,43 +104,20 @@ def bar(what: str) -> Iterator[Progress]:
 _open_displays: list[Any] = []
 
 
-@contextlib.contextmanager
-def _display() -> Iterator[Any]:
-    """The display of the bars that are open now, or a new one."""
-    from rich import progress
-    from rich.console import Console
-
-    if _open_displays:
-        yield _open_displays[-1]
-        return
-    columns = (progress.TextColumn("{task.description:<34}", markup=False), progress.BarColumn(),
-               progress.MofNCompleteColumn(), progress.TimeElapsedColumn(), progress.TextColumn("left"),
-               progress.TimeRemainingColumn())
-    with progress.Progress(*columns, console=Console(stderr=True)) as shown:
-        _open_displays.append(shown)
-        try:
-            yield shown
-        finally:
-            _open_displays.pop()
-
-
-# categories of Unicode that are no text: control, format (also what turns the direction), lone surrogates, separators
-_NO_TEXT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-
-
 def visible(text: str) -> str:
     """Text fit for a terminal: characters that steer it, as names of files may hold, are written as `\\x1b`.
 
     Line breaks stay.
     """
-    return "".join(c if c == "\n" or unicodedata.category(c) not in _NO_TEXT else
+    # categories that are no text: control, format (also what turns the direction), lone surrogates, separators
+    return "".join(c if c == "\n" or unicodedata.category(c) not in {"Cc", "Cf", "Cs", "Zl", "Zp"} else
                    c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
 
 
 def split_figures(metrics: Iterable[Metric]) -> tuple[list[Metric], list[Metric]]:
-    """The rows that the closing table shows, in order and at most twelve, and the rest."""
+    """The rows that the closing table shows, in order and at most twelve, as are read at a glance, and the rest."""
     metrics = list(metrics)
-    main = [m for m in metrics if not m.detail][:MOST_ROWS]
+    main = [m for m in metrics if not m.detail][:12]
     return main, [m for m in metrics if m not in main]
 
 

@@ -26,7 +26,6 @@ from .words import number_of
 
 PAGE = "page"                        # name of the result that keeps what failed, beside the page
 PICTURE = "picture.png"              # of one of the things, in its folder
-GRAVEST = ("failed", "check", "good", "new")                          # verdicts, and what was not done yet
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,7 @@ class FolderCommand:
             results = space.run(work, tasks, workers, progress)
         return self.write(space, results, len(tasks))
 
+
     def write(self, space: Workspace, results: Results, count: int, failed: Sequence[str] = ()) -> Outcome:
         """The page of results in an output that is open, and what was called there; what is told of so many things.
 
@@ -108,10 +108,17 @@ class FolderCommand:
         def gravity(name: str) -> tuple[int, float, str]:
             judgement = judgement_on(name, results)
             error = self.error(results.values[name]) if name in results.values else np.inf
-            return (GRAVEST.index("new" if judgement is None else judgement.verdict),
+            return (("failed", "check", "good", "new").index("new" if judgement is None else judgement.verdict),
                     -np.inf if np.isnan(error) else -error, name)
 
         return sorted(names, key=gravity)
+
+
+def do_one(doing: str, space: Workspace, work: Any, task: Task, settings: Mapping[str, Any], following: str) -> Outcome:
+    """One thing alone, into the output itself, where the work writes its page."""
+    with bar(doing) as progress:
+        rows = space.run(work, [task], inside=progress).only
+    return Outcome(space.folder, rows, settings, judgement=judgement_of(rows), following=following)
 
 
 def as_line(metric: Metric) -> str:

@@ -124,23 +124,18 @@ def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judge
 
     `used` are things that are taken along, as a model: what is doubtful in them is not in all that is made with them.
     """
-    problems, doubts = [], []
-    for path in dict.fromkeys(inputs):
+    problems, doubts, made_of = list[str](), list[str](), list(dict.fromkeys(inputs))
+    for i, path in enumerate([*made_of, *dict.fromkeys(used)]):
         one = read_judgement(path)
-        problems += [f"{path}: its own report says that it failed: {', '.join(one.reasons)}"] \
-            if one and one.problems else []
-        doubts += [f"{path}: its own report says to look at it: {', '.join(one.reasons)}"] \
-            if one and one.doubts else []
-        within = {p.parent.name: read_judgement(p.parent) for p in sorted(path.glob("*/report.json"))} \
-            if one is None and path.is_dir() else {}
-        known = {name: judgement for name, judgement in within.items() if judgement is not None}
-        told = judge_many(known)
-        problems += [f"{path}: {reason}" for reason in told.problems]
-        doubts += [f"{path}: {reason}" for reason in told.doubts]
-    for path in dict.fromkeys(used):
-        one = read_judgement(path)
-        problems += [f"{path}: its own report says that it failed: {', '.join(one.reasons)}"] \
-            if one and one.problems else []
+        if one and one.problems:
+            problems.append(f"{path}: its own report says that it failed: {', '.join(one.reasons)}")
+        if one and one.doubts and i < len(made_of):
+            doubts.append(f"{path}: its own report says to look at it: {', '.join(one.reasons)}")
+        if one is None and i < len(made_of) and path.is_dir():
+            within = {p.parent.name: read_judgement(p.parent) for p in sorted(path.glob("*/report.json"))}
+            whole = judge_many({name: judgement for name, judgement in within.items() if judgement is not None})
+            problems += [f"{path}: {reason}" for reason in whole.problems]
+            doubts += [f"{path}: {reason}" for reason in whole.doubts]
     return Judgement.of(problems, doubts)
 
 

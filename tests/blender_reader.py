@@ -1,4 +1,4 @@
-"""What Blender makes of GLB, BVH, USD and FBX files, for tests and benchmarks; in a Python that has `bpy`.
+"""What Blender makes of GLB, BVH and FBX files, for tests and benchmarks; in a Python that has `bpy`.
 
     python tests/blender_reader.py JOBS.json      where bpy has a Python of its own: [{file, times, names, rate, out}]
 """
@@ -12,7 +12,7 @@ import numpy as np
 def evaluated(path, times, names=None, rate=24.0):
     """Vertices of the one mesh, or the joints of these names: (T, n, 3) metres, with y up as in the file.
 
-    `rate` is that of the frames in USD and FBX.
+    `rate` is that of the frames in FBX.
     """
     import bpy
 
@@ -24,11 +24,9 @@ def evaluated(path, times, names=None, rate=24.0):
         bpy.ops.import_scene.gltf(filepath=file, disable_bone_shape=True)
     elif ending == ".fbx":
         bpy.ops.import_scene.fbx(filepath=file, anim_offset=0.0)
-    elif ending == ".bvh":
+    else:
         bpy.ops.import_anim.bvh(filepath=file, global_scale=0.01, update_scene_fps=True)
         first = 1.0                                                        # the frame that BVH begins at
-    else:
-        bpy.ops.wm.usd_import(filepath=file)
     out = []
     for time in times:
         frame = first + time * scene.render.fps / scene.render.fps_base

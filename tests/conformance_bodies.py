@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from completion_bodies import MEAN, SD
 from model_bodies import worm, worm_model, worm_skeleton
+from toy_kind import ToyModel
 
 from model.blend_weights import diffused_weights
 from model.body import BodyModel
-from model.features import Lift, PoseFeatures, QuadraticLift, RadialLift
+from model.features import Lift, PoseFeatures, QuadraticLift, QuaternionLift
 from model.learning.skinning import corrective_features
 from model.pose_space import PoseSpace
 from model.scape import BlendScapeModel, ScapeModel
@@ -81,10 +82,10 @@ def skinned_worm(correctives: bool) -> SkinningModel:
                          float(variances.sum()), **LEARNED)
 
 
-def radial_lift() -> RadialLift:
-    """Three bells a joint."""
-    rng = np.random.default_rng(3)
-    return RadialLift(rng.normal(0, 0.5, (4, 3, 3)), rng.uniform(0.5, 1.0, 4))
+def toy_worm() -> ToyModel:
+    """The worm as the kind that only the tests know."""
+    skin = skinned_worm(False)
+    return ToyModel(skin.template, skin.skeleton, skin.weights, **LEARNED)
 
 
 def stiff_bodies() -> dict[str, BodyModel]:
@@ -103,8 +104,9 @@ def stiff_bodies() -> dict[str, BodyModel]:
 KINDS: dict[str, Callable[[], BodyModel]] = {
     "scape-linear": scape_worm,
     "scape-quadratic": lambda: scape_worm(QuadraticLift()),
-    "scape-radial": lambda: scape_worm(radial_lift()),
+    "scape-quaternion": lambda: scape_worm(QuaternionLift()),
     "blendscape": blendscape_worm,
     "skinning-plain": lambda: skinned_worm(False),
     "skinning-linear": lambda: skinned_worm(True),
+    "toy": toy_worm,
 }

@@ -12,8 +12,8 @@ from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 QUICK = CoregistrationConfig(
     fit=ScanFitConfig(rounds=4, scan_points=800, model_points=400, random_starts=10),
-    registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
-                                           GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05))),
+    registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.7, 0.01, 0.08),
+                                           GraphStage(80, 0.06, 0.7, 0.01, 0.05))),
     learn=LearnConfig(refinements=1), rounds=2, failed=0.05, workers=Workers(1))
 
 

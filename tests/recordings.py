@@ -8,9 +8,10 @@ from completion_bodies import half_view, worm_with_prior
 from test_completion_partial import MARKS
 from test_completion_tracking import SETTINGS, motion
 
-from completion.tracking import cli
+from completion.tracking import cli, report
 from scanprep.command_line import run
 from scanprep.geometry.files import PointCloud, write_points
+from scanprep.pictures.page import Page
 
 FRAMES = 9
 
@@ -52,11 +53,11 @@ def track(*argv):
     return run(track_quickly, "scape track", list(argv))
 
 
-def quick_page(folder, motion, *_):
+def quick_page(motion, *_):
     """In place of the pictures, which take longer than all else."""
-    (folder / "report.html").write_text(f"{motion.poses.sum()}")
+    return Page(f"{motion.poses.sum()}")
 
 
 if __name__ == "__main__":
-    cli._page = quick_page
+    report.track_page = quick_page
     sys.exit(track(*sys.argv[1:]))

@@ -5,9 +5,8 @@ from scipy.linalg import block_diag
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import AnimateConfig, animate, smoothed
-from completion.mocap.pose.marked_body import MarkedBody, supports
-from completion.mocap.pose.robust import marker_weights
+from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.marked_body import MarkedBody, marker_weights, supports
 from completion.motion import Motion
 from model.fitting import energy
 from scanprep.geometry import rotations
@@ -110,7 +109,7 @@ def body(subject, layout):
 
 def smooth_step(body, x, targets):
     weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
-    return smoothed(body, PLAIN.inertia(100.0, 15), x, targets, weights)
+    return body.smoothed(x, PLAIN.inertia(100.0, 15), body.system, targets, weights)
 
 
 def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
@@ -133,7 +132,7 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
     rows.append(D)
     values.append((np.sqrt(stiffness) * np.diff(body.step_to(x[:-1], x[1:]), axis=0)).ravel())
     step = -np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0].reshape(5, 15)
-    got = smoothed(body, stiffness, x, targets, weights)
+    got = body.smoothed(x, stiffness, body.system, targets, weights)
     assert np.abs(step).max() > 0.01
     np.testing.assert_allclose(got[:, -3:] - x[:, -3:], step[:, -3:], atol=1e-5)
 

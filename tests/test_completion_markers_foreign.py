@@ -11,7 +11,7 @@ from completion.mocap.files.c3d import file_parameters, point_table, rotations_s
 from completion.mocap.files.c3d_points import add_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, marker_subjects, people_of, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.robust import motion_problem
+from completion.mocap.pose.judgement import motion_problem
 from completion.motion import Motion
 from scanprep.geometry.format_common import unit_named
 from scanprep.geometry.mesh import Mesh

@@ -5,9 +5,9 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 from marker_faults import CONFIG, FRAMES, LABELS, RATE, exchanged
 
-from completion.mocap.artefacts import simulated
-from completion.mocap.artefacts.find import ambiguous_swap, find_artefacts
-from completion.mocap.artefacts.simulated import Simulation, bridged
+from completion import smoothing
+from completion.mocap.artefacts import find
+from completion.mocap.artefacts.find import Simulation, ambiguous_swap, bridged, find_artefacts
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.pictures import chart_artefacts
@@ -122,7 +122,7 @@ def test_what_a_person_before_has_told_is_begun_with(subject, layout, moved, mon
     faulty[60:, 20] += turns[60:, 20] @ [0.03, 0, 0]
     first = find_artefacts(subject, changed(faulty), layout, CONFIG)
     motion = animate(subject, first.repaired, layout, AnimateConfig())
-    monkeypatch.setattr(simulated, "between_keys", None)
+    monkeypatch.setattr(find, "between_keys", None)
     monkeypatch.setattr(follow, "between_keys", None)
     again = find_artefacts(subject, changed(faulty), layout, CONFIG, motion, known=first)
     assert [vars(e) for e in again.swaps] == [vars(e) for e in first.swaps]
@@ -150,12 +150,12 @@ def test_frames_are_smoothed_and_solved_some_at_a_time(subject, layout, moved, m
     body = MarkedBody(subject, layout, 1.0, 0.3)
     config, weights = AnimateConfig(), np.full(positions.shape[:2], 1e4)
     x = body.body.join(moved[0] + 0.02, moved[1])
-    arguments = body, config.inertia(RATE, body.n_unknowns), x, positions, weights
-    whole, alone = follow.smoothed(*arguments), body.solve(x, positions, weights, 5, 1e-6)
-    monkeypatch.setattr(follow, "WINDOW", 150)
-    monkeypatch.setattr(follow, "OVERLAP", 50)
+    arguments = x, config.inertia(RATE, body.n_unknowns), body.system, positions, weights
+    whole, alone = body.smoothed(*arguments), body.solve(x, positions, weights, 5, 1e-6)
+    monkeypatch.setattr(smoothing, "WINDOW", 50)
+    monkeypatch.setattr(smoothing, "OVERLAP", 50)
     monkeypatch.setattr(marked_body, "MOST", 50)
-    assert np.abs(follow.smoothed(*arguments) - whole).max() < 1e-6
+    assert np.abs(body.smoothed(*arguments) - whole).max() < 1e-6
     pieces = body.solve(x, positions, weights, 5, 1e-6)
     for one, other in ((pieces.x, alone.x), (pieces.energy, alone.energy), (pieces.converged, alone.converged)):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
@@ -180,8 +180,8 @@ def test_close_labels_are_tried_both_ways(subject, layout, moved):
     exchanged(faulty, a, b, 40, 109)
     for end in (40, 110):
         faulty[end - 15:end + 15, [a, b]] = np.nan
-    body = Simulation(subject, changed(faulty), layout, AnimateConfig())
-    x = body.solve(faulty)
+    body = Simulation(subject, changed(faulty), layout)
+    x = body.follow(faulty)
     swapped = ambiguous_swap(body, x, Tracks(faulty, RATE), a, b)
     there = np.isfinite(faulty[:, a, 0])
     np.testing.assert_array_equal(swapped[there[swapped]], np.arange(55, 95))
@@ -192,13 +192,13 @@ def test_what_a_marker_is_off_by_the_account_of_the_others(subject, layout, move
     _, _, positions, _ = moved
     faulty = positions[:40].copy()
     faulty[:, 7] += [0.004, 0.01, -0.006]
-    body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout, AnimateConfig())
-    x = body.solve(faulty)
+    body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout)
+    x = body.follow(faulty)
     off = faulty - body.body.positions(x)
-    alone = body.alone(off, x)[:, 7]
+    alone = body.alone(off, x, faulty)[:, 7]
     without = faulty.copy()
     without[:, 7] = np.nan
-    true = faulty[:, 7] - body.body.positions(body.solve(without))[:, 7]
+    true = faulty[:, 7] - body.body.positions(body.follow(without))[:, 7]
     assert np.linalg.norm(off[:, 7] - true, axis=1).mean() > 0.001
     assert np.linalg.norm(alone - true, axis=1).mean() < 0.4 * np.linalg.norm(off[:, 7] - true, axis=1).mean()
 

@@ -9,8 +9,8 @@ from completion import MoshConfig, PersonConfig, animate, find_person, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.mosh import PoseConfig
-from completion.mocap.pose.robust import hardly_believed, markers_told
-from completion.mocap.pose.settings import AnimateConfig
+from completion.mocap.pose.judgement import hardly_believed, markers_told
+from completion.mocap.pose.marked_body import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.person import choose_frames, common_markers, judge_moves, spread_frames
 from completion.mocap.subject.worn_elsewhere import MovedMarker, Worn, _Frames, _with_whole_parts, find_worn

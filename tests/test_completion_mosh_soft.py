@@ -12,11 +12,16 @@ from derivatives import differences
 from completion import MarkerLayout, MarkerSequence, Motion, follow_soft_tissue
 from completion.mocap.pose.marked_body import supports
 from completion.mocap.soft_tissue import follow
-from completion.mocap.soft_tissue.follow import ShapeFollower, SkinFollower, variances
-from completion.mocap.soft_tissue.follower import whiten
-from completion.mocap.soft_tissue.settings import SoftTissueConfig
-from completion.mocap.soft_tissue.skin import SkinMovement, in_root, in_world, smooth_modes
-from completion.mocap.soft_tissue.soft_tissue import SoftTissue, changing_bodies, skin_movement
+from completion.mocap.soft_tissue.follow import ShapeFollower, SkinFollower, SoftTissueConfig, variances, whiten
+from completion.mocap.soft_tissue.soft_tissue import (
+    SkinMovement,
+    SoftTissue,
+    changing_bodies,
+    in_root,
+    in_world,
+    skin_movement,
+    smooth_modes,
+)
 from completion.viewing.soft import soft_columns
 from model.body import BodyModel
 from scanprep.geometry import rotations

@@ -5,8 +5,7 @@ from completion_bodies import MEAN, worm_with_prior
 
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.initialise import reinitialise_limbs
-from completion.mocap.pose.marked_body import MarkedBody
-from completion.mocap.pose.settings import AnimateConfig
+from completion.mocap.pose.marked_body import AnimateConfig, MarkedBody
 
 CONFIG = AnimateConfig(prior_weight=1e-3)
 LOST = np.arange(10, 16)

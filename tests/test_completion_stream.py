@@ -10,10 +10,11 @@ from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate, low_pass
 from completion.mocap.pose.foot_contact import Floor, FootContact
-from completion.mocap.pose.marked_body import MarkedBody, supports
+from completion.mocap.pose.judgement import marker_speed
+from completion.mocap.pose.marked_body import MarkedBody, marker_weights, supports
 from completion.mocap.pose.part_shapes import PartShapes
-from completion.mocap.pose.robust import LabelWatch, marker_speed, marker_weights
 from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
+from completion.mocap.pose.swaps import LabelWatch
 from completion.motion import Motion
 from model.features import linear_features
 from model.fitting import energy
@@ -304,12 +305,13 @@ def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
     body = MarkedBody(subject, layout, 0.3, 0.3)
     x = body.body.join(*motions["stand"])
     feet = FootContact(body, x, 60.0)
-    places = feet.held(x).places
+    places = feet.held(x)
     held = ~np.isnan(places[..., 0])
     assert held.all(axis=0).sum() >= 4 and (feet.floor.above(places[held]) > -1e-9).all()
     raised = x.copy()
     raised[:, -1] += 1
-    assert np.isnan(FootContact(body, raised, 60.0, feet.floor).held(raised).places).all()
+    floor = *feet.floor.normal, feet.floor.height
+    assert np.isnan(FootContact(body, raised, 60.0, floor).held(raised)).all()
 
 
 def test_a_motion_keeps_which_markers_were_trusted(tmp_path):

@@ -16,7 +16,7 @@ from scene_reader import scenes_of
 from trees import tree
 
 from completion import Motion
-from completion.tracking import cli
+from completion.tracking import cli, report
 from completion.tracking.folder import FrameFolder
 from completion.tracking.report import _ranges
 from completion.tracking.sequence import Tracker
@@ -133,7 +133,7 @@ def test_the_command_writes_all_it_promises(recording, output):
 
 def test_killed_in_the_first_frames_and_started_again(recording, tmp_path, capfd, monkeypatch):
     """The shape is found from frames of two chunks; the run is killed after the first."""
-    monkeypatch.setattr(cli, "_page", quick_page)
+    monkeypatch.setattr(report, "track_page", quick_page)
     out, shaped = tmp_path / "out", ("--shape-frames", 7)
     assert call(recording, tmp_path / "whole", *shaped) == 0
     program = [sys.executable, str(Path(__file__).with_name("recordings.py")), *arguments(recording[0], out, *shaped)]
@@ -161,7 +161,7 @@ def again(recording, output, tmp_path, monkeypatch):
     folder, out, numbers, push = tmp_path / "recording", tmp_path / "out", [], Tracker.push
     shutil.copytree(recording[0], folder)
     shutil.copytree(output, out)
-    monkeypatch.setattr(cli, "_page", quick_page)
+    monkeypatch.setattr(report, "track_page", quick_page)
 
     def counted(self, frame):
         numbers.append(self.state.number)

@@ -129,7 +129,7 @@ def test_random_bodies_and_poses_are_as_the_model_says(files, model):
     app = app_of(files, "worm.npz")
     drawn = []
     for _ in range(300):
-        app.controls.random_body(app.rng)
+        app.controls.random_body()
         drawn.append(app.controls.betas)
     assert np.abs(np.mean(drawn, axis=0)).max() < 0.25 and np.abs(np.std(drawn, axis=0) - 1).max() < 0.2
     ask(app, "random_pose")

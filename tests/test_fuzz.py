@@ -148,7 +148,7 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("kind", ["scape-radial", "blendscape", "skinning-linear"])
+@pytest.mark.parametrize("kind", ["scape-quaternion", "blendscape", "skinning-linear"])
 def test_damaged_models_are_refused_when_they_are_loaded(tmp_path, kind):
     path = tmp_path / "model.npz"
     KINDS[kind]().save(path)

@@ -19,8 +19,8 @@ from completion.__main__ import COMMANDS as SCAPE
 from completion.__main__ import main
 from completion.measuring import bodies
 from completion.mocap.animate.work import Work as Follow
-from completion.mocap.pose.robust import hardly_seen, judge_motions, motion_doubts, motion_problem
-from completion.mocap.pose.settings import AnimateConfig
+from completion.mocap.pose.judgement import hardly_seen, judge_motions, motion_doubts, motion_problem
+from completion.mocap.pose.marked_body import AnimateConfig
 from completion.mocap.subject.person import PersonConfig
 from completion.mocap.subject.worn_elsewhere import Worn
 from completion.motion import Motion

@@ -1,6 +1,7 @@
 """What every kind of body model must do, whatever it is made of; the kinds are listed in `conformance_bodies`."""
 import numpy as np
 import pytest
+import toy_kind
 from completion_bodies import half_view
 from conformance_bodies import KINDS, stiff_bodies
 from derivatives import differences
@@ -11,9 +12,12 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
+from model import files
 from model.body import BodyModel
+from model.cli import group
 from model.files import load_model
 from model.fitting.vertices import FitConfig, fit_pose, fit_shape
+from model.resolution.change import resolution_gap
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -23,7 +27,10 @@ BODIES = pytest.mark.parametrize("betas", [None, BETAS, BETAS[:2]], ids=["own", 
 
 @pytest.fixture(scope="module", params=list(KINDS))
 def model(request):
-    return KINDS[request.param]()
+    with pytest.MonkeyPatch.context() as patch:
+        for kind, line in toy_kind.TABLE.items():
+            patch.setitem(files.KINDS, kind, line)
+        yield KINDS[request.param]()
 
 
 @pytest.fixture
@@ -38,6 +45,7 @@ def at_random(model, rng, count, size=0.5):
 def test_it_says_what_it_is(model):
     assert isinstance(model, BodyModel) and model.n_betas == 3
     assert model.kind in repr(model).lower() and len(repr(model)) < 200
+    assert model.n_features == model.features.count
     assert (np.diff(model.explained) >= 0).all() and model.explained[-1] == pytest.approx(1)
 
 
@@ -248,6 +256,21 @@ def test_markers_are_animated(model):
     motion = animate(subject, MarkerSequence(positions, layout.labels, 100.0), layout,
                      AnimateConfig(smoothing=0))
     assert np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean(axis=1).max() < 0.01
+
+
+def test_a_model_passes_through_the_commands(model, tmp_path, monkeypatch):
+    """What a kind must say is enough for all of them; `complete` and `animate` are above."""
+    file, out = tmp_path / "worm.npz", tmp_path / "out"
+    model.save(file)
+    for argv in (["info"], ["mesh", "--betas", "1", "-o", "out/a.ply"], ["sample", "-n", "2", "-o", "out/b"],
+                 ["export", "-o", "out/c.glb"], ["export", "-o", "out/d.bvh"], ["export", "-o", "out/e.npz"],
+                 ["resample", "--vertices", "300", "-o", "out/f.npz"]):
+        monkeypatch.chdir(tmp_path)
+        assert group([argv[0], str(file), *argv[1:]]) == 0, argv
+    back = load_model(out / "f.npz")
+    assert type(back) is type(model) and len(back.template.vertices) == pytest.approx(300, abs=5)
+    apart = resolution_gap(model, back, 0.3 * POSE[None], BETAS[None])
+    assert apart.max() < 0.02 and {path.name for path in out.iterdir()} >= {"a.ply", "b", "c.glb", "d.bvh", "e.npz"}
 
 
 @pytest.mark.parametrize("kind", ["scape", "skinning"])

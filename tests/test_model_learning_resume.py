@@ -17,7 +17,7 @@ from scanprep.batch.opening import beside
 from scanprep.command_line import run
 from scanprep.skeleton import restarts
 
-STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "_learned"), "people": (scape, "shape_gradients"),
+STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
 QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
 SKIN = {"rounds": 2, "components": 4}
@@ -135,7 +135,7 @@ def test_killed_twice_in_the_poses(bodies, monkeypatch):
     killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the second
     real, calls = scape._refined, []
     monkeypatch.setattr(scape, "_refined", lambda *given, **named: calls.append(1) or real(*given, **named))
-    monkeypatch.setattr(scape, "_first", None)
+    monkeypatch.setattr(scape, "by_edges", None)
     assert learned(bodies, "b.npz", refinements=3) == undisturbed
     assert len(calls) == 1
 
@@ -161,12 +161,12 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
                 "--config", str(config_file(tmp_path, scape=QUICK))]
 
     assert run(learn, "scape learn", given("a.npz")) == 0
-    killed(restarts, "_searched", 1, given("b.npz"))                              # after the first restart
+    killed(restarts, "_search", 1, given("b.npz"))                              # after the first restart
     killed(parts, "_left_out_error", 0, given("b.npz"))                           # after the last
     killed(parts, "_tried", 1, given("b.npz"))                                    # before more parts are tried
     tried, real = [], parts._tried
     monkeypatch.setattr(parts, "_tried", lambda *given: tried.append(given[1]) or real(*given))
-    monkeypatch.setattr(restarts, "_searched", lambda search: pytest.fail("searched again"))
+    monkeypatch.setattr(restarts, "_search", lambda search: pytest.fail("searched again"))
     assert run(learn, "scape learn", given("b.npz")) == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert tried and all(wanted is not None for wanted in tried)
@@ -266,7 +266,7 @@ def test_a_mix_goes_on(tmp_path):
         for i, body in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
             whole = whole.add(f"p{person}_{i}", body, subject=f"p{person}")
     whole.with_skeleton(truth.skeleton)
-    file = config_file(tmp_path, mixed={"refinements": 2, "components": 2})
+    file = config_file(tmp_path, mixed={"refinements": 3, "components": 2})
     given = ["--poses", str(tmp_path / "set"), "--kind", "mixed", "--config", str(file)]
     assert run(learn, "scape learn", [*given, "-o", str(tmp_path / "a.npz")]) == 0
     argv = [*given, "-o", str(tmp_path / "b.npz")]

@@ -3,7 +3,6 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model.features import PoseFeatures, QuadraticLift
-from model.learning import regression
 from model.learning.config import LearnConfig
 from model.learning.regression import Design, by_edges, choose_design, compress, left_out
 from model.pose_space import PoseSpace
@@ -35,7 +34,7 @@ def test_a_linear_truth_is_learned_exactly(model):
     rng = np.random.default_rng(4)
     poses = random_poses(model, 30, rng)
     poses[:, 3, 2] = 0                                        # the truth does not use this axis
-    design, space = learn(model, poses, model.pose_space.gradients(poses), features="linear", prunings=(1e-4,))
+    design, space = learn(model, poses, model.pose_space.gradients(poses), prunings=(1e-4,))
     new = random_poses(model, 5, rng)
     new[:, 3, 2] = 0
     np.testing.assert_allclose(space.gradients(new), model.pose_space.gradients(new), atol=2e-6)  # float32
@@ -51,19 +50,6 @@ def test_a_quadratic_truth_needs_products(model):
     assert off["quadratic"] < 1e-5 and off["linear"] > 0.05
 
 
-@pytest.mark.parametrize("regressor", ["ridge", "svr"])
-def test_bells_follow_what_is_not_linear(model, regressor, monkeypatch):
-    monkeypatch.setattr(regression, "RADII", (1.5,))
-    monkeypatch.setattr(regression, "TUBE", 1e-5)
-    rng = np.random.default_rng(6)
-    poses, new = random_poses(model, 80, rng, 0.4), random_poses(model, 20, rng, 0.3)
-    judge = edge_error(model, curved(model, new))
-    line = judge(learn(model, poses, curved(model, poses), features="linear")[1].gradients(new))
-    _, radial = learn(model, poses, curved(model, poses), features="radial", regressor=regressor, ridges=(1e-3,))
-    bells = judge(radial.gradients(new))
-    assert bells < 0.35 * line
-
-
 def test_support_vectors_shrug_off_a_wrong_body(model):
     """One body whose Q is nonsense in one part pulls least squares more than support vectors."""
     rng = np.random.default_rng(7)
@@ -71,15 +57,14 @@ def test_support_vectors_shrug_off_a_wrong_body(model):
     Q = model.pose_space.gradients(poses)
     Q[3, model.skeleton.part_of_face == 1] += 3.0
     judge = edge_error(model, model.pose_space.gradients(new))
-    errors = {r: judge(learn(model, poses, Q, features="linear", regressor=r, ridges=(1e-2,))[1]
+    errors = {r: judge(learn(model, poses, Q, regressor=r, ridges=(1e-2,))[1]
                        .gradients(new)) for r in ("ridge", "svr")}
     assert errors["svr"] < 0.5 * errors["ridge"]
 
 
-@pytest.mark.parametrize("features", ["linear", "quadratic", "radial"])
-def test_sums_over_the_poses_tell_least_squares_as_much_as_every_pose(model, features, monkeypatch):
+@pytest.mark.parametrize("features", ["linear", "quadratic"])
+def test_sums_over_the_poses_tell_least_squares_as_much_as_every_pose(model, features):
     """Against ridge regression as it stands in the books, of one group of triangles; more features than poses too."""
-    monkeypatch.setattr(regression, "RADII", (1.0,))
     rng = np.random.default_rng(12)
     poses = random_poses(model, 25, rng)
     Q = curved(model, poses) + rng.normal(0, 0.05, (25, len(model.template.faces), 3, 3))
@@ -94,9 +79,8 @@ def test_sums_over_the_poses_tell_least_squares_as_much_as_every_pose(model, fea
     np.testing.assert_allclose(seen.of_space(space), seen.sums(space.gradients(poses)), atol=1e-12)
 
 
-@pytest.mark.parametrize("features", ["linear", "quadratic", "radial"])
-def test_left_out_predictions_are_those_of_leaving_out(model, features, monkeypatch):
-    monkeypatch.setattr(regression, "RADII", (1.0,))
+@pytest.mark.parametrize("features", ["linear", "quadratic"])
+def test_left_out_predictions_are_those_of_leaving_out(model, features):
     rng = np.random.default_rng(8)
     poses = random_poses(model, 12, rng)
     Q = model.pose_space.gradients(poses) + rng.normal(0, 0.05, (12, len(model.template.faces), 3, 3))
@@ -116,8 +100,8 @@ def test_what_predicts_best_is_chosen(model):
     Q = model.pose_space.gradients(poses) + rng.normal(0, 0.05, (14, len(model.template.faces), 3, 3))
     tried = {}
     for ridge in (1e-4, 0.1, 30.0):
-        tried[ridge] = learn(model, poses, Q, features="linear", ridges=(ridge,))[0].left_out_error
-    chosen, _ = learn(model, poses, Q, features="linear", ridges=tuple(tried))
+        tried[ridge] = learn(model, poses, Q, ridges=(ridge,))[0].left_out_error
+    chosen, _ = learn(model, poses, Q, ridges=tuple(tried))
     assert chosen.ridge == min(tried, key=tried.get)
     assert chosen.left_out_error == pytest.approx(min(tried.values()), rel=1e-12)
     again = choose_design(model.template, model.skeleton, poses, LearnConfig("linear", "ridge", (0.0,), tuple(tried)),
@@ -130,7 +114,7 @@ def test_pruning_is_chosen_by_what_it_predicts(model):
     rng = np.random.default_rng(10)
     poses = random_poses(model, 40, rng)
     poses[:, 1, 2] *= 0.1
-    design, _ = learn(model, poses, model.pose_space.gradients(poses), features="linear", prunings=(1e-4, 0.05))
+    design, _ = learn(model, poses, model.pose_space.gradients(poses), prunings=(1e-4, 0.05))
     assert design.pruning == 1e-4
 
 

@@ -5,7 +5,7 @@ import pytest
 from model_bodies import random_poses, worm_model
 from posing_bodies import skinned, symmetric_worm
 
-from model import load_model
+from model import BodyModel, load_model
 from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
@@ -160,8 +160,8 @@ def test_refuses_what_cannot_be(model):
         change_resolution(model, model.template.with_vertices(model.template.vertices + 1))
     with pytest.raises(ValueError, match="not usable as a template"):
         change_resolution(model, Mesh(model.template.vertices, model.template.faces[:0]))
-    with pytest.raises(ValueError, match="kind"):
-        change_resolution(type("Other", (), {"kind": "other", "template": model.template})(), model.template)
+    with pytest.raises(ValueError, match="kind 'scape'"):
+        BodyModel.resampled(model, model.template, model.skeleton, 0, print)
 
 
 def test_gradients_of_edges_and_the_rest():

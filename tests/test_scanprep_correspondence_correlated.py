@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scanprep.correspondence import potentials as ce
-from scanprep.correspondence.correlated import find_correspondences, find_seeds, matched_ends
+from scanprep.correspondence.correlated import find_correspondences, find_seeds, match_ends
 from scanprep.correspondence.potentials import Places, gradients
 from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
 from scanprep.correspondence.sheet import Sheet
@@ -121,10 +121,10 @@ def test_ends_are_matched_by_the_ways_between_them():
     x = rng.normal(size=(5, 3))
     ways = np.linalg.norm(x[:, None] - x, axis=2)
     order = rng.permutation(5)
-    best = matched_ends(ways, 1.1 * ways[np.ix_(order, order)], 8)[0]
+    best = match_ends(ways, 1.1 * ways[np.ix_(order, order)], 8)[0]
     assert (order[best] == np.arange(5)).all()
     lost = order[:4]                                         # one end of the scan is hidden
-    best = matched_ends(ways, ways[np.ix_(lost, lost)], 8)[0]
+    best = match_ends(ways, ways[np.ix_(lost, lost)], 8)[0]
     assert (best == -1).sum() == 1 and (lost[best[best >= 0]] == np.flatnonzero(best >= 0)).all()
 
 

@@ -28,7 +28,7 @@ from scanprep.registration.figures import (
     write_figures,
 )
 from scanprep.registration.limbs import Doubt
-from scanprep.registration.nonrigid import principal_stretches, stretched_share, uncovered_share
+from scanprep.registration.nonrigid import principal_stretches, share_stretched, uncovered_share
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
 
@@ -186,10 +186,10 @@ def test_stretches_of_a_known_map(template):
     np.testing.assert_allclose(short[usable], 0.5, rtol=1e-6)
     moved = template.with_vertices(template.vertices @ R.T)
     np.testing.assert_allclose(np.concatenate(principal_stretches(template, moved)), 1, atol=1e-9)
-    assert stretched_share(template, moved) == 0
-    assert stretched_share(template, template.with_vertices(0.4 * template.vertices)) == 0         # somebody small
+    assert share_stretched(template, moved) == 0
+    assert share_stretched(template, template.with_vertices(0.4 * template.vertices)) == 0         # somebody small
     half = np.where(template.vertices[:, :1] > np.median(template.vertices[:, 0]) + 0.2, [2.5, 1, 1], 1)
-    assert 0.05 < stretched_share(template, template.with_vertices(half * template.vertices)) < 0.5
+    assert 0.05 < share_stretched(template, template.with_vertices(half * template.vertices)) < 0.5
 
 
 def test_missed_points(template):

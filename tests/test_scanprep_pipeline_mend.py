@@ -13,7 +13,7 @@ from scanprep.batch.ownership import HOME
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.storage import StorageError
 from scanprep.pipeline.again import Call
-from scanprep.pipeline.cli import carried_out
+from scanprep.pipeline.cli import carry_out
 from scanprep.pipeline.mend import MendApp
 from scanprep.viewer.clicked import KEPT
 from scanprep.viewer.messages import Message
@@ -36,7 +36,7 @@ def made(tmp_path_factory):
     write_landmarks(file, {name: marks[WRONG.get(name, name)] for name in marks})
     call = Call(scans, place / "template.ply", config=WITH_PICTURES)
     with workspace(place / "set") as space:
-        carried_out(call, call.inputs(lambda line: None), space)
+        carry_out(call, call.inputs(lambda line: None), space)
     return place, shutil.copytree(place, place.with_name("kept"))
 
 
@@ -111,7 +111,7 @@ def test_exchanged_landmarks_are_mended_and_only_that_scan_is_registered(place):
     assert len(scene.data) - scene.fields["first"] == len(after["set/pictures/body1.scene"])
     call = Call.read(place / "set")                             # and the command itself has nothing left to do
     with workspace(place / "set") as space:
-        done = carried_out(call, call.inputs(lambda line: None), space)
+        done = carry_out(call, call.inputs(lambda line: None), space)
     assert {m.name: m.value for m in done.metrics}["of them in this run"] == 0
 
 

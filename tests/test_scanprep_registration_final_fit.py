@@ -12,7 +12,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
-from scanprep.registration.final_fit import FinalFit, final_fit, smoothed_scan
+from scanprep.registration.final_fit import FinalFit, final_fit, smooth_scan
 from scanprep.registration.schedule import FinalFitConfig, FinalFitRound
 from scanprep.registration.stretches import Triangles
 
@@ -144,7 +144,7 @@ def test_even_growth_costs_nothing():
 def test_a_field_is_measured_and_laid_out_again(truth):
     body = crab()
     triangles = Triangles(body)
-    field = triangles.measured(truth.vertices)
+    field = triangles.measure(truth.vertices)
     np.testing.assert_allclose(field.R @ field.R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), field.R.shape),
                                atol=1e-9)
     np.testing.assert_allclose(field.S, field.S.transpose(0, 2, 1), atol=1e-12)
@@ -177,12 +177,12 @@ def test_smoothing_keeps_an_even_field_and_drops_a_fold():
     body = crab()
     triangles = Triangles(body)
     M = np.diag([1.2, 1.2, 1.2]) @ rotations.exp(np.array([0.2, 0.5, -1.0]))
-    even = triangles.measured(body.vertices @ M.T)
-    smooth = triangles.smoothed(even, 0.1, np.ones(len(body.faces)))
+    even = triangles.measure(body.vertices @ M.T)
+    smooth = triangles.smooth(even, 0.1, np.ones(len(body.faces)))
     np.testing.assert_allclose(smooth.gradient, np.broadcast_to(M, smooth.R.shape), atol=1e-8)
     x = body.vertices.copy()
     x[[405, 406]] = x[[406, 405]]
-    folded = triangles.smoothed(triangles.measured(x), 0.1, np.ones(len(body.faces)))
+    folded = triangles.smooth(triangles.measure(x), 0.1, np.ones(len(body.faces)))
     assert np.linalg.norm(folded.R - np.eye(3), axis=(1, 2)).max() < 0.5
 
 
@@ -190,7 +190,7 @@ def test_a_smoothed_scan_is_smoother_than_the_scan_even_where_it_curves(truth):
     scan = target_of(cloud(truth, 20000))
     nearest = Surface(truth).closest(scan.points)
     sign = np.sign(np.einsum("nd,nd->n", scan.normals, truth.face_normals[nearest.faces]))
-    smooth = smoothed_scan(replace(scan, normals=sign[:, None] * scan.normals, oriented=True), 0.015)
+    smooth = smooth_scan(replace(scan, normals=sign[:, None] * scan.normals, oriented=True), 0.015)
     before, after = (Surface(truth).closest(p).distances.mean() for p in (scan.points, smooth.points))
     assert after < 0.45 * before
     agree = np.einsum("nd,nd->n", smooth.normals, truth.face_normals[nearest.faces])

@@ -8,10 +8,10 @@ from jointed_bodies import bent, crab
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.graph_fit import GraphFit, Stiffness, start_fit
+from scanprep.registration.graph_fit import GraphFit, start_fit
 from scanprep.registration.matches import prepare, pull
 from scanprep.registration.nonrigid import register
-from scanprep.registration.schedule import RegistrationConfig
+from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 LEFT, RIGHT = np.array([0, 0, 0.6]), np.array([0, 0.6, 0])
 GIVEN = prepare(crab(), crab())
@@ -27,7 +27,7 @@ def begun(T=None, nodes=80) -> GraphFit:
 
 
 def linked(fit: GraphFit, wanted, length: float) -> GraphFit:
-    return fit.minimised(wanted, Stiffness(length, 0.1 * length, 0.0), 3)
+    return fit.minimise(wanted, GraphStage(80, length / SIZE, 0.0, 0.0, 0.0), SIZE, 3)
 
 
 def off(fit: GraphFit, wanted: np.ndarray) -> float:
@@ -65,7 +65,7 @@ def test_a_finer_graph_goes_on_from_the_coarser_one():
     wanted, fit = bent(crab(), LEFT, RIGHT), begun()
     for _ in range(5):
         fit = linked(fit, all_wanted(wanted), 0.1 * SIZE)
-    after = linked(fit.refined(GIVEN.template, 200), all_wanted(wanted), 0.1 * SIZE)
+    after = linked(fit.refine(GIVEN.template, 200), all_wanted(wanted), 0.1 * SIZE)
     assert np.linalg.norm(after.x - fit.x, axis=1).mean() < 0.01
     assert off(after, wanted) < off(fit, wanted) + 0.002
 

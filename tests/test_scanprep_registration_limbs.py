@@ -7,7 +7,7 @@ from scanprep.geometry.target import target_of
 from scanprep.judgement import size
 from scanprep.pipeline.scan import size_doubts
 from scanprep.registration import unmarked
-from scanprep.registration.limb_ends import RigidFit, bending, find_ends, rotated_ends
+from scanprep.registration.limb_ends import RigidFit, bending, find_ends, rotate_ends
 from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_bending, rolls
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts, average_person
@@ -128,7 +128,7 @@ def test_a_hand_bent_at_the_wrist_is_found(person):
     for axis, degrees in ((1, 50), (1, 80), (2, -80), (2, 80)):
         pose[hand] = np.radians(degrees) * frames()[hand, axis]
         scan = template.with_vertices(person.posed(pose))
-        tried = rotated_ends(template, end, template.vertices, RigidFit(target_of(scan), size(template)))
+        tried = rotate_ends(template, end, template.vertices, RigidFit(target_of(scan), size(template)))
         off = min(np.linalg.norm(places[mine] - scan.vertices[end.vertices[mine]], axis=1).mean() for places in tried)
         assert off < 0.025, (axis, degrees)
 

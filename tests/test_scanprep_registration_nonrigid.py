@@ -15,9 +15,12 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.registration import folds
-from scanprep.registration import graph_fit as graph
+from scanprep.registration import graph_energy as energy
+from scanprep.registration.deformation_graph import build_graph, deform, refine_motion
+from scanprep.registration.graph_fit import start_fit
+from scanprep.registration.matches import pull
 from scanprep.registration.nonrigid import register
-from scanprep.registration.schedule import RegistrationConfig
+from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 LEFT, RIGHT = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
 MARKS = np.array([820, 821, 9 * 20, 9 * 20 + 10, 20 * 20, 20 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
@@ -125,13 +128,13 @@ def test_a_folded_patch_is_laid_flat_again():
 # ---- the graph and the energy terms -------------------------------------------------------------------------
 
 def small_graph():
-    return graph.build_graph(crab(), 40)
+    return build_graph(crab(), 40)
 
 
 def random_motion(g, rng, size=0.3):
     M = len(g.node_vertices)
     step = size * rng.normal(size=(M, 7)) * [1, 1, 1, 0.3, 0.1, 0.1, 0.1]
-    return graph.start_motion(g, np.eye(4)).moved(step)
+    return start_fit(crab(), np.eye(4), M).motion.advance(step)
 
 
 @pytest.mark.parametrize("mended", [True, False])
@@ -148,10 +151,10 @@ def test_a_similarity_is_free_and_exact():
     g = small_graph()
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotations.exp(np.array([1.0, 2.0, -0.5])), [1, 2, 3]
-    motion = replace(graph.start_motion(g, T), log_scale=np.full(len(g.nodes), np.log(1.3)),
+    motion = replace(start_fit(crab(), T, 40).motion, log_scale=np.full(len(g.nodes), np.log(1.3)),
                      positions=1.3 * g.nodes @ T[:3, :3].T + T[:3, 3])
-    np.testing.assert_allclose(graph.deform(g, motion), 1.3 * crab().vertices @ T[:3, :3].T + T[:3, 3], atol=1e-12)
-    for term in (graph.stretch_term, graph.bend_term, graph.growth_term):
+    np.testing.assert_allclose(deform(g, motion), 1.3 * crab().vertices @ T[:3, :3].T + T[:3, 3], atol=1e-12)
+    for term in (energy.stretch_term, energy.bend_term, energy.growth_term):
         assert term(g, motion, 1.0).value < 1e-20
 
 
@@ -165,10 +168,10 @@ def test_inner_links_cross_the_body():
 
 
 def test_a_finer_graph_takes_the_motion_over():
-    coarse, fine = small_graph(), graph.build_graph(crab(), 150)
+    coarse, fine = small_graph(), build_graph(crab(), 150)
     motion = random_motion(coarse, np.random.default_rng(5), 0.05)
-    after = graph.deform(fine, graph.transferred(coarse, motion, fine))
-    assert np.linalg.norm(after - graph.deform(coarse, motion), axis=1).mean() < 0.003
+    after = deform(fine, refine_motion(coarse, motion, fine))
+    assert np.linalg.norm(after - deform(coarse, motion), axis=1).mean() < 0.003
 
 
 def wanted_pull(rng):
@@ -176,7 +179,7 @@ def wanted_pull(rng):
     at = rng.integers(0, len(body.vertices), 300)
     normals = rng.normal(size=(300, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return graph.pull(len(body.vertices), at, rng.normal(size=(300, 3)), rng.random(300), normals, 0.1)
+    return pull(len(body.vertices), at, rng.normal(size=(300, 3)), rng.random(300), normals, 0.1)
 
 
 @pytest.mark.parametrize("name", ["data", "stretch", "bend", "growth"])
@@ -184,15 +187,15 @@ def test_gradient_matches_finite_differences(name):
     rng = np.random.default_rng(7)
     g = small_graph()
     motion, wanted = random_motion(g, rng), wanted_pull(rng)
-    stiffness = graph.Stiffness(0.7, 0.5, 0.3)
-    term = graph.terms(g, motion, wanted, stiffness)[name]
-    blocks, half = term.normal(graph.NodePattern(g))
+    stage = GraphStage(40, 0.7, 0.3, 0.0, 0.0)
+    term = energy.terms(g, motion, wanted, stage, 2.0)[name]
+    blocks, half = term.normal(energy.NodePattern(g))
     for _ in range(4):
         direction = rng.normal(size=half.shape)
-        expected = slope(lambda s, d=direction: graph.terms(g, motion.moved(s * d), wanted, stiffness)[name].value,
+        expected = slope(lambda s, d=direction: energy.terms(g, motion.advance(s * d), wanted, stage, 2.0)[name].value,
                          1e-5)
         np.testing.assert_allclose(2 * np.sum(half * direction), expected, rtol=1e-6, atol=1e-7 * abs(term.value))
-    H = graph.NodePattern(g).matrix(blocks)
+    H = energy.NodePattern(g).matrix(blocks)
     assert abs(H - H.T).max() <= 1e-12 * abs(H).max()
     assert np.linalg.eigvalsh(H.toarray()).min() > -1e-9 * abs(H).max()
 
@@ -200,7 +203,7 @@ def test_gradient_matches_finite_differences(name):
 def test_pull_is_its_own_sum_of_squares():
     rng = np.random.default_rng(8)
     x, at, targets, w = rng.normal(size=(10, 3)), rng.integers(0, 10, 30), rng.normal(size=(30, 3)), rng.random(30)
-    wanted = graph.pull(10, at, targets, w)
+    wanted = pull(10, at, targets, w)
     np.testing.assert_allclose(wanted.energy(x), np.sum(w * ((x[at] - targets) ** 2).sum(axis=1)))
 
 

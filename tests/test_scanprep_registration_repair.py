@@ -7,11 +7,11 @@ import pytest
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 from scanprep.registration import person as person_module
-from scanprep.registration.deformation_graph import build_graph
-from scanprep.registration.graph_fit import deform, start_fit, start_motion
+from scanprep.registration.deformation_graph import build_graph, deform
+from scanprep.registration.graph_fit import start_fit
 from scanprep.registration.limbs import beyond_people, exchanged_sides, frames, joint_angles, limb_doubts
 from scanprep.registration.matches import prepare
-from scanprep.registration.nonrigid import Registration, measured
+from scanprep.registration.nonrigid import Registration, measure_fit
 from scanprep.registration.person import PersonParts, average_person, person_parts
 from scanprep.registration.repair import better, motion_of, repaired, rolled
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
@@ -21,8 +21,8 @@ from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import PARENTS, PARTS, named_pose
 
 FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("forearm_left", "shin_right", "head"))
-QUICK = RegistrationConfig((GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=3),
-                            GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=4)), ends=0, final_fit=None)
+QUICK = RegistrationConfig((GraphStage(300, 0.09, 0.7, 0.01, 0.08, 0.0, rounds=3),
+                            GraphStage(300, 0.02, 0.7, 0.01, 0.05, 0.0, rounds=4)), final_fit=None)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def parts(person):
 def registration(person, scan, x):
     """What a registration with vertices (N, 3) says of itself."""
     fit = replace(start_fit(person.mesh, np.eye(4), 300), x=x, moved=0.0)
-    return measured(prepare(person.mesh, scan), fit, scan)
+    return measure_fit(prepare(person.mesh, scan), fit, scan)
 
 
 def with_rolled_skin(person, body, part, angle):
@@ -99,7 +99,7 @@ def test_a_motion_is_found_from_where_it_took_the_template(person):
     graph = build_graph(person.mesh, 120)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotations.exp(np.array([0.4, -2.0, 1.0])), [3, -1, 2]
-    wanted = replace(start_motion(graph, T), log_scale=np.full(120, 0.2))
+    wanted = start_fit(person.mesh, T, 120).motion
     x = np.exp(0.2) * person.mesh.vertices @ T[:3, :3].T + T[:3, 3]
     found = motion_of(graph, x)
     np.testing.assert_allclose(found.R, wanted.R, atol=1e-9)

@@ -7,27 +7,25 @@ import numpy as np
 import pytest
 from jointed_bodies import bent, crab
 
-from scanprep.alignment.icp import landmark_motion
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import target_of
 from scanprep.registration.folds import vertex_rotations
-from scanprep.registration.limb_ends import RigidFit, find_ends, rotated_ends
+from scanprep.registration.limb_ends import RigidFit, find_ends, rotate_ends
 from scanprep.registration.matches import (
     Likeness,
-    describe_both,
-    described_alike,
-    descriptors,
     hint_pull,
+    initial_transform,
     match_both_ways,
     path_anchors,
-    path_lengths,
+    prepare,
     pull,
     tukey,
 )
 from scanprep.registration.nonrigid import evidence, register
+from scanprep.registration.paths import descriptors, path_lengths
 from scanprep.registration.schedule import RegistrationConfig
 
 BEND = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
@@ -104,10 +102,7 @@ def test_paths_cross_gaps_but_leave_crumbs_out():
 def test_a_body_upside_down_and_bent_is_placed_by_its_descriptors():
     mesh = body()
     x = moved(bent(mesh, *BEND))
-    target = target_of(Mesh(x, mesh.faces))
-    mine, theirs = describe_both(mesh, target, (spread(mesh), x[spread(mesh)]), 0.01, size_of(mesh))
-    vertices, points = described_alike(mesh, mine, replace(target, descriptors=theirs), np.arange(0, len(x), 3))
-    T = landmark_motion(mesh.vertices[vertices], points)
+    T = initial_transform(prepare(mesh, Mesh(x, mesh.faces), (spread(mesh), x[spread(mesh)])))
     R, _ = rotations.procrustes(mesh.vertices, x)
     assert np.linalg.norm(rotations.log(T[:3, :3] @ R.T)) < 0.2
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
@@ -201,7 +196,7 @@ def test_an_end_that_is_rotated_about_itself_is_found():
     truth = np.einsum("nij,nj->ni", rotations.exp(1.0 * share[:, None] * end.axis), mesh.vertices)
     target = target_of(Mesh(truth, mesh.faces))
     size = size_of(mesh)
-    rotated = rotated_ends(mesh, end, mesh.vertices, RigidFit(target, size), moved=0.0)[0]
+    rotated = rotate_ends(mesh, end, mesh.vertices, RigidFit(target, size), moved=0.0)[0]
     before = np.linalg.norm(mesh.vertices - truth, axis=1)[end.vertices].mean()
     assert np.linalg.norm(rotated - truth[end.vertices], axis=1).mean() < 0.35 * before
 
@@ -210,7 +205,7 @@ def test_an_end_that_fits_is_left_alone():
     mesh = body()
     end = find_ends(mesh, 2, 0.25)[0]
     size = size_of(mesh)
-    assert not rotated_ends(mesh, end, mesh.vertices, RigidFit(target_of(mesh), size))
+    assert not rotate_ends(mesh, end, mesh.vertices, RigidFit(target_of(mesh), size))
 
 
 # ---- confidence ---------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import SeenSpace, Surface
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
-from scanprep.repair.volumetric_diffusion import diffused_surface, signed_distance
+from scanprep.repair.volumetric_diffusion import diffuse_surface, signed_distance
 
 
 def pierced(mesh, centre, radius):
@@ -33,7 +33,7 @@ def test_signed_distances_of_a_ball_and_where_they_end():
 
 def test_the_zero_level_continues_a_ball():
     holed = pierced(ball(5), [0, 0, 0.1], 0.04)
-    zero = diffused_surface(holed, holed.boundary_vertices)
+    zero = diffuse_surface(holed, holed.boundary_vertices)
     cap = zero.vertices[(zero.vertices[:, 2] > 0.09)]
     assert len(cap) > 30
     assert np.abs(np.linalg.norm(cap, axis=1) - 0.1).max() < 0.002
@@ -74,7 +74,7 @@ def test_what_was_seen_to_be_empty_is_outside():
     holed = pierced(ball(4), [0, 0, 0.1], 0.05)
     inside = np.array([[0, 0, 0.08], [0.01, 0, 0.085], [0, -0.01, 0.09]])
     for seen, sign in ((None, -1), (Pit(), 1)):
-        found = diffused_surface(holed, holed.boundary_vertices, seen)
+        found = diffuse_surface(holed, holed.boundary_vertices, seen)
         assert (np.sign(signed_distance(found, inside)[0]) == sign).all()
 
 
@@ -95,7 +95,7 @@ def test_seen_space_stays_empty():
 
 def test_finer_voxels_find_the_same_surface():
     holed = pierced(ball(5), [0, 0, 0.1], 0.05)
-    coarse, fine = (diffused_surface(holed, holed.boundary_vertices, voxels=n) for n in (10, 14))
+    coarse, fine = (diffuse_surface(holed, holed.boundary_vertices, voxels=n) for n in (10, 14))
     inner = fine.vertices[np.linalg.norm(fine.vertices - [0, 0, 0.1], axis=1) < 0.05]
     assert Surface(coarse).closest(inner).distances.max() < 0.004
     assert len(fine.faces) > 1.5 * len(coarse.faces)

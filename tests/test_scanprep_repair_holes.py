@@ -9,7 +9,7 @@ from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report, filling_judgement
 from scanprep.repair.intersections import intersecting_faces
-from scanprep.repair.loops import group_loops, joined_polygon, triangulate_loop
+from scanprep.repair.loops import group_loops, join_polygons, triangulate_loop
 from scanprep.repair.manifold import repair
 
 
@@ -258,7 +258,7 @@ def test_a_limb_that_was_cut_through_is_joined():
 def test_joined_polygons_go_around_every_border_once():
     cut = torus().submesh(np.abs(torus().corners.mean(axis=1)[:, 0]) > 0.03)[0]
     loops = cut.boundary_loops
-    polygon = joined_polygon(cut.vertices, loops[:2])
+    polygon = join_polygons(cut.vertices, loops[:2])
     assert len(polygon) == len(loops[0]) + len(loops[1]) + 2
     assert set(polygon.tolist()) == set(np.concatenate(loops[:2]).tolist())
     steps = {(a, b) for a, b in zip(polygon.tolist(), np.roll(polygon, -1).tolist(), strict=True)}

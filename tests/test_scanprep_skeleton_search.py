@@ -13,7 +13,7 @@ from scanprep.skeleton.motions import PosedSurface, closure, fit_motions, rigid_
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.sides import Sides, cover, mirror_pairs
-from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirrored_poses
+from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirror_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import Person, mirrored_pose
 
@@ -75,7 +75,7 @@ def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
     bent[[4, 5, 10]] = [[0, -1.0, 0.4], [0, 0.8, 0.8], [-1.2, 0, 0]]
     poses = np.stack([body.mesh.vertices, body.posed(bent)])
     template = body.mesh.with_vertices(poses[1]) if crooked else body.mesh
-    found = mirrored_poses(template, poses, find_symmetry(template, poses))
+    found = mirror_poses(template, poses, find_symmetry(template, poses))
     wanted = np.stack([body.mesh.vertices, body.posed(mirrored_pose(bent))])
     for one, other in zip(found, wanted, strict=True):
         R, t = rotations.procrustes(one, other)

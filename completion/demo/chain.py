@@ -4,10 +4,10 @@
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,7 @@ from scanprep.synthetic.data_set import (
     write_scan,
 )
 from scanprep.synthetic.people import MARKERS, Person, random_pose, walk
-from scanprep.synthetic.scanner import RangeView, ScannerConfig, scan
+from scanprep.synthetic.scanner import ScannerConfig, scan
 from scanprep.threads import one_thread
 
 from ..mocap.files.markers import MarkerSequence, read_markers, write_markers
@@ -47,9 +47,8 @@ from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion, save_completion
-from .truth import TruthMap, surface_error
+from .truth import TruthMap, distance, surface_error
 
-TEMPLATE_VIEWS = 12                      # sides from which the careful scan is taken that the template is made of
 LANDMARKS = 7                            # that are marked on the half view
 MARKER_NOISE = 0.001                     # metres
 
@@ -92,24 +91,7 @@ FULL = DemoConfig(poses=20, subjects=12, faces=14000, resolution=0.0068, templat
 QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, rate=30.0)
 
 
-def write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], folder: Path) -> None:
-    """What the folder holds, and who is in the scans."""
-    storage.write_json(folder / "demo.json", storage.as_json(config))
-    (folder / "scans").mkdir()
-    tables.write_table(folder / "scans" / TABLE, ("name", "subject", "pose", "sex"), rows)
-
-
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
-Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-
-
-def write_views(folder: Path, views: Sequence[RangeView]) -> None:
-    """Range views as `scape prep template` reads them: a mesh each, and where the cameras stood."""
-    names = [f"view_{k:02d}" for k in range(len(views))]
-    for name, view in zip(names, views, strict=True):
-        write_mesh(folder / f"{name}.ply", view.mesh)
-    storage.write_json(folder / "cameras.json", {name: view.camera.tolist()
-                                                 for name, view in zip(names, views, strict=True)})
 
 
 @dataclass(frozen=True)
@@ -130,14 +112,15 @@ class Demo:
 
     space: Workspace
     config: DemoConfig
-    bar: Bar  # `bar(title)` is a context manager that yields a progress callback
+    # `bar(title)` is a context manager that yields a progress callback
+    bar: Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
     @property
     def folder(self) -> Path:
         """Where all is."""
         return self.space.folder
 
-    @cached_property
+    @property
     def scanner(self) -> ScannerConfig:
         """The virtual scanner."""
         return ScannerConfig(resolution=self.config.resolution)
@@ -155,15 +138,21 @@ class Demo:
             self.space.drop(name)
         scans = [replace(done.values[task.name], folder=self.folder / "scans") for task in tasks]
         rows = [(s.name, s.subject, s.pose, s.sex) for s in scans]
-        self.space.step("settings", (self.config, rows), partial(write_settings, self.config, rows))
+
+        def write(folder: Path) -> None:
+            """What the folder holds, and who is in the scans."""
+            storage.write_json(folder / "demo.json", storage.as_json(self.config))
+            (folder / "scans").mkdir()
+            tables.write_table(folder / "scans" / TABLE, ("name", "subject", "pose", "sex"), rows)
+
+        self.space.step("settings", (self.config, rows), write)
         return scans
 
     @cached_property
     def template(self) -> Mesh:
         """A careful scan of the subject at rest from more sides, merged, its holes filled, decimated."""
         # from above and below too, and into places that a fixed scanner does not reach: hands have fingers
-        scanner = ScannerConfig(views=TEMPLATE_VIEWS, resolution=self.config.template_resolution,
-                                height=1.2, blind_reach=0.01)
+        scanner = ScannerConfig(views=12, resolution=self.config.template_resolution, height=1.2, blind_reach=0.01)
         settings = TemplateConfig()
         settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
 
@@ -175,7 +164,12 @@ class Demo:
                 place = folder / "template_scan"
                 write_scan(place, "rest", careful, self.rest, marks)
                 views = read_views(place / "views" / "rest.npz")
-                write_views(place / "range_views", views)
+                # as `scape prep template` reads them: a mesh each, and where the cameras stood
+                named = {f"view_{k:02d}": view for k, view in enumerate(views)}
+                for name, view in named.items():
+                    write_mesh(place / "range_views" / f"{name}.ply", view.mesh)
+                storage.write_json(place / "range_views" / "cameras.json",
+                                   {name: view.camera.tolist() for name, view in named.items()})
                 mesh = make_template(views, self.config.faces, settings, progress)
             landmarks = read_landmark_vertices(place / "rest.landmarks.json", mesh)
             write_landmarks(folder / "template.landmarks.json", landmarks)
@@ -233,15 +227,11 @@ class Demo:
         return self.model.subject(None)
 
     @cached_property
-    def truths(self) -> dict[str, GroundTruth]:
-        """What stood in the scanner, by the name of the scan."""
-        return {s.name: GroundTruth.load(s.truth) for s in self.scans}
-
-    @cached_property
-    def off_surface(self) -> dict[str, np.ndarray]:
-        """Distance (N,) of every registered vertex to the true surface, metres, by the name of the scan."""
-        registered = self.prepared.registered
-        return {name: surface_error(self.template.with_vertices(vertices), self.truths[name])
+    def off(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Distances (N,), metres, of every registered vertex to the true surface and to its true place, by the scan."""
+        registered, truths = self.prepared.registered, {s.name: GroundTruth.load(s.truth) for s in self.scans}
+        return {name: (surface_error(self.template.with_vertices(vertices), truths[name]),
+                       distance(vertices, self.truth_map.vertices(truths[name])))
                 for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
 
     @cached_property

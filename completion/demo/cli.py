@@ -12,8 +12,6 @@ from scanprep.ranges import Seed
 from ..cli import Out
 from .chain import FULL, QUICK, Demo, DemoConfig
 
-NEXT = "open {} in a browser; then your own scans: scape prep run scans --template template.ply -o set"
-
 
 def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False, seed: Seed = DemoConfig.seed,
          *, space: Workspace) -> Outcome:
@@ -40,4 +38,6 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
     judgement = judge(run, metrics)
     with bar("drawing the report") as progress, space.staging("page") as staged:
         write_page(run, metrics, judgement, progress, staged.folder)
-    return Outcome(out, metrics, {"demo": run.config}, judgement=judgement, following=NEXT.format(out / "report.html"))
+    return Outcome(out, metrics, {"demo": run.config}, judgement=judgement,
+                   following=f"open {out / 'report.html'} in a browser; then your own scans: "
+                             "scape prep run scans --template template.ply -o set")

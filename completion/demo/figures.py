@@ -7,16 +7,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from model.learning.scape import judge_model
+from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.dataset import RegisteredSet
 from scanprep.judgement import Judgement, judge_many
 from scanprep.pipeline.page import judge_set, judge_whole
 
-from ..mocap.pose.robust import motion_doubts
+from ..mocap.pose.judgement import motion_doubts
 from .chain import Demo
-from .truth import adjusted_rand, joint_errors, mean_over_area, surface_error
+from .truth import adjusted_rand, distance, joint_errors, mean_over_area, surface_error
 
-MM = 1000.0
 NAMED = ("head", "hand_left", "hand_right", "foot_left", "foot_right")     # without which motions cannot be exported
 # Half as much again as seed 0 gives: mean errors of a vertex, millimetres
 LIMITS = {"model": 12.0, "completion, hidden": 25.0, "completion, seen": 3.0, "animation": 15.0, "registration": 1.5}
@@ -24,7 +24,41 @@ LIMITS = {"model": 12.0, "completion, hidden": 25.0, "completion, seen": 3.0, "a
 
 def figures(demo: Demo) -> list[Metric]:
     """Run what has not been run, and measure it against the ground truth: errors on what was not learned come first."""
-    return [*_poses(demo), *_completion(demo), *_animation(demo), *_registration(demo), *_skeleton(demo)]
+    template, at = demo.template, demo.truth_map
+    # poses that the model never saw
+    wanted = [at.vertices(truth) for truth in demo.held_out]
+    error = [mean_over_area(distance(demo.fitted(w), w), template) for w in wanted]
+    rows = [Metric(f"model: {len(wanted)} poses it never saw, mean error", MM * float(np.mean(error)), "mm")]
+    # the half view
+    done, (half, _, truth) = demo.completion, demo.half_scan
+    surface, true = surface_error(done.completed, truth), at.vertices(truth)
+    apart = distance(done.completed.vertices, true)
+    seen = cKDTree(half.vertices).query(true)[0] < 2 * demo.config.resolution
+    rows += [Metric("completion, hidden: mean error", MM * mean_over_area(apart, template, ~seen), "mm"),
+             Metric("completion, seen: mean distance to the true surface",
+                    MM * mean_over_area(surface, template, seen), "mm"),
+             Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%", detail=True)]
+    # the walk
+    motion, (_, _, bodies), faces = demo.motion, demo.walk, demo.person.mesh.faces
+    walked = [distance(body, at.places.transferred(true_body, faces))
+              for body, true_body in zip(motion.vertices(demo.subject), bodies, strict=True)]
+    rows += [Metric("animation: mean error", MM * mean_over_area(np.mean(walked, axis=0), template), "mm"),
+             Metric("animation: markers to their place on the body, mean", MM * float(np.nanmean(motion.residuals)),
+                    "mm")]
+    # scans, and the skeleton found from them
+    means = {name: mean_over_area(off, template) for name, (off, _) in demo.off.items()}
+    slid = [mean_over_area(off, template) for _, off in demo.off.values()]
+    worst = max(means, key=means.__getitem__)
+    skeleton = demo.model.skeleton
+    agreement = adjusted_rand(skeleton.part_of_face, at.part_of_face, template.face_areas)
+    return [*rows, Metric(f"registration: {len(means)} scans, mean distance to the true surface",
+                          MM * float(np.mean(list(means.values()))), "mm"),
+            Metric(f"registration: the same, worst scan ({worst})", MM * means[worst], "mm"),
+            Metric("points registered beside their true place, mean", MM * float(np.mean(slid)), "mm"),
+            Metric("skeleton: parts found (the people have 16)", len(skeleton.parents)),
+            Metric("skeleton: agreement with the true parts (1 is the same, 0 is chance)", agreement, detail=True),
+            Metric("skeleton: joints to the nearest true one, mean",
+                   MM * float(joint_errors(skeleton, demo.rest).mean()), "mm")]
 
 
 def judge(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
@@ -40,57 +74,3 @@ def judge(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
               if name.startswith(f"{stage}: ") and value > limit]
     return of_results.joined(Judgement.of(check=[
         *([f"no part is called {', '.join(lacking)}"] if lacking else []), *doubts]))
-
-
-def _poses(demo: Demo) -> list[Metric]:
-    wanted = [demo.truth_map.vertices(truth) for truth in demo.held_out]
-    error = [mean_over_area(distance(demo.fitted(w), w), demo.template) for w in wanted]
-    return [Metric(f"model: {len(wanted)} poses it never saw, mean error", MM * float(np.mean(error)), "mm")]
-
-
-def _completion(demo: Demo) -> list[Metric]:
-    done, (half, _, truth) = demo.completion, demo.half_scan
-    surface, wanted = surface_error(done.completed, truth), demo.truth_map.vertices(truth)
-    apart = distance(done.completed.vertices, wanted)
-    seen = cKDTree(half.vertices).query(wanted)[0] < 2 * demo.config.resolution
-    return [Metric("completion, hidden: mean error", MM * mean_over_area(apart, demo.template, ~seen), "mm"),
-            Metric("completion, seen: mean distance to the true surface",
-                   MM * mean_over_area(surface, demo.template, seen), "mm"),
-            Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%",
-                   detail=True)]
-
-
-def _animation(demo: Demo) -> list[Metric]:
-    motion, (_, _, bodies) = demo.motion, demo.walk
-    followed = motion.vertices(demo.subject)
-    faces = demo.person.mesh.faces
-    apart = [distance(f, demo.truth_map.places.transferred(b, faces)) for f, b in zip(followed, bodies, strict=True)]
-    return [Metric("animation: mean error", MM * mean_over_area(np.mean(apart, axis=0), demo.template), "mm"),
-            Metric("animation: markers to their place on the body, mean", MM * float(np.nanmean(motion.residuals)),
-                   "mm")]
-
-
-def _registration(demo: Demo) -> list[Metric]:
-    registered, template = demo.prepared.registered, demo.template
-    surface = {name: mean_over_area(off, template) for name, off in demo.off_surface.items()}
-    apart = [mean_over_area(distance(vertices, demo.truth_map.vertices(demo.truths[name])), template)
-             for name, vertices in zip(registered.names, registered.vertices(), strict=True)]
-    worst = max(surface, key=surface.__getitem__)
-    return [Metric(f"registration: {len(surface)} scans, mean distance to the true surface",
-                   MM * float(np.mean(list(surface.values()))), "mm"),
-            Metric(f"registration: the same, worst scan ({worst})", MM * surface[worst], "mm"),
-            Metric("points registered beside their true place, mean", MM * float(np.mean(apart)), "mm")]
-
-
-def _skeleton(demo: Demo) -> list[Metric]:
-    skeleton = demo.model.skeleton
-    agreement = adjusted_rand(skeleton.part_of_face, demo.truth_map.part_of_face, demo.template.face_areas)
-    return [Metric("skeleton: parts found (the people have 16)", len(skeleton.parents)),
-            Metric("skeleton: agreement with the true parts (1 is the same, 0 is chance)", agreement, detail=True),
-            Metric("skeleton: joints to the nearest true one, mean",
-                   MM * float(joint_errors(skeleton, demo.rest).mean()), "mm")]
-
-
-def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) distances of corresponding points (N, 3)."""
-    return np.linalg.norm(a - b, axis=1)

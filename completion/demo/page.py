@@ -24,8 +24,7 @@ from ..mocap.files.motion_files import write_glb
 from ..motion_pictures import chart_residuals, dotted_pane
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
 from .chain import Demo
-from .figures import distance
-from .truth import mean_over_area, surface_error
+from .truth import distance, mean_over_area, surface_error
 
 FAR = 0.01                 # metres at the end of the heat maps
 WORST = 6                  # scans in the table of registrations
@@ -45,12 +44,7 @@ def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Ca
     for i, stage in enumerate(stages):
         stage(demo, page)
         tell(i + 1, len(stages))
-    save_png(to / "overview.png", picture_panes(overview_panes(demo), 400))
-    page.write(to / "report.html")
-
-
-def overview_panes(demo: Demo) -> list[Pane]:
-    """The chain: scan, registration, parts, body shapes, completion, animation."""
+    # the chain: scan, registration, parts, body shapes, completion, animation
     template, model, done = demo.template, demo.model, demo.completion
     name = demo.scans[1].name                       # the first pose after rest
     registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
@@ -66,7 +60,9 @@ def overview_panes(demo: Demo) -> list[Pane]:
         (Solid(demo.half_scan[0], MEASURED), done.completed.vertices, -30, "half a view"),
         (Solid(done.completed, colors), done.completed.vertices, 30, "completed"),
         *((template.with_vertices(v), v, 40.0, "animated") for v in walking)]
-    return [_pane(demo, shape, fits, label, turn) for shape, fits, turn, label in shown]
+    save_png(to / "overview.png", picture_panes(
+        [_pane(demo, shape, fits, label, turn) for shape, fits, turn, label in shown], 400))
+    page.write(to / "report.html")
 
 
 def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str, turn: float = 25.0) -> Pane:
@@ -104,11 +100,11 @@ def _registration(demo: Demo, page: Page) -> None:
     registered = demo.prepared.registered
     meshes = {name: demo.template.with_vertices(vertices)
               for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
-    means = {name: 1000 * mean_over_area(off, demo.template) for name, off in demo.off_surface.items()}
+    means = {name: 1000 * mean_over_area(off, demo.template) for name, (off, _) in demo.off.items()}
     order = sorted(means, key=lambda name: -means[name])
     panes = []
     for name in order[:4]:
-        fits, off = meshes[name].vertices, Heat(demo.off_surface[name], 0, FAR, "distance to the truth")
+        fits, off = meshes[name].vertices, Heat(demo.off[name][0], 0, FAR, "distance to the truth")
         panes += [_pane(demo, read_mesh(demo.folder / "scans" / f"{name}.ply"), fits, name),
                   _pane(demo, Solid(meshes[name], off, shades={"plain": np.array(CLAY)}), fits,
                         f"{means[name]:.2f} mm from the truth")]

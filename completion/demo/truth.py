@@ -31,6 +31,11 @@ class TruthMap:
         return self.places.transferred(truth.vertices, truth.faces)
 
 
+def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) distances of corresponding points (N, 3)."""
+    return np.linalg.norm(a - b, axis=1)
+
+
 def surface_error(mesh: Mesh, truth: GroundTruth) -> np.ndarray:
     """Distance (N,) of the vertices of a mesh to the true surface, metres."""
     return Surface(truth.mesh).closest(mesh.vertices).distances

@@ -29,8 +29,6 @@ from ..viewing.kinds import reported_model
 
 COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"      # files that tell what a folder is
 
-LEAN, RAISED = 25.0, 75.0            # degrees of a shin, and of an arm, from hanging, on somebody who stands
-
 
 @dataclass(frozen=True, eq=False)
 class Body:
@@ -126,7 +124,29 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     beside, or known by the triangles: those of the synthetic people. Where tapes begin at others too, as they do when
     ten were clicked, the average person finds them.
     """
-    template, known = _known_landmarks(given, bodies, model)
+    from scanprep.synthetic.landmarks import landmarks
+    from scanprep.synthetic.topology import load
+
+    # the template, and the landmarks that somebody gave it
+    first = bodies[0] if bodies else None
+    if model is not None:
+        template = model.template
+    else:
+        assert first is not None
+        template = RegisteredSet.load(first.path).template if (first.path / "set.json").exists() else first.mesh
+    beside = None if first is None else landmarks_beside(first.path) if not first.path.is_dir() else next(
+        (path for path in [first.path / "landmarks.json"] if path.exists()), None)
+    known = dict[str, int]()
+    if given is not None:
+        known = read_landmark_vertices(given, template)
+    elif model is not None and model.info.get("landmarks"):
+        known = dict(model.info["landmarks"])
+    elif beside is not None:
+        known = read_landmark_vertices(beside, template)
+    elif np.array_equal(template.faces, load().mesh.faces):
+        known = landmarks()
+
+    # those that tapes begin at besides
     lacking = [name for name in MEASURED if name not in known_landmarks(known)]
     if not lacking:
         return template, known
@@ -145,42 +165,12 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     return template, known | more
 
 
-def _known_landmarks(given: Path | None, bodies: Sequence[Body], model: BodyModel | None
-                     ) -> tuple[Mesh, dict[str, int]]:
-    """The template, and the landmarks that somebody gave it."""
-    from scanprep.synthetic.landmarks import landmarks
-    from scanprep.synthetic.topology import load
-
-    first = bodies[0] if bodies else None
-    template = model.template if model is not None else _template(first)
-    if given is not None:
-        return template, read_landmark_vertices(given, template)
-    if model is not None and model.info.get("landmarks"):
-        return template, dict(model.info["landmarks"])
-    if first is not None and (beside := _beside(first.path)) is not None:
-        return template, read_landmark_vertices(beside, template)
-    if np.array_equal(template.faces, load().mesh.faces):
-        return template, landmarks()
-    return template, {}
-
-
 def check_standing(tapes: Tapes, body: Body) -> None:
     """Refuse a body as the template of others if its legs bend or its arms are not below the shoulders."""
     for name, (first, second) in tapes.limbs.items():
         way = second.at(tapes.template.vertices) - first.at(tapes.template.vertices)
         angle = float(np.degrees(np.arccos(-way @ tapes.axes[0] / np.linalg.norm(way))))
-        if angle > (LEAN if name.endswith("shin") else RAISED):
+        if angle > (25 if name.endswith("shin") else 75):           # degrees from hanging, on somebody who stands
             raise ValueError(f"{body.path}: it is the template of all bodies, as no model is named, and does not stand "
                              f"upright: the {name} is {angle:.0f} degrees from it; name one that stands first, or the "
                              "model with -m")
-
-
-def _template(first: Body | None) -> Mesh:
-    assert first is not None
-    return RegisteredSet.load(first.path).template if (first.path / "set.json").exists() else first.mesh
-
-
-def _beside(path: Path) -> Path | None:
-    if path.is_dir():
-        return path / "landmarks.json" if (path / "landmarks.json").exists() else None
-    return landmarks_beside(path)

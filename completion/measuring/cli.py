@@ -13,7 +13,7 @@ from model.measurement.catalogue import CATALOGUE
 from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, measure, stands
 from model.measurement.tapes import Tapes
-from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
+from model.measurement.wanted import body_with_measurements, checked_wanted
 from model.people import stature_and_volume
 from model.posing.transfer import own_body
 from scanprep.arguments import Place, UsageError
@@ -31,7 +31,6 @@ from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
 from .page import measures_page
 
 BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
-TOLD = 3                             # reasons of each kind that a judgement names
 
 
 def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone = None,
@@ -69,7 +68,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     tapes = find_tapes(*landmarks_of(landmarks, read, loaded))
     if loaded is None:
         check_standing(tapes, read[0])
-    found, stood = _measured(read, loaded, tapes)
+    found, stood = _measure(read, loaded, tapes)
     names = [body.name for body in read]
     write_measures(output, names, found)
     measures_page(names, stood, found, tapes).write(output.with_suffix(".html"))
@@ -77,29 +76,21 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
                    judgement=judged(names, found, [tapes.template.with_vertices(body) for body in stood]))
 
 
-def _measured(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
-              ) -> tuple[list[Measurements], list[np.ndarray]]:
+def _measure(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
+             ) -> tuple[list[Measurements], list[np.ndarray]]:
     """The measurements of bodies, and their vertices (N, 3) as they were measured."""
     found, stood = list[Measurements](), list[np.ndarray]()
     with bar("measuring") as progress:
         for number, body in enumerate(bodies):
-            vertices, axes = _standing(body, model, tapes)
+            vertices, axes = body.mesh.vertices, tapes.axes if body.betas else None
+            # a body in another pose is brought into the standard one, with all its detail
+            if not body.betas and model is not None and not stands(vertices, tapes):
+                rest = np.zeros((len(model.skeleton.parents), 3))
+                vertices, axes = own_body(model, vertices).subject.vertices(rest), tapes.axes
             stood.append(vertices)
             found.append(measure(vertices, tapes, axes, body.expected_error))
             progress(number + 1, len(bodies))
     return found, stood
-
-
-def _standing(body: Body, model: BodyModel | None, tapes: Tapes) -> tuple[np.ndarray, np.ndarray | None]:
-    """The vertices (N, 3) of a body in the standard pose, with all its detail, and the axes it then has.
-
-    It is as it was, its axes to be found, where it stands so already, or there is no model.
-    """
-    vertices = body.mesh.vertices
-    if body.betas or model is None or stands(vertices, tapes):
-        return vertices, tapes.axes if body.betas else None
-    rest = np.zeros((len(model.skeleton.parents), 3))
-    return own_body(model, vertices).subject.vertices(rest), tapes.axes
 
 
 def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurements]) -> None:
@@ -138,10 +129,10 @@ def judged(names: Sequence[str], found: Sequence[Measurements], bodies: Sequence
             doubts.append(f"{name}: no {missing[0].replace('_', ' ')}, {mine.missing[missing[0]]}"
                           + (f", and {number_of(len(missing) - 1, 'other')}" if len(missing) > 1 else ""))
     if absurd and len({line.partition(": ")[0] for line in absurd}) == len(names):
-        return Judgement.of(absurd[:TOLD])
-    told = [*absurd, *doubts]
-    more = [f"{len(told) - TOLD} more, see the table"] if len(told) > TOLD else []
-    return Judgement.of(check=[*told[:TOLD], *more])
+        return Judgement.of(absurd[:3])
+    reasons = [*absurd, *doubts]
+    more = [f"{len(reasons) - 3} more, see the table"] if len(reasons) > 3 else []
+    return Judgement.of(check=[*reasons[:3], *more])
 
 
 def _figures(names: Sequence[str], found: Sequence[Measurements]) -> list[Metric]:
@@ -172,15 +163,11 @@ def _wanted(to: Sequence[str], output: Path, model: BodyModel, name: str, landma
             for word, value in made.wanted.items()]
     rows += [Metric("from the mean person", made.deviations, "sd"),
              Metric("people as far from the mean in these measurements", 100 * made.rarer, "%")]
-    return Outcome(output, rows, {"model": name}, judgement=_of_wanted(made))
-
-
-def _of_wanted(made: WantedBody) -> Judgement:
     missed = [f"{name.replace('_', ' ')} is {MM * made.reached[name]:.0f} mm, not {MM * made.wanted[name]:.0f}: the "
               "measurements contradict each other, or nobody whom the model knows has them" for name in made.missed]
     rare = [f"fewer than one person in {1 / max(made.rarer, 1e-6):,.0f} is so far from the mean, by what the model "
             "knows"] if made.rarer < 1e-3 else []
-    return Judgement.of(check=[*missed, *rare])
+    return Outcome(output, rows, {"model": name}, judgement=Judgement.of(check=[*missed, *rare]))
 
 
 def read_measurements(words: Sequence[str]) -> dict[str, float]:

@@ -15,10 +15,7 @@ from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid
 
 SHOWN, BESIDE_EACH_OTHER = 6, 3      # bodies that turn on the page, columns of its table; and in one figure
-SKIN, TAPE, WAY, HEIGHT = (0.86, 0.83, 0.79), (0.80, 0.20, 0.16), (0.10, 0.38, 0.66), (0.25, 0.30, 0.38)
-NO_BREAK = "\u00a0"
-THICK = 0.003                        # metres
-TALL, LOW = 560, 420                 # pixels: height of a figure of one or two bodies, and of more
+HEIGHT = (0.25, 0.30, 0.38)          # colour of the lines of heights
 BESIDE = 0.045                       # metres between the lines of heights
 
 
@@ -33,7 +30,7 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
         told = "" if first else ("Red: girths, a tape that spans hollows. Blue: lengths along the skin and widths. "
                                  "Grey, beside the body: heights. Drag to turn; the list hides and shows them.")
         page.bodies([_pane(names[k], bodies[k], found[k], tapes, len(few) == 1) for k in few], told,
-                    TALL if len(few) < 3 else LOW)
+                    560 if len(few) < 3 else 420)
     if len(names) > SHOWN:
         page.text(f"The first {SHOWN} of {len(names)} bodies; all are in the table file.")
     page.table([(_words(both), *(_cell(found[k], both) for k in shown)) for both in _pairs()
@@ -60,8 +57,8 @@ def _pairs() -> list[tuple[str, ...]]:
 
 
 def _words(both: tuple[str, ...]) -> str:
-    """As a table has it."""
-    return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", NO_BREAK)
+    """As a table has it, in one line."""
+    return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", "\u00a0")
 
 
 def _cell(mine: Measurements, both: tuple[str, ...]) -> str:
@@ -74,20 +71,22 @@ def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, lab
     """A body with its tapes; the lines of heights stand beside it, with their names where there is room."""
     mesh = tapes.template.with_vertices(vertices)
     up, left, ahead = mine.axes
-    girths, ways, heights = ([mine.readings[n].curve for n in mine.readings if kind(n)] for kind in (
-        lambda n: isinstance(tapes.found[n], Girth),
-        lambda n: not isinstance(tapes.found[n], Girth | Height),
-        lambda n: isinstance(tapes.found[n], Height)))
-    side = float((vertices @ left).max()) + BESIDE
-    beside = [curve + (side + k * BESIDE - curve @ left)[:, None] * left for k, curve in enumerate(heights)]
-    shapes: list[Shape] = [Solid(mesh, SKIN, name="body")]
-    for curves, color, what in ((girths, TAPE, "girths"), (ways, WAY, "lengths and widths"),
-                                (beside, HEIGHT, "heights")):
-        if curves:
-            shapes.append(Bones(np.concatenate([c[:-1] for c in curves]), np.concatenate([c[1:] for c in curves]),
-                                color, THICK, name=what))
+    curves: dict[str, list[np.ndarray]] = {"girths": [], "lengths and widths": [], "heights": []}
+    words, side = list[str](), float((vertices @ left).max()) + BESIDE
+    for term, reading in mine.readings.items():
+        tape, curve = tapes.found[term], reading.curve
+        if isinstance(tape, Height):
+            curve = curve + (side + len(words) * BESIDE - curve @ left)[:, None] * left
+            words.append(term.replace("_", " "))
+        curves["girths" if isinstance(tape, Girth) else "heights" if isinstance(tape, Height)
+               else "lengths and widths"].append(curve)
+    beside = curves["heights"]
+    shapes: list[Shape] = [Solid(mesh, (0.86, 0.83, 0.79), name="body")]
+    for (what, some), color in zip(curves.items(), ((0.80, 0.20, 0.16), (0.10, 0.38, 0.66), HEIGHT), strict=True):
+        if some:
+            shapes.append(Bones(np.concatenate([c[:-1] for c in some]), np.concatenate([c[1:] for c in some]),
+                                color, 0.003, name=what))
     if beside and labelled:
-        words = [n.replace("_", " ") for n in mine.readings if isinstance(tapes.found[n], Height)]
         shapes.append(Dots(np.array([c[-1] for c in beside]), HEIGHT, 0.008, labels=words))
     points = np.concatenate([vertices, *beside])
     return Pane(shapes, Camera.from_side(points, ahead, up), name)

@@ -6,8 +6,8 @@ its zero, its signs and what stands in for landmarks that a skeleton does not ha
 """
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -17,10 +17,6 @@ from scanprep.skeleton.roles import above, numbered_roles
 
 from ..motion import Motion
 
-UPRIGHT = 0.6                        # cosine: who leans no further on average stands by the model's own axes
-SINGULAR = 1e-9                      # sine of the angle between the first and the third axis
-SIZE = 0.05                          # of how much a frame's angles count, against a jump
-SEQUENCES = {"zxy": (2, 0, 1), "yxy": (1, 0, 1)}
 _SIDED = {                           # column without its side: (proximal segment, distal one, sequence, its signs)
     ("hip_flexion", "hip_adduction", "hip_rotation"): ("pelvis", "thigh", "zxy", (1, 1, 1)),
     ("knee_angle", "knee_adduction", "knee_rotation"): ("thigh", "shank", "zxy", (-1, 1, 1)),
@@ -108,55 +104,38 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
     if "humanoid_root" not in roles or pair is None or not low or not high:
         raise ValueError(f"joint angles are of people: expected parts named pelvis, thigh_left, ..., head, found "
                          f"{', '.join(names)}"[:300])
-    body = _body_axes(joints[roles[pair[1]]] - joints[roles[pair[0]]], joints[high].mean(0) - joints[low].mean(0))
-    parts = {"pelvis": roles["humanoid_root"]}
-    trunk = _carrier(parents, roles)
-    if trunk is not None:
-        parts["trunk"] = trunk
-    if "skullbase" in roles:
-        parts["head"] = roles["skullbase"]
-    frames = dict.fromkeys(parts, body)
-    for side in "rl":
-        _limbs(side, roles, joints, body, parts, frames)
-    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
-
-
-def _body_axes(right: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(3, 3) columns ahead, up, right: up is the axis of the model nearest to a direction, right as level."""
-    up = _nearest_axis(high)
+    # ahead, up and right: up is the axis of the model nearest to where the head is, right as level
+    up = _nearest_axis(joints[high].mean(0) - joints[low].mean(0))
+    right = joints[roles[pair[1]]] - joints[roles[pair[0]]]
     right = right - (right @ up) * up
     if not np.linalg.norm(right) > 1e-6:
         raise ValueError("joint angles: expected hips or shoulders beside each other at rest")
     right = right / np.linalg.norm(right)
-    return np.stack([np.cross(up, right), up, right], axis=1)
+    body, parts = np.stack([np.cross(up, right), up, right], axis=1), {"pelvis": roles["humanoid_root"]}
 
-
-def _carrier(parents: np.ndarray, roles: Mapping[str, int]) -> int | None:
-    """The part that carries the arms; None where it is the pelvis."""
+    # the trunk is the part that carries the arms, unless that is the pelvis
     chains = [above(parents, roles.get(f"{side}_sternoclavicular", roles[f"{side}_shoulder"]))[1:]
               for side in "lr" if f"{side}_shoulder" in roles]
     both = [j for j in chains[0] if all(j in chain for chain in chains)] if chains else []
-    return both[0] if both and both[0] != roles["humanoid_root"] else None
+    if both and both[0] != roles["humanoid_root"]:
+        parts["trunk"] = both[0]
+    if "skullbase" in roles:
+        parts["head"] = roles["skullbase"]
+    frames = dict.fromkeys(parts, body)
 
-
-def _limbs(side: str, roles: Mapping[str, int], joints: np.ndarray, body: np.ndarray, parts: dict[str, int],
-           frames: dict[str, np.ndarray]) -> None:
-    """Adds the segments of the limbs of one side that have both their ends."""
-    for name, (start, end) in _LIMBS.items():
+    # the segments of the limbs that have both their ends; without a joint beyond, they are as they are held at rest
+    for side, (name, (start, end)) in product("rl", _LIMBS.items()):
         begin, stop = roles.get(f"{side}_{start}"), roles.get(f"{side}_{end}")
         if begin is None or (end is not None and stop is None):
             continue
-        if end is None:                                      # no joint beyond: as it is held at rest
-            before = frames.get(f"forearm_{side}")
-            frame = body if name == "foot" else before
-            if frame is None:
-                continue
-        else:
-            assert stop is not None, "both ends"
+        frame = body if name == "foot" else frames.get(f"forearm_{side}")
+        if stop is not None:
             frame = _long_axes(joints[begin] - joints[stop], body, by_front=start in ("shoulder", "elbow"))
             if name == "forearm":                            # thumbs point ahead at rest: half way to pronation
                 frame = frame @ _turn(1, np.pi / 2 if side == "r" else -np.pi / 2)
-        parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
+        if frame is not None:
+            parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
+    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
 
 
 def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray:
@@ -221,7 +200,8 @@ def ground_axes(axes: np.ndarray, R: np.ndarray) -> np.ndarray:
     somebody who turns round the first frame.
     """
     mean = R.mean(axis=0)
-    up = axes[:, 1] if (mean @ axes[:, 1]) @ axes[:, 1] > UPRIGHT else _nearest_axis(mean @ axes[:, 1])
+    # who leans no further on average stands by the model's own axes
+    up = axes[:, 1] if (mean @ axes[:, 1]) @ axes[:, 1] > 0.6 else _nearest_axis(mean @ axes[:, 1])
     ways = [way - (way @ up) * up for way in (mean @ axes[:, 0], R[0] @ axes[:, 0], R[0] @ axes[:, 1])]
     x = _nearest_axis(next((way for way in ways if np.linalg.norm(way) > 0.1), ways[-1]))
     return np.stack([x, up, np.cross(x, up)], axis=1)
@@ -245,9 +225,9 @@ def decompose(R: np.ndarray, sequence: str) -> np.ndarray:
     else:
         lost = np.hypot(R[:, 0, 1], R[:, 2, 1])
         a, b = np.arctan2(-R[:, 0, 1], -R[:, 2, 1]), -np.arctan2(lost, R[:, 1, 1])
-    known = np.maximum.accumulate(np.where(lost > SINGULAR, np.arange(len(R)), -1))
+    known = np.maximum.accumulate(np.where(lost > 1e-9, np.arange(len(R)), -1))
     a = np.where(known < 0, 0.0, a[known])
-    left = _turn(0, -b) @ _turn(SEQUENCES[sequence][0], -a) @ R
+    left = _turn(0, -b) @ _turn(2 if sequence == "zxy" else 1, -a) @ R
     angles = np.stack([a, b, np.arctan2(left[:, 0, 2], left[:, 0, 0])], axis=1)
     return np.unwrap(_smaller(angles) if sequence == "zxy" else angles, axis=0)
 
@@ -256,7 +236,8 @@ def _smaller(angles: np.ndarray) -> np.ndarray:
     """Of each frame's two solutions that of smaller angles (T, 3), radians; the least jumps are worth as much."""
     both = np.stack([angles, angles * [1, -1, 1] + np.pi])               # (2, T, 3)
     both -= 2 * np.pi * np.rint(both / (2 * np.pi))
-    size = SIZE * np.abs(both).sum(axis=2)
+    # a frame's angles count little against a jump
+    size = 0.05 * np.abs(both).sum(axis=2)
     jump = np.abs(np.exp(1j * both[:, None, 1:]) - np.exp(1j * both[None, :, :-1])).sum(axis=3)      # (2, 2, T - 1)
     cost, came = size[:, 0].tolist(), np.zeros((len(angles), 2), dtype=int)
     for t, (((a, b), (c, d)), (first, second)) in enumerate(zip(jump.transpose(2, 0, 1).tolist(), size.T[1:].tolist(),

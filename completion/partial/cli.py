@@ -9,8 +9,8 @@ from scanprep.arguments import Place, UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, judgement_of, say
-from scanprep.folders import kept_results
+from scanprep.console import Metric, Outcome, say
+from scanprep.folders import do_one, kept_results
 from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.judgement import judge_many
 from scanprep.pipeline.scans import find_scans
@@ -30,8 +30,8 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
                   subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
                   unit: Unit | Literal["unknown"] | None = None,
                   up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None, interactive: bool = False,
-                  config: CompletionConfig = CompletionConfig(),  # noqa: B008
-                  workers: Workers = Workers(), space: Workspace) -> Outcome:                    # noqa: B008
+                  config: CompletionConfig = CompletionConfig(),
+                  workers: Workers = Workers(), space: Workspace) -> Outcome:
     """The whole body from a scan of some of it.
 
     Several scans are views of one body in one frame. A folder is completed scan by scan, each into a folder of its
@@ -70,8 +70,10 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     if up is not None:
         config = replace(config, up=AXES[up])
     if len(scans) == 1 and scans[0].is_dir():
-        call = FolderCall(scans[0], model, landmarks, subject, template_landmarks, _only(mask), unit, config)
-        return _mended(call, space) if interactive else _folder(call, space, workers)
+        if len(mask) > 1:
+            raise UsageError(f"--mask: expected one folder of masks for a folder of scans, got {len(mask)}")
+        call = FolderCall(scans[0], model, landmarks, subject, template_landmarks, next(iter(mask), None), unit, config)
+        return _mend(call, space) if interactive else call.carry_out(space, workers)
     if interactive:
         return _in_browser(scans, output, model, subject, template_landmarks, unit, config)
     loaded, name = read_model(model)
@@ -80,21 +82,12 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     work = Work(body_of(loaded, subject, unit), name, marks, config, unit, ColorConfig(fill=config.fill_colors))
     if inputs.landmarks is None:
         say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
-    with bar("completing") as progress:
-        done = space.run(work, [Task("completion", inputs)], inside=progress).only
-    return Outcome(output, done, {"complete": config, "model": name}, judgement=judgement_of(done),
-                       following=f"open {output / 'report.html'}, then scape measure {output} "
-                                 f"-m {model or 'MODEL.npz'} -o measures.csv")
+    return do_one("completing", space, work, Task("completion", inputs), {"complete": config, "model": name},
+                  f"open {output / 'report.html'}, then scape measure {output} -m {model or 'MODEL.npz'} "
+                  "-o measures.csv")
 
 
-def _folder(call: FolderCall, space: Workspace, workers: Workers) -> Outcome:
-    """Complete the scans of a folder."""
-    tasks = list(call.tasks().values())
-    _, work = call.work(any(task.given.landmarks for task in tasks))
-    return call.told(space.folder, work.model).carry_out("completing scans", space, work, tasks, workers)
-
-
-def _mended(call: FolderCall, space: Workspace) -> Outcome:
+def _mend(call: FolderCall, space: Workspace) -> Outcome:
     """Look at what a folder was completed to, and mend it, in the browser."""
     from scanprep.viewer.server import serve
 
@@ -106,7 +99,7 @@ def _mended(call: FolderCall, space: Workspace) -> Outcome:
     saved = Metric("bodies saved", len(app.fresh))
     if not results.values and not results.failures:
         return Outcome(None, [saved], judgement=None)
-    outcome = call.told(space.folder, app.plain.model).outcome(space, results, len(app.tasks))
+    outcome = call.description(space.folder, app.plain.model).outcome(space, results, len(app.tasks))
     return replace(outcome, metrics=[saved, *outcome.metrics])
 
 
@@ -125,15 +118,7 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
     files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]
     app = CompleteApp(loaded, Work(body_of(loaded, subject, unit), name, marks, config, unit), files, output, labels)
     serve(app)
-    if not app.saved:
-        return Outcome(None, [Metric("bodies saved", 0)], {"complete": config, "model": name}, judgement=None)
-    return Outcome(output, [Metric("bodies saved", len(app.saved)),
-                            *(Metric(scan.name, app.made[scan].completion.judgement.verdict) for scan in app.saved)],
-                   {"complete": config, "model": name}, judgement=judge_many(
-                       {scan.name: app.made[scan].completion.judgement for scan in app.saved}))
-
-
-def _only(masks: tuple[Path, ...]) -> Path | None:
-    if len(masks) > 1:
-        raise UsageError(f"--mask: expected one folder of masks for a folder of scans, got {len(masks)}")
-    return masks[0] if masks else None
+    judged = {scan.name: app.made[scan].completion.judgement for scan in app.saved}
+    rows = [Metric("bodies saved", len(judged)), *(Metric(name, one.verdict) for name, one in judged.items())]
+    return Outcome(output if judged else None, rows, {"complete": config, "model": name},
+                   judgement=judge_many(judged) if judged else None)

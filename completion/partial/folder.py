@@ -10,9 +10,10 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.arguments import UsageError
 from scanprep.batch.calls import KeptCall
-from scanprep.batch.workspace import Results, Task
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Unit
-from scanprep.console import Metric
+from scanprep.console import Metric, Outcome
 from scanprep.folders import FolderCommand, figure
 from scanprep.geometry.files import name_of
 from scanprep.pipeline.scans import find_scans
@@ -39,9 +40,14 @@ class FolderCall(KeptCall):
     config: CompletionConfig = field(default_factory=CompletionConfig)
 
     def tasks(self) -> dict[str, Task]:
-        """The scans as they are now, by name."""
-        found = folder_inputs(self.scans, self.landmarks, self.masks)
-        return {name: Task(name, inputs, name) for name, inputs in found.items()}
+        """The scans as they are now, by name, with their landmarks, in their folder or its own, and masks."""
+        if self.masks is not None and not self.masks.is_dir():
+            raise UsageError("--mask: expected a folder of masks for a folder of scans, there is none at "
+                             f"{self.masks}")
+        masks = {name_of(path): path for path in sorted(self.masks.iterdir(), reverse=True)} if self.masks else {}
+        return {scan.name: Task(scan.name, Inputs((scan.scan,), scan.landmarks, tuple(
+            masks[name] for name in [scan.name] if name in masks)), scan.name)
+                for scan in find_scans(self.scans, self.landmarks)}
 
     def work(self, wanted: bool) -> tuple[BodyModel, Work]:
         """The model, and the work on each scan; `wanted`: landmarks of the template must be known."""
@@ -50,25 +56,19 @@ class FolderCall(KeptCall):
         return loaded, Work(body_of(loaded, self.subject, self.unit), name, marks, self.config, self.unit,
                             ColorConfig(fill=self.config.fill_colors), f"scape complete {self.scans}")
 
+    def carry_out(self, space: Workspace, workers: Workers) -> Outcome:
+        """Complete the scans of the folder."""
+        tasks = list(self.tasks().values())
+        _, work = self.work(any(task.given.landmarks for task in tasks))
+        return self.description(space.folder, work.model).carry_out("completing scans", space, work, tasks, workers)
 
-    def told(self, output: Path, model: str) -> FolderCommand:
-        """What is told of the scans in an output; `model` is its name."""
+    def description(self, output: Path, model: str) -> FolderCommand:
+        """What is said of the scans in an output; `model` is its name."""
         return FolderCommand(
             ("scan",), "{} completed", summary, lambda rows: -figure(rows, EXPLAINED),
             {"complete": self.config, "model": model},
             hint="To mend some, run the same command with --interactive: it opens these results in the browser, worst "
             f"first (scape complete {self.scans} ... -o {output} --interactive).", call=self)
-
-
-def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> dict[str, Inputs]:
-    """The scans of a folder by name, with their landmarks, in their folder or its own, and masks of their names."""
-    if masks is not None and not masks.is_dir():
-        raise UsageError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
-    found = {}
-    for task in find_scans(folder, landmarks):
-        mine = sorted(p for p in masks.iterdir() if name_of(p) == task.name) if masks else []
-        found[task.name] = Inputs((task.scan,), task.landmarks, tuple(mine[:1]))
-    return found
 
 
 def summary(results: Results, count: int) -> list[Metric]:

@@ -48,7 +48,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
     def __init__(self, call: FolderCall, output: Path) -> None:
         model, self.plain = call.work(True)
         self.call, self.tasks, self.fresh = call, call.tasks(), set[str]()
-        self.told = call.told(output, self.plain.model)
+        self.told = call.description(output, self.plain.model)
         self._space = Workspace(output, output / HOME)                      # only looked at here
         self.results = kept_results(self._space, list(self.tasks))
         self._name_of = {task.given.scans[0]: name for name, task in self.tasks.items()}

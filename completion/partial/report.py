@@ -22,14 +22,8 @@ from scanprep.pictures.sheets import webp_bytes
 from .completion import Completion
 
 MEASURED, COMPLETED = (0.55, 0.67, 0.80), (0.93, 0.75, 0.42)
-PREDICTED, OVER = (0.62, 0.74, 0.62), (0.45, 0.42, 0.50)
-CLOTHING, MARK = (0.62, 0.48, 0.66), (0.80, 0.12, 0.10)
 HEIGHT = 520
-WIDEST = 2.0                         # times as wide as high a picture of one side may be
 ERROR, OFF = "expected error", "distance of the scan to the {} body"
-OF_PREDICTED = (ERROR, OFF.format("predicted"))
-FEW = 9000                           # points of a bare cloud that a picture shows
-ONE_SIDED = 0.05                     # of the surface: its mean normal from which on a scan is one from a side
 
 
 def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh,
@@ -39,13 +33,17 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
     `masked` (n,) bool.
     """
     views = [sides(completion, template)[turn] for turn in (0, 2)]
-    body, colors = completion.completed, _two_colors(completion)
+    body = completion.completed
+    colors = np.where(completion.seen[:, None], MEASURED, COMPLETED)
     given = scan_shapes(scan, masked, completion.scale)
     shown: list[tuple[Sequence[Shape], Camera, str]] = [
         (given, views[0], "scan, from the camera"), (given, views[1], "scan, from behind"),
         ([Solid(body, colors)], views[0], "completed"), ([Solid(body, colors)], views[1], "completed, from behind"),
         ([Solid(completion.predicted)], views[1], "predicted, from behind")]
-    width, height = _size(views)
+    # one size in which all views fit, at most twice as wide as high: a picture of something long is less high
+    aspect = max(view.width / view.height for view in views)
+    height = max(1, min(HEIGHT, round(2 * HEIGHT / aspect)))
+    width = int(height * aspect) + 10
     return side_by_side([render(shape, view, width, height) for shape, view, _ in shown],
                         [label for _, _, label in shown])
 
@@ -56,8 +54,8 @@ def sides(completion: Completion, template: Mesh) -> list[Camera]:
     vertical, ahead = stance(template, rotations.exp(completion.pose[0]))
     towards = (body.vertex_areas * completion.seen) @ body.vertex_normals
     towards -= (towards @ vertical) * vertical
-    one_sided = np.linalg.norm(towards) > ONE_SIDED * body.vertex_areas.sum()
-    side = towards / np.linalg.norm(towards) if one_sided else ahead
+    # a scan from all sides has no mean normal
+    side = towards / np.linalg.norm(towards) if np.linalg.norm(towards) > 0.05 * body.vertex_areas.sum() else ahead
     aside = np.cross(vertical, side)
     return [Camera.from_side(body, way, vertical) for way in (side, aside, -side, -aside)]
 
@@ -72,21 +70,14 @@ def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, m
             else view[:, :3]
         hidden = np.zeros(len(points), dtype=bool) if masked is None else masked[start:start + len(points)]
         shade = np.array(MEASURED) * (1.0, 0.82, 1.12, 0.7)[number % 4]
-        colors = np.where(hidden[:, None], CLOTHING, np.clip(shade, 0, 1))
+        colors = np.where(hidden[:, None], (0.62, 0.48, 0.66), np.clip(shade, 0, 1))        # clothing is violet
         start += len(points)
         if isinstance(view, Mesh) and len(view.faces):
             out.append(Solid(view, colors))
         else:
-            some = slice(None, None, max(1, len(points) // FEW))
+            some = slice(None, None, max(1, len(points) // 9000))
             out.append(Dots(points[some], colors[some], radius=0.005))
     return out
-
-
-def scan_distances(points: np.ndarray, mesh: Mesh, body: Mesh, seen: np.ndarray) -> np.ndarray:
-    """How far the scan is from a mesh, metres, as seen at the vertices (N,) of the body; NaN without data."""
-    far = Surface(mesh).closest(points).distances
-    off, near = cKDTree(points).query(body.vertices, 3)
-    return np.where(seen & (off[:, 0] < 0.05), far[near].mean(axis=1), np.nan)
 
 
 def completion_panes(scan: View | Sequence[View], completion: Completion, template: Mesh,
@@ -100,32 +91,28 @@ def completion_panes(scan: View | Sequence[View], completion: Completion, templa
     marks: list[Shape] = []
     if landmarks is not None:
         labels = [(names or {}).get(int(v), "") for v in landmarks[0]]
-        marks = [Dots(completion.scale * np.asarray(landmarks[1]), MARK, 0.010, True, name="landmarks", labels=labels)]
-    over = [replace(shape, name="scan over it", visible=False, color=OVER) for shape in given]
-    body = completion.completed
-    shades = _shades(scan, completion, masked)
-    whole = Solid(Mesh(body.vertices, body.faces), _two_colors(completion), name="completed body", shades=shades)
-    predicted = Solid(completion.predicted, PREDICTED, name="predicted body", visible=False,
-                      shades={title: heat for title, heat in shades.items() if title in OF_PREDICTED})
-    return [Pane([*given, *marks], camera, "scan"), Pane([whole, *over, predicted, *marks], camera, "completed")]
-
-
-def _shades(scan: View | Sequence[View], completion: Completion, masked: np.ndarray | None
-            ) -> dict[str, np.ndarray | Heat]:
-    """What else the completed body is coloured by."""
+        marks = [Dots(completion.scale * np.asarray(landmarks[1]), (0.80, 0.12, 0.10), 0.010, True, name="landmarks",
+                      labels=labels)]
+    over = [replace(shape, name="scan over it", visible=False, color=(0.45, 0.42, 0.50)) for shape in given]
+    # what else the bodies are coloured by: how far the scan is, as seen at their vertices, NaN without data
     body, shades = completion.completed, dict[str, np.ndarray | Heat]()
     if body.colors is not None:
         shades["colours of the scan"] = body.colors
     points = completion.scale * all_points(scan)
     points = points if masked is None else points[~masked]
+    off, near = cKDTree(points).query(body.vertices, 3)
     for mesh, high, which in ((body, 0.005, "completed"), (completion.predicted, 0.015, "predicted")):
-        far = scan_distances(points, mesh, body, completion.seen)
+        far = Surface(mesh).closest(points).distances[near].mean(axis=1)
         title = OFF.format(which)
-        shades[title] = Heat(far, 0.0, high, title)
+        shades[title] = Heat(np.where(completion.seen & (off[:, 0] < 0.05), far, np.nan), 0.0, high, title)
     if completion.expected_error is not None:
         high = float(np.ceil(200 * np.nanquantile(completion.expected_error, 0.98)) / 200)
         shades[ERROR] = Heat(completion.expected_error, 0.0, max(high, 0.005), ERROR)
-    return shades
+    whole = Solid(Mesh(body.vertices, body.faces), np.where(completion.seen[:, None], MEASURED, COMPLETED),
+                  name="completed body", shades=shades)
+    predicted = Solid(completion.predicted, (0.62, 0.74, 0.62), name="predicted body", visible=False,
+                      shades={title: shades[title] for title in (OFF.format("predicted"), ERROR) if title in shades})
+    return [Pane([*given, *marks], camera, "scan"), Pane([whole, *over, predicted, *marks], camera, "completed")]
 
 
 def completion_page(panes: Sequence[Pane], name: str, metrics: Sequence[Metric], picture: np.ndarray,
@@ -143,14 +130,3 @@ def completion_page(panes: Sequence[Pane], name: str, metrics: Sequence[Metric],
         "and the usual poses say of it.\n\n"
         "Colours of the scan: carried over where it was seen; elsewhere grey, or spread smoothly when "
         "fill_colors = true in a --config file asks for it.")
-
-
-def _two_colors(completion: Completion) -> np.ndarray:
-    return np.where(completion.seen[:, None], MEASURED, COMPLETED)
-
-
-def _size(views: Sequence[Camera]) -> tuple[int, int]:
-    """Width and height of a picture in which all views fit; one of something long is less high."""
-    aspect = max(view.width / view.height for view in views)
-    height = max(1, min(HEIGHT, round(WIDEST * HEIGHT / aspect)))
-    return int(height * aspect) + 10, height

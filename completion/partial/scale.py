@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from model.fitting import energy
 from model.fitting.bodies import FixedBody, Follow, NearPoints
 from model.fitting.energy import MovingPoints
+from model.fitting.named_points import anneal
 from model.fitting.scan import spread
 from model.fitting.starts import all_rotations
 from model.priors import gaussian_prior, typical_poses
@@ -161,7 +162,5 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
         return normal_equations([energy.point_to_point(follow(x), points, weights), energy.pose_prior(x, prior, stiff),
                                  energy.shape_prior(x, body.n_angles + 3)])
 
-    for stiff in (10.0, 3.0, 1.0):
-        found = levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3)
-        x = found.x
-    return float(np.exp(LOOSE * x[np.argmin(found.energy), -1]))
+    found = anneal(lambda x, stiff: levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3), x)
+    return float(np.exp(LOOSE * found.x[np.argmin(found.energy), -1]))

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -58,8 +58,7 @@ class Work:
         metrics = complete_files(self, inputs, room)
         if self.command:
             write_report(Outcome(room.folder, metrics, {"complete": self.config}, judgement=judgement_of(metrics)),
-                         self.command,
-                         time.perf_counter() - start)
+                         self.command, time.perf_counter() - start)
         return metrics
 
 
@@ -101,7 +100,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     files = read_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
     surface = files.mesh or (all_points(files.views) if files.views else None)
     named = read_landmarks(inputs.landmarks, surface, unit) if inputs.landmarks else {}
-    landmarks = _landmarks(work, inputs.landmarks, named)
+    landmarks = shared_landmarks(inputs.landmarks, work.marks, named) if inputs.landmarks else None
     masked = read_masks(inputs.masks, files, unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
@@ -118,9 +117,14 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
                   landmarks: tuple[np.ndarray, np.ndarray] | None, masked: np.ndarray | None, output: Path
                   ) -> list[Metric]:
     """Write a completion with its colours, its pictures and its page into a folder; the figures."""
-    views = list(files.views)
+    views, mesh, viewpoint = list(files.views), done.completed, work.config.viewpoint
     if files.colored:
-        done = _with_colors(work, files, done, output)
+        colors = carry_colors(mesh, done.seen, views, work.colors, viewpoint, done.scale, files.textures)
+        if any(texture is not None for texture in files.textures):
+            known = colored_views(views, viewpoint, done.scale, files.textures)
+            write_textured(output / "completed.glb", bake(
+                mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
+        done = replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
     save_completion(output, done)
     metrics = [judgement_row(done.judgement), *figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
@@ -138,14 +142,12 @@ def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.nd
             masked: np.ndarray | None) -> list[Metric]:
     """The rows of the closing table."""
     rows = [Metric(EXPLAINED, 100 * done.explained, "%"),
-            Metric(MEASURED, 100 * float(done.seen.mean()), "%")]
+            Metric(MEASURED, 100 * float(done.seen.mean()), "%"),
+            Metric("landmarks used", "none" if landmarks is None else len(landmarks[0]))]
     if done.expected_error is not None:
         rows.insert(0, Metric(EXPECTED, MM * float(np.nanmean(done.expected_error)), "mm"))
-    if landmarks is None:
-        rows.append(Metric("landmarks used", "none"))
-    else:
-        rows += [Metric("landmarks used", len(landmarks[0])),
-                 Metric("landmarks to the model's own body, RMS", MM * done.landmark_rms, "mm")]
+    if landmarks is not None:
+        rows.append(Metric("landmarks to the model's own body, RMS", MM * done.landmark_rms, "mm"))
     if len(inputs.scans) > 1:
         rows.append(Metric("views", len(inputs.scans)))
     if masked is not None:
@@ -170,21 +172,6 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
     points = all_points(files.views)
     return np.concatenate([read_mask(path, points[a:b], unit)
                            for path, a, b in zip(paths, starts[:-1], starts[1:], strict=True)])
-
-
-def _landmarks(work: Work, file: Path | None, named: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-    return None if file is None else shared_landmarks(file, work.marks, named)
-
-
-def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -> Completion:
-    """The completion with colours on its mesh; a textured scan gives completed.glb besides."""
-    mesh, views = done.completed, list(files.views)
-    colors = carry_colors(mesh, done.seen, views, work.colors, work.config.viewpoint, done.scale, files.textures)
-    if any(texture is not None for texture in files.textures):
-        known = colored_views(views, work.config.viewpoint, done.scale, files.textures)
-        write_textured(output / "completed.glb",
-                       bake(mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
-    return replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
 
 
 def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:

@@ -1,9 +1,10 @@
 """The command `scape track`."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -14,11 +15,11 @@ from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.farthest_points import spread_indices
+from scanprep.geometry.files import PointCloud
 from scanprep.judgement import Judgement, extent, unit_problem
 from scanprep.ranges import Positive
 
 from ..cli import ModelOrNone, body_of, read_landmark_pairs, read_model
-from ..motion import Motion
 from .folder import FrameFolder, follow_folder
 from .sequence import Tracker, as_motion, tracking_doubts, tracking_problem
 from .settings import TrackConfig
@@ -29,8 +30,7 @@ FramesArg = Annotated[Path, Place("FRAMES")]
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
-                 config: TrackConfig = TrackConfig(),  # noqa: B008
-                 *, space: Workspace) -> Outcome:
+                 config: TrackConfig = TrackConfig(), *, space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 
     Example: scape track frames -m model.npz --rate 30 -o walk
@@ -56,6 +56,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         config: Settings.
     """
     from ..mocap.files.motion_files import write_glb, write_motion
+    from .report import track_page
 
     found = FrameFolder(frames, cameras, unit)
     loaded, name = read_model(model)
@@ -69,11 +70,16 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         say(f"{len(found) - done.fresh} of {len(found)} frames were tracked before")
     motion = as_motion(done.frames, done.state.betas, rate, config)
     person = body if isinstance(body, Subject) else loaded.subject(motion.betas)
-    metrics = [Metric("model", name), Metric("cameras", len(found.cameras)), *_figures(motion)]
+    residual = motion.residuals[motion.converged, 0] if motion.converged.any() else np.array([np.nan])
+    metrics = [Metric("model", name), Metric("cameras", len(found.cameras)), Metric("frames", len(motion.poses)),
+               Metric("rate", motion.rate, "1/s"), Metric("frames lost", int((~motion.converged).sum())),
+               Metric("distance of the points to the body, mean", MM * float(residual.mean()), "mm"),
+               Metric("the same, worst frame", MM * float(residual.max()), "mm")]
 
     def write(folder: Path) -> None:
         write_motion(folder, motion, person)
-        _page(folder, motion, person, found, frames.name, metrics)
+        track_page(motion, person, lambda t: _points(found[t]), frames.name, found.numbers, metrics).write(
+            folder / "report.html")
 
     of_motion = done.key, config.smoothing
     metrics += space.step("animation", of_motion, lambda folder: write_glb(folder / "animation.glb", motion, person))
@@ -86,27 +92,13 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
                    judgement=judgement)
 
 
+def _points(views: Sequence[PointCloud]) -> np.ndarray:
+    """What all cameras saw in a frame, (n, 3) metres."""
+    return np.concatenate([np.zeros((0, 3)), *(view.points for view in views)])
+
+
 def wrong_size(frames: FrameFolder, person: Subject) -> str | None:
     """Why frames cannot show the body, by the largest of a few of them; None where they can."""
     some = spread_indices(len(frames), 5)
-    spans = [extent(np.concatenate([np.zeros((0, 3)), *(view.points for view in frames[t])])) for t in some]
+    spans = [extent(_points(frames[t])) for t in some]
     return unit_problem(float(np.fmax.reduce(spans)), extent(person.template.vertices), "the frames are", 0.1)
-
-
-def _figures(motion: Motion) -> list[Metric]:
-    residual = motion.residuals[motion.converged, 0]
-    shown = residual if len(residual) else np.array([np.nan])
-    return [Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s"),
-            Metric("frames lost", int((~motion.converged).sum())),
-            Metric("distance of the points to the body, mean", MM * float(shown.mean()), "mm"),
-            Metric("the same, worst frame", MM * float(shown.max()), "mm")]
-
-
-def _page(output: Path, motion: Motion, person: Subject, frames: FrameFolder, name: str, metrics: list[Metric]
-          ) -> None:
-    from .report import track_page
-
-    def cloud(t: int) -> np.ndarray[Any, Any]:
-        return np.concatenate([np.zeros((0, 3)), *(view.points for view in frames[t])])
-
-    track_page(motion, person, cloud, name, frames.numbers, metrics).write(output / "report.html")

@@ -39,12 +39,14 @@ class FrameFolder:
         if not folder.is_dir():
             raise ValueError(f"{folder}: " + ("expected a folder of frames, found a file" if folder.exists()
                                               else "no such folder"))
-        cameras = _by_pattern(folder, pattern) if pattern else _by_folder(folder)
-        self.cameras = tuple(cameras)
-        self._paths = cameras
-        self.numbers = _numbers({n for files in cameras.values() for n in files})
-        self.names = tuple(f"{n}" for n in self.numbers)
-        self.unit = common_unit([path for files in cameras.values() for path in files.values()], self.unit)
+        self._paths = _by_pattern(folder, pattern) if pattern else _by_folder(folder)
+        self.cameras = tuple(self._paths)
+        # numbers may leave out as many frames as there are; else they only give the order
+        order = sorted({n for files in self._paths.values() for n in files})
+        step = int(np.gcd.reduce(np.diff(order))) if len(order) > 1 else 1
+        filled = list(range(order[0], order[-1] + 1, step))
+        self.numbers = filled if len(filled) <= 2 * len(order) else order
+        self.unit = common_unit([path for files in self._paths.values() for path in files.values()], self.unit)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -54,30 +56,36 @@ class FrameFolder:
 
     def __getitem__(self, i: int) -> list[PointCloud]:
         """What the cameras saw in frame i; a file that cannot be read is a camera that saw nothing."""
-        found = [self._read(path) for path in self.paths(i)]
-        return [cloud for cloud in found if cloud is not None]
+        found = []
+        for path in self.paths(i):
+            try:
+                found.append(read_points(path, self.unit))
+            except EmptyFileError:               # the camera saw nothing
+                continue
+            except MeshFileError as error:
+                if str(error) not in self.problems:
+                    self.problems.append(str(error))
+        return found
 
     def paths(self, i: int) -> list[Path]:
         """The files of frame i."""
         return [files[self.numbers[i]] for files in self._paths.values() if self.numbers[i] in files]
 
-    def _read(self, path: Path) -> PointCloud | None:
-        try:
-            return read_points(path, self.unit)
-        except EmptyFileError:               # the camera saw nothing
-            return None
-        except MeshFileError as error:
-            if str(error) not in self.problems:
-                self.problems.append(str(error))
-            return None
-
 
 def _by_folder(folder: Path) -> dict[str, dict[int, Path]]:
-    own = _files(folder)
-    if own:
-        return {"": _numbered(own)}
-    inner = {path.name: _files(path) for path in sorted(folder.iterdir()) if path.is_dir()}
-    found = {name: _numbered(files) for name, files in inner.items() if files}
+    """Camera -> the files of a folder, or of those in it, by the last number in their names."""
+    inner = [("", folder), *((path.name, path) for path in sorted(folder.iterdir()) if path.is_dir())]
+    found: dict[str, dict[int, Path]] = {}
+    for camera, place in inner:
+        for path in [] if "" in found else list_files(place, lambda path: ending_of(path) in ENDINGS):
+            digits = re.findall(r"\d+", name_of(path))
+            if not digits:
+                raise ValueError(f"{path}: expected the number of the frame in its name")
+            own, number = found.setdefault(camera, {}), int(digits[-1])
+            if number in own:
+                raise ValueError(f"{place}: {own[number].name} and {path.name} are both frame {number}; put cameras "
+                                 "into folders of their own, or name them with --cameras")
+            own[number] = path
     if not found:
         raise ValueError(f"{folder}: expected frames ({', '.join(ENDINGS)}) in it, or in one folder for each camera, "
                          "found none")
@@ -85,6 +93,7 @@ def _by_folder(folder: Path) -> dict[str, dict[int, Path]]:
 
 
 def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
+    """Camera -> files by number, of names such as "cam{camera}_{frame}.ply"."""
     if "{camera}" not in pattern or "{frame}" not in pattern:
         raise UsageError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
     expression = re.escape(pattern).replace(r"\{camera\}", "(?P<camera>.+?)").replace(r"\{frame\}", r"(?P<frame>\d+)")
@@ -92,67 +101,27 @@ def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
     for path in sorted(folder.rglob("*")):
         match = re.fullmatch(expression, path.relative_to(folder).as_posix())
         if match and path.is_file():
-            mine, number = found.setdefault(match["camera"], {}), int(match["frame"])
-            if number in mine:
-                raise ValueError(f"{folder}: {mine[number].name} and {path.name} are both frame {number} of camera "
+            own, number = found.setdefault(match["camera"], {}), int(match["frame"])
+            if number in own:
+                raise ValueError(f"{folder}: {own[number].name} and {path.name} are both frame {number} of camera "
                                  f"{match['camera']}")
-            mine[number] = path
+            own[number] = path
     if not found:
         raise ValueError(f"{folder}: no file is named as --cameras '{pattern}' says")
     return dict(sorted(found.items()))
 
 
-def _files(folder: Path) -> list[Path]:
-    return list_files(folder, lambda path: ending_of(path) in ENDINGS)
-
-
-def _numbered(paths: list[Path]) -> dict[int, Path]:
-    """Files by the last number in their names."""
-    out: dict[int, Path] = {}
-    for path in paths:
-        digits = re.findall(r"\d+", name_of(path))
-        if not digits:
-            raise ValueError(f"{path}: expected the number of the frame in its name")
-        number = int(digits[-1])
-        if number in out:
-            raise ValueError(f"{path.parent}: {out[number].name} and {path.name} are both frame {number}; put cameras "
-                             "into folders of their own, or name them with --cameras")
-        out[number] = path
-    return out
-
-
-def _numbers(found: set[int]) -> list[int]:
-    """Frame numbers in order, with those between that are left out, unless they are too many to be frames."""
-    order = sorted(found)
-    steps = np.diff(order)
-    step = int(np.gcd.reduce(steps)) if len(steps) else 1
-    filled = (order[-1] - order[0]) // step + 1
-    # numbers may leave out as many frames as there are; else they only give the order
-    return list(range(order[0], order[-1] + 1, step)) if filled <= 2 * len(order) else order
-
-
-AT_ONCE = 5                          # frames that are kept together
 START = "frames/"                    # of the names of what is kept
-SURFACES = "surfaces"
-
-
-@dataclass(frozen=True, eq=False)
-class Chunk:
-    """What came of some frames."""
-
-    ready: tuple[TrackedFrame, ...]  # tuple of TrackedFrame
-    state: TrackerState     # TrackerState, after them
-    problems: tuple[str, ...]  # tuple of str, what was wrong with their files, the folder left out
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
     """All frames of a folder."""
 
-    frames: list[TrackedFrame]  # list of TrackedFrame
-    state: TrackerState     # TrackerState, at the end
-    key: str                # changes with everything they depend on
-    fresh: int              # frames that were followed now; the others had been before
+    frames: list[TrackedFrame]
+    state: TrackerState             # at the end
+    key: str                        # changes with everything they depend on
+    fresh: int                      # frames that were followed now; the others had been before
 
 
 def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: str, surfaces: bool = False,
@@ -163,37 +132,33 @@ def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: 
     when one is missing, damaged or changed, the tracker goes on from the end of the one before.
     """
     done: list[TrackedFrame] = []
-    state, fresh, names = tracker.state, 0, []
-    for first in (*range(0, len(frames), AT_ONCE), len(frames)):
-        mine = range(first, min(first + AT_ONCE, len(frames)))
+    state, fresh, names, at_once = tracker.state, 0, [], 5
+    for first in (*range(0, len(frames), at_once), len(frames)):
+        mine = range(first, min(first + at_once, len(frames)))
         files = [[(path.relative_to(frames.folder).as_posix(), path) for path in frames.paths(i)] for i in mine]
         key = space.digests.of(key, files)
         names.append(f"{START}{first:08d}" if mine else f"{START}end")
 
-        def follow(folder: Path, mine: range = mine, before: TrackerState = state) -> Chunk:
+        def follow(folder: Path, mine: range = mine, before: TrackerState = state
+                   ) -> tuple[tuple[TrackedFrame, ...], TrackerState, tuple[str, ...]]:
+            """The frames that are ready, the state after them, and what was wrong with files, the folder left out."""
             nonlocal fresh
             fresh += len(mine)
             if tracker.state.number != before.number:
                 tracker.resume(before)
-            return _followed(tracker, frames, mine, folder / SURFACES if surfaces else None)
+            known = len(frames.problems)
+            # none are pushed at the end, for those that were waiting
+            ready = [frame for i in mine for frame in tracker.push(frames[i])] if mine else tracker.finish()
+            for frame in ready if surfaces else ():
+                write_mesh(folder / "surfaces" / f"{frame.number:06d}.ply", tracker.surface(frame), "single")
+            problems = tuple(text.removeprefix(str(frames.folder)) for text in frames.problems[known:])
+            del frames.problems[known:]
+            return tuple(without_points(frame) for frame in ready), tracker.state, problems
 
-        chunk = space.step(names[-1], key, follow)
-        state = chunk.state
-        done += chunk.ready
-        frames.problems += [f"{frames.folder}{text}" for text in chunk.problems]
+        ready, state, problems = space.step(names[-1], key, follow)
+        done += ready
+        frames.problems += [f"{frames.folder}{text}" for text in problems]
         if progress is not None:
             progress(first + len(mine), len(frames))
     space.drop_others(START, names)                          # the recording was longer
     return Followed(done, state, key, fresh)
-
-
-def _followed(tracker: Tracker, frames: FrameFolder, mine: range, surfaces: Path | None) -> Chunk:
-    """Some frames, or none for those that were waiting at the end."""
-    told = len(frames.problems)
-    ready = [frame for i in mine for frame in tracker.push(frames[i])] if mine else tracker.finish()
-    if surfaces is not None:
-        for frame in ready:
-            write_mesh(surfaces / f"{frame.number:06d}.ply", tracker.surface(frame), "single")
-    problems = tuple(text.removeprefix(str(frames.folder)) for text in frames.problems[told:])
-    del frames.problems[told:]
-    return Chunk(tuple(without_points(frame) for frame in ready), tracker.state, problems)

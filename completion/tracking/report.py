@@ -8,37 +8,28 @@ import numpy as np
 from model.linear import Subject
 from scanprep.console import Metric
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots
 
 from ..motion import Motion
 from ..motion_pictures import chart_residuals, moving_pane, played
 
-POINTS, BODY = (0.16, 0.42, 0.72), (0.90, 0.78, 0.55)
-MOST = 300_000                       # points of all frames together
 
-Cloud = Callable[[int], np.ndarray]
-
-
-def tracked_pane(motion: Motion, subject: Subject, cloud: Cloud) -> Pane:
-    """The motion with some of the points of each frame; `cloud` frame -> (n, 3), metres."""
+def track_page(motion: Motion, subject: Subject, cloud: Callable[[int], np.ndarray], name: str, numbers: list[int],
+               metrics: Sequence[Metric]) -> Page:
+    """The page of `scape track`; `cloud` frame -> (n, 3), metres; numbers are those of the frames in their files."""
+    page = Page(f"{name}, tracked", "The body, and some of the points that were measured in each frame. Where it is "
+                "grey the frame was lost.")
+    # some of the points of each frame, at most 300,000 of all together
     frames, _ = played(motion)
-    count = int(np.clip(MOST // len(frames), 100, 1000))
+    count = int(np.clip(300_000 // len(frames), 100, 1000))
     points = np.full((len(frames), count, 3), np.nan)
     for row, t in enumerate(frames):
         measured = cloud(int(t))
         some = measured[np.linspace(0, len(measured) - 1, min(count, len(measured))).astype(int)]
         points[row, :len(some)] = some
-    dots = Dots(points[0], POINTS, radius=0.006, name="measured points")
-    return moving_pane(motion, subject, [(dots, points)], color=BODY)
-
-
-def track_page(motion: Motion, subject: Subject, cloud: Cloud, name: str, numbers: list[int],
-               metrics: Sequence[Metric]) -> Page:
-    """The page of `scape track`; numbers are those of the frames in their files."""
-    page = Page(f"{name}, tracked", "The body, and some of the points that were measured in each frame. Where it is "
-                "grey the frame was lost.")
-    page.bodies([tracked_pane(motion, subject, cloud)], "Press the triangle to play, drag the body to turn it.", 520)
+    dots = Dots(points[0], (0.16, 0.42, 0.72), radius=0.006, name="measured points")
+    page.bodies([moving_pane(motion, subject, [(dots, points)], color=(0.90, 0.78, 0.55))],
+                "Press the triangle to play, drag the body to turn it.", 520)
     page.section("Distance of the points to the body").chart(
         chart_residuals(motion, "points", lost=True), "mean over the points of a frame, before smoothing")
     lost = np.array(numbers)[~motion.converged]

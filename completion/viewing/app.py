@@ -5,7 +5,7 @@ and with where all sliders stand. Older answers that still wait give way to newe
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,12 @@ from .files import Entry, Files
 from .pages import Inside
 from .saving import save_bodies, save_poses
 from .things import MOST, Things
+
+# what sliders, buttons and the mouse do to the bodies; the fields of their messages are the arguments
+MOVES: Mapping[str, Callable[..., object]] = {
+    "beta": Controls.set_beta, "turn": Controls.set_turn, "choose": Controls.choose_part, "touch": Controls.choose,
+    "grab": Controls.grab, "drag": Controls.drag, "random_body": Controls.random_body,
+    "random_pose": Controls.random_pose, "reset": Controls.reset}
 
 
 class ViewApp(Things):
@@ -46,8 +52,7 @@ class ViewApp(Things):
                  files: Files | None = None) -> None:
         super().__init__(entries, files or Files())
         self.over, self.output = over, output
-        self.controls, self.rng = Controls(), np.random.default_rng()
-        self.dropped = Dropped()
+        self.controls, self.dropped = Controls(), Dropped()
         self.inside = Inside(self.files, output, self.dropped)
         self.written: list[Path] = []                     # what was saved
         self.note = ""
@@ -86,16 +91,6 @@ class ViewApp(Things):
         return {"betas": one.betas.tolist(), "turns": {name: turn.tolist() for name, turn in one.turns.items()},
                 "chosen": one.chosen}
 
-    def _residuals(self) -> list[Message]:
-        """Of measured markers, in every frame."""
-        out = []
-        for i, pane, layer in self._places():
-            told = self.contents[i].markers
-            if told is not None:
-                fields = {"pane": pane, "layer": layer + told.shape, "labels": told.labels, **told.colors()}
-                out.append(Message("residuals", fields, told.residuals.astype("<f4").tobytes()))
-        return out
-
     # what is shown
 
     def show(self, wanted: Sequence[int]) -> None:
@@ -129,22 +124,24 @@ class ViewApp(Things):
                 self.written.append(folder)
             self.join(folder)
 
-    def _places(self) -> list[tuple[int, int, int]]:
-        """Entry, pane and first layer of everything that is shown."""
-        out, layer = [], 0
-        for pane, i in enumerate(self.shown):
-            out.append((i, 0, layer) if self.over else (i, pane, 0))
-            layer += len(self.contents[i].shapes)
-        return out
-
     def _make_scene(self) -> None:
-        shown = [self.contents[i] for i in self.shown]
-        self.cameras, panes = over_each_other(shown) if self.over else side_by_side(shown)
+        """A pane and its first layer for everything that is shown, residuals of its markers, sliders of its bodies."""
+        contents = [self.contents[i] for i in self.shown]
+        self.cameras, panes = over_each_other(contents) if self.over else side_by_side(contents)
         self.number += 1
-        self._scene = [Message("scene", {"number": self.number}, pack_scene(panes, whole=True)), *self._residuals()]
-        self._notes = tuple(note for content in shown for note in content.notes)
-        self.controls.take([Shown(body, self.contents[i].name, pane, layer + k) for i, pane, layer in self._places()
-                            if i in self.bodies for k, body in enumerate(self.bodies[i].layers)])
+        self._scene = [Message("scene", {"number": self.number}, pack_scene(panes, whole=True))]
+        bodies, below = list[Shown](), 0
+        for number, i in enumerate(self.shown):
+            content = self.contents[i]
+            pane, layer = (0, below) if self.over else (number, 0)
+            below += len(content.shapes)
+            if (known := content.markers) is not None:
+                fields = {"pane": pane, "layer": layer + known.shape, "labels": known.labels, **known.colors()}
+                self._scene.append(Message("residuals", fields, known.residuals.astype("<f4").tobytes()))
+            if i in self.bodies:
+                bodies += [Shown(body, content.name, pane, layer + k) for k, body in enumerate(self.bodies[i].layers)]
+        self._notes = tuple(note for content in contents for note in content.notes)
+        self.controls.take(bodies)
         self._positions = {}
         for one in self.controls.shown:
             self._moved(one)
@@ -164,10 +161,14 @@ class ViewApp(Things):
 
     def handle(self, message: Message, send: Send) -> None:
         """A slider, a button, a click."""
-        action = getattr(self, f"on_{message.kind}", None)
-        if action is None:
+        if (move := MOVES.get(message.kind)) is not None:
+            move(self.controls, **message.fields)
+            for one in self.controls.shown:
+                send(self._moved(one))
+        elif (action := getattr(self, f"on_{message.kind}", None)) is not None:
+            action(send, **message.fields)
+        else:
             raise ValueError(f"a message of kind '{message.kind}', which nothing here answers")
-        action(send, **message.fields)
 
     def receive(self, name: str, path: Path, send: Send) -> None:
         """A file dropped on the page joins the things and is shown; ValueError for one that cannot be."""
@@ -175,20 +176,13 @@ class ViewApp(Things):
             whole, self.note = with_camera(kept)
             if not self.note:
                 self.join(whole)
-        self._tell_all(send)
+        for message in self.greet():
+            send(message)
 
     def close(self) -> None:
         """Forget what was dropped; all else that was wanted was saved."""
         self.written += [folder for page in self.inside.completions for folder in self.inside.written(page)]
         self.dropped.close()
-
-    def _tell_all(self, send: Send) -> None:
-        for message in self.greet():
-            send(message)
-
-    def _tell(self, send: Send) -> None:
-        for one in self.controls.shown:
-            send(self._moved(one))
 
     def on_show(self, send: Send, entries: list[int]) -> None:
         """Other things."""
@@ -201,53 +195,6 @@ class ViewApp(Things):
             for message in [*self._scene, *self._positions.values()]:
                 send(message)
         send(self.state())
-
-    def on_beta(self, send: Send, index: int, value: float) -> None:
-        """A slider of the shape."""
-        self.controls.set_beta(index, value)
-        self._tell(send)
-
-    def on_turn(self, send: Send, part: str, turn: list[float]) -> None:
-        """The angles of a part."""
-        self.controls.set_turn(part, turn)
-        self._tell(send)
-
-    def on_choose(self, send: Send, part: str) -> None:
-        """The part whose angles are shown."""
-        if part in self.controls.turns:
-            self.controls.chosen = part
-        self._tell(send)
-
-    def on_touch(self, send: Send, pane: int, layer: int, vertex: int) -> None:
-        """The part that was clicked."""
-        self.controls.choose(pane, layer, vertex)
-        self._tell(send)
-
-    def on_grab(self, send: Send, pane: int, layer: int, vertex: int) -> None:
-        """A vertex is taken hold of."""
-        self.controls.grab(pane, layer, vertex)
-        self._tell(send)
-
-    def on_drag(self, send: Send, target: list[float]) -> None:
-        """It is wanted there."""
-        self.controls.drag(target)
-        self._tell(send)
-
-    def on_random_body(self, send: Send) -> None:
-        """Other betas."""
-        self.controls.random_body(self.rng)
-        self._tell(send)
-
-    def on_random_pose(self, send: Send) -> None:
-        """Another pose."""
-        if self.controls.shown:
-            self.controls.random_pose(self.rng)
-            self._tell(send)
-
-    def on_reset(self, send: Send) -> None:
-        """Mean body, at rest."""
-        self.controls.reset()
-        self._tell(send)
 
     def on_save_body(self, send: Send) -> None:
         """Each body as a mesh."""

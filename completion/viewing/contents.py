@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,10 +23,8 @@ from scanprep.viewer.clicked import camera_before
 
 from ..partial.completion import Completion
 
-POINTS, TRIANGLES = 150_000, 120_000             # of a cloud or mesh that are shown
 SHOWN_OFF = 0.03                     # metres: residual of a marker that is darkest
 MARKER = (0.85, 0.25, 0.2)
-ELEVATION, TURN = 8.0, np.radians(20)            # degrees above, and angle from the front, of the first view
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) for i, axis in enumerate("xyz")}
 
 
@@ -49,14 +47,14 @@ class Stance:
         return replace(self, extent=_box(points.reshape(-1, 3)))
 
     def camera(self, up: np.ndarray | None = None) -> Camera:
-        """A view from beside the front, this way up."""
+        """A view from beside the front, 20 degrees to its side and 8 above, this way up."""
         if self.seen is not None:
             return self.seen
         up = self.up if up is None else up
         front = self.front if np.linalg.norm(np.cross(self.front, up)) > 0.1 else np.roll(up, 1)
         flat = front - (front @ up) * up
-        side = np.cos(TURN) * flat + np.sin(TURN) * np.cross(up, flat)
-        return Camera.from_side(self.extent, side, up, ELEVATION)
+        side = np.cos(np.radians(20)) * flat + np.sin(np.radians(20)) * np.cross(up, flat)
+        return Camera.from_side(self.extent, side, up, 8.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,19 +90,24 @@ class Content:
 
 
 def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray] | None = None) -> Content:
-    """A mesh, or points (n, 3), with landmarks."""
+    """A mesh, or points (n, 3), with landmarks; not more of it than a browser turns smoothly."""
     mesh = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
     stands = Stance.of(mesh)
-    size = float(np.linalg.norm(np.ptp(stands.extent, axis=0)))
-    marks = _landmarks(landmarks, size)
+    marks = [mark_places(landmarks, stands, "landmarks")] if landmarks else []
     if not len(mesh.faces):
-        every = max(1, len(mesh.vertices) // POINTS)
+        size, every = float(np.linalg.norm(np.ptp(stands.extent, axis=0))), max(1, len(mesh.vertices) // 150_000)
         return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stands,
                        f"{len(mesh.vertices):,} points")
-    shown = thinned(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), TRIANGLES)
+    shown = thinned(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), 120_000)
     few = len(shown.mesh.faces) < len(mesh.faces)
     notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * few
     return Content(name, [shown, *marks], stands, sizes(mesh), notes=notes)
+
+
+def mark_places(places: Mapping[str, np.ndarray], stands: Stance, name: str) -> Dots:
+    """Landmarks or markers on a thing, with their names."""
+    size = float(np.linalg.norm(np.ptp(stands.extent, axis=0)))
+    return Dots(np.array(list(places.values())), MARKER, size / 160, True, name=name, labels=tuple(places))
 
 
 def from_camera(content: Content) -> Content:
@@ -117,12 +120,6 @@ def from_camera(content: Content) -> Content:
 def sizes(mesh: Mesh) -> str:
     """How many vertices and triangles."""
     return f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
-
-
-def _landmarks(places: dict[str, np.ndarray] | None, size: float) -> list[Dots]:
-    if not places:
-        return []
-    return [Dots(np.array(list(places.values())), MARKER, size / 160, True, name="landmarks", labels=tuple(places))]
 
 
 def body_shades(mesh: Mesh, part_of_face: np.ndarray, **more: Any) -> Solid:

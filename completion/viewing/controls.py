@@ -35,6 +35,7 @@ class Controls:
     trans: np.ndarray = field(default_factory=lambda: np.zeros(3))
     chosen: str = ""                     # part whose angles are shown
     held: tuple[Shown, Drag] | None = None
+    rng: np.random.Generator = field(default_factory=np.random.default_rng)
 
     def take(self, shown: list[Shown]) -> None:
         """Other bodies; what the sliders say stays as far as they have it."""
@@ -78,16 +79,18 @@ class Controls:
         TURNS.check(value, "pose")
         self.turns[part] = value
 
-    def random_body(self, rng: np.random.Generator) -> None:
+    def random_body(self) -> None:
         """Betas drawn as the training people's are spread."""
-        self.betas = rng.normal(size=len(self.betas))
+        self.betas = self.rng.normal(size=len(self.betas))
 
-    def random_pose(self, rng: np.random.Generator) -> None:
+    def random_pose(self) -> None:
         """A pose from the prior of the first model, within what its joints were seen to do."""
+        if not self.shown:
+            return
         body = self.shown[0].body
         examples = body.model.pose_examples
         limits = JointLimits.from_poses(examples) if len(examples) >= LEAST_POSES else None
-        pose = sample_poses(body.model, 1, rng, limits)[0]
+        pose = sample_poses(body.model, 1, self.rng, limits)[0]
         pose[0] = 0
         self.turns.update(zip(body.parts, pose, strict=True))
         self.trans = np.zeros(3)
@@ -100,16 +103,16 @@ class Controls:
 
     # dragging
 
-    def find(self, pane: int, layer: int) -> Shown:
-        """The body of a layer."""
-        for one in self.shown:
-            if (one.pane, one.layer) == (pane, layer):
-                return one
-        raise ValueError(f"pane and layer: expected a model's body, got {pane}, {layer}")
+    def choose_part(self, part: str) -> None:
+        """The part whose angles are shown."""
+        if part in self.turns:
+            self.chosen = part
 
     def choose(self, pane: int, layer: int, vertex: int) -> Shown:
         """The part that was clicked."""
-        one = self.find(pane, layer)
+        one = next((one for one in self.shown if (one.pane, one.layer) == (pane, layer)), None)
+        if one is None:
+            raise ValueError(f"pane and layer: expected a model's body, got {pane}, {layer}")
         if not 0 <= vertex < len(one.body.part_of_vertex):
             raise ValueError(f"vertex: expected 0 to {len(one.body.part_of_vertex) - 1}, got {vertex}")
         self.chosen = one.body.parts[int(one.body.part_of_vertex[vertex])]

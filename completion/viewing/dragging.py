@@ -11,9 +11,6 @@ from .movable import MovableBody
 
 NEAR = 0.01                          # metres: a point this far from where it is wanted costs 1
 HOLD, USUAL = 0.05, 0.02             # weights of the pose it had, and of poses the model was learned from
-STEPS = 4                            # Gauss-Newton steps for each move of the hand
-FARTHEST = 0.25                      # of the body's size: so far a point moves at a time
-LARGEST = 0.4                        # radians that a joint turns in one step
 
 
 class Drag:
@@ -47,39 +44,34 @@ class Drag:
         A few Gauss-Newton steps, each taken only as far as the energy falls.
         """
         here = self.operator.evaluate(pose, trans)[0]
-        way = target - here
-        target = here + way * min(1.0, FARTHEST * self.size / max(float(np.linalg.norm(way)), 1e-9))
+        way = target - here                         # a point moves at most a quarter of the body's size at a time
+        target = here + way * min(1.0, 0.25 * self.size / max(float(np.linalg.norm(way)), 1e-9))
         if not len(self.columns):
             return pose, trans + target - here
-        for _ in range(STEPS):
-            pose = self._step(pose, trans, target)
+
+        def away(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            x = pose.ravel()[self.columns]
+            return x - self.start[self.columns], x - self.mean[self.columns]
+
+        def energy(pose: np.ndarray) -> float:
+            held, usual = away(pose)
+            off = (self.operator.evaluate(pose, trans)[0] - target) / NEAR
+            return float(off @ off + HOLD * held @ self.precision @ held + USUAL * usual @ self.precision @ usual)
+
+        for _ in range(4):
+            y, J = self.operator.jacobian(pose, trans)
+            off, J = (y[0] - target) / NEAR, J[0][:, self.columns] / NEAR
+            held, usual = away(pose)
+            H = J.T @ J + (HOLD + USUAL) * self.precision
+            g = J.T @ off + self.precision @ (HOLD * held + USUAL * usual)
+            step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(len(H)), g)
+            step *= min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))         # radians that a joint turns at a time
+            for shorter in (1, 3, 9, 27, 81):
+                tried = pose.copy()
+                tried.ravel()[self.columns] += step / shorter
+                if energy(tried) < energy(pose):
+                    pose = tried
+                    break
         out = pose.copy()
         out[1:] = twists(pose)[1:]
         return out, trans
-
-    def _step(self, pose: np.ndarray, trans: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """One damped step."""
-        y, J = self.operator.jacobian(pose, trans)
-        off, J = (y[0] - target) / NEAR, J[0][:, self.columns] / NEAR
-        held, usual = self._away(pose)
-        H = J.T @ J + (HOLD + USUAL) * self.precision
-        g = J.T @ off + self.precision @ (HOLD * held + USUAL * usual)
-        step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(len(H)), g)
-        step *= min(1.0, LARGEST / max(float(np.abs(step).max()), 1e-12))
-        before = self._energy(pose, trans, target)
-        for _ in range(5):
-            tried = pose.copy()
-            tried.ravel()[self.columns] += step
-            if self._energy(tried, trans, target) < before:
-                return tried
-            step /= 3
-        return pose
-
-    def _away(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = pose.ravel()[self.columns]
-        return x - self.start[self.columns], x - self.mean[self.columns]
-
-    def _energy(self, pose: np.ndarray, trans: np.ndarray, target: np.ndarray) -> float:
-        held, usual = self._away(pose)
-        off = (self.operator.evaluate(pose, trans)[0] - target) / NEAR
-        return float(off @ off + HOLD * held @ self.precision @ held + USUAL * usual @ self.precision @ usual)

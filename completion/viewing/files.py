@@ -11,28 +11,27 @@ from model.body import BodyModel
 from model.files import load_model
 from model.motion.files import betas_for, read_motion_file
 from model.motion.onto import read_motion
+from model.statue.files import ABOUT, CONTROL
 from scanprep.cli import Unit
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import is_camera
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
-from scanprep.pictures.shading import Dots
 from scanprep.viewer.clicked import read_surface
 from scanprep.viewer.dropped import with_camera
 
 from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion
 from ..partial.completion import load_completion
-from .contents import MARKER, Content, from_camera, of_completion, of_mesh, of_model, told
+from .contents import Content, from_camera, mark_places, of_completion, of_mesh, of_model, told
 from .kinds import kind_of, layout_places, reported_model, worst_first
 from .motions import of_markers, of_motion, read_recording
 from .soft import soft_tissue_of, with_soft_tissue
-from .statues import is_statue, read_statue, statue_folder
+from .statues import read_statue
 
 PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
 SHOWN = ("surface", "picture", "model", "motion", "markers")
-TABLES = (".csv", ".tsv", ".txt", ".bvh")    # not shown of folders: they may hold anything, or be of any body
 ENOUGH = 3                           # labels that a recording and a motion have in common
 DEEP = 3                             # folders inside folders that are looked into
 
@@ -73,8 +72,7 @@ class Files:
                  over: bool = False, rate: float | None = None) -> None:
         self.paths, self.model, self.unit, self.over, self.rate = paths, model, unit, over, rate
         self._models: dict[Path, BodyModel] = {}
-        self._found: list[Path] = []                     # models among the files
-        self._recordings: list[Path] = []                # of markers, to be laid over motions
+        self.known: dict[str, tuple[Path, ...]] = {"model": (), "markers": ()}      # among the files
 
     def entries(self) -> list[Entry]:
         """All things, in order; ValueError for a file that is not there, or cannot be shown whatever is in it."""
@@ -89,7 +87,8 @@ class Files:
                 if picture in self.paths:
                     continue
                 path = picture
-            path = statue_folder(path)
+            if path.name in (ABOUT, CONTROL) and (path.parent / ABOUT).is_file():              # files of a statue
+                path = path.parent
             if path.name.lower().endswith(PLACES):
                 self._lay_on(found, path)
             else:
@@ -102,8 +101,7 @@ class Files:
     def with_another(self, entries: Sequence[Entry], path: Path) -> list[Entry]:
         """Entries and those of one more file or folder, in the place of those that it had; ValueError as `entries`."""
         self._models.pop(path.resolve(), None)
-        self._found = [one for one in self._found if one != path]
-        self._recordings = [one for one in self._recordings if one != path]
+        self.known = {kind: tuple(one for one in paths if one != path) for kind, paths in self.known.items()}
         if path.name.lower().endswith(PLACES):
             found = list(entries)
             beside = [i for i, entry in enumerate(found) if landmarks_beside(entry.path) == path]
@@ -129,7 +127,7 @@ class Files:
     def models(self) -> list[Path]:
         """Those among the files, and last the one that was named for motions."""
         named = [] if self.model is None else [self.model]
-        return list(dict.fromkeys([*(path for path in self._found if path not in named), *named]))
+        return list(dict.fromkeys([*(path for path in self.known["model"] if path not in named), *named]))
 
     def read_model(self, path: Path) -> BodyModel:
         """Each model is read once."""
@@ -152,8 +150,8 @@ class Files:
         if kind not in loads:
             raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks, a depth picture "
                              f"or a folder, found {kind}")
-        self._found = [*self._found, *[path] * (kind == "model")]
-        self._recordings = [*self._recordings, *[path] * (kind == "markers")]
+        if kind in self.known:
+            self.known = {**self.known, kind: (*self.known[kind], path)}
         return Entry(name, loads[kind], kind != "markers" or not self.over, path, kind)
 
     def _surface(self, path: Path, name: str) -> Content:
@@ -174,9 +172,8 @@ class Files:
         def load() -> Content:
             content = last.load()
             mesh = getattr(content.shapes[0], "mesh", None)
-            size = float(np.linalg.norm(np.ptp(content.stance.extent, axis=0)))
             places = layout_places(path, mesh) or read_landmarks(path, mesh, self.unit)
-            dots = Dots(np.array(list(places.values())), MARKER, size / 160, True, name=path.name, labels=tuple(places))
+            dots = mark_places(places, content.stance, path.name)
             still = (f"{path.name}: shown on the body at rest, without sliders",) * (content.model is not None)
             return replace(content, shapes=[*content.shapes, dots], model=None, notes=(*content.notes, *still))
 
@@ -193,7 +190,7 @@ class Files:
     def _inside(self, folder: Path, name: str, deep: int) -> Iterator[Entry]:
         if (folder / SET).is_file():
             yield from self._of_set(folder, name)
-        elif is_statue(folder):
+        elif (folder / ABOUT).is_file() and (folder / CONTROL).is_file():
             yield Entry(name, lambda: read_statue(name, folder), True, folder, "statue", folder)
         elif (folder / COMPLETION).is_file():
             yield Entry(name, lambda: of_completion(name, load_completion(folder)), True, folder, "completion", folder)
@@ -209,7 +206,9 @@ class Files:
                     continue
                 if path.is_dir() and deep:
                     yield from self._inside(path, f"{name}/{path.name}", deep - 1)
-                elif path.is_file() and path.suffix.lower() not in TABLES and kind_of(path) in SHOWN:
+                # tables may hold anything, and BVH be of any body
+                elif path.is_file() and path.suffix.lower() not in (".csv", ".tsv", ".txt", ".bvh") \
+                        and kind_of(path) in SHOWN:
                     yield self._of_file(path, f"{name}/{path.name}")
 
     def _of_set(self, folder: Path, name: str) -> Iterator[Entry]:
@@ -259,7 +258,7 @@ class Files:
         """What was measured: the mended recording beside the motion, or one among the files that is laid over it."""
         virtual = path.with_name("virtual.c3d")
         tried = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
-        for file, unit in [*tried, *((one, self.unit) for one in self._recordings if self.over)]:
+        for file, unit in [*tried, *((one, self.unit) for one in self.known["markers"] if self.over)]:
             markers = read_recording(file, unit, self.rate)
             if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= ENOUGH:
                 return markers
@@ -273,7 +272,7 @@ class Files:
             name = reported_model(folder / "report.json")
             if name is not None and name.is_file():
                 return self.read_model(name)
-        fitting = [m for m in map(self.read_model, self._found)
+        fitting = [m for m in map(self.read_model, self.known["model"])
                    if motion is None or len(m.skeleton.parents) == motion.poses.shape[1]]
         if not fitting:
             raise ValueError(f"{path}: a motion needs its model; name it with -m, or drop it before")

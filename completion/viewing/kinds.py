@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from model.files import KINDS
 from model.motion.files import is_motion
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import camera_file, is_picture
@@ -17,8 +18,6 @@ from scanprep.geometry.mesh import Mesh
 from ..mocap.files.markers import READERS
 from ..mocap.marker_sets.layout import MarkerLayout
 
-CACHED = "cached at "                # in reports, before the file of the model of synthetic people
-
 
 def kind_of(path: Path) -> str:
     """What a file is: model, motion, completion, markers, surface, picture, or words for what it is instead."""
@@ -27,8 +26,7 @@ def kind_of(path: Path) -> str:
         if storage.HEADER not in names:
             return "motion" if is_motion(path) else f"an archive of {', '.join(sorted(names)) or 'nothing'}"[:100]
         kind = storage.kind_of(path)
-        return {"scape": "model", "blendscape": "model", "skinning": "model", "completion": "completion"}.get(
-            kind, f"a file of kind '{kind}'")
+        return "model" if kind in KINDS else kind if kind == "completion" else f"a file of kind '{kind}'"
     suffix = path.suffix.lower()
     if suffix == ".bvh":
         return "motion"
@@ -46,7 +44,7 @@ def reported_model(path: Path) -> Path | None:
         name = str(settings["model"])
     except (storage.StorageError, AttributeError, KeyError, TypeError):
         return None
-    return Path(name.split(CACHED)[-1])
+    return Path(name.split("cached at ")[-1])          # after which stands the file of the synthetic people's model
 
 
 def worst_first(whole: RegisteredSet) -> list[tuple[str, str]]:

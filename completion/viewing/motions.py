@@ -43,14 +43,18 @@ def as_columns(motion: Motion, subject: Subject, frames: np.ndarray) -> tuple[np
     What the fast path adds up for a body lies in few columns, whatever it does. So the columns are those of some
     frames, and in all others the coefficients come from the fast path's own, without a vertex being made.
     """
-    made, _ = low_rank(frames.astype(np.float64))
-    even = np.full((made.shape[0], 1), made.shape[0] ** -0.5)              # moves all vertices alike
-    basis = np.linalg.qr(np.hstack([even, made]))[0]
+    basis = columns_of(frames.astype(np.float64))
     columns = subject.operator.combined(basis.T).astype(np.float64)
     place = (subject.origin + motion.trans)[:, None] * basis.sum(axis=0)[:, None]
     out = np.concatenate([columns.turned(motion.poses[i:i + AT_ONCE])
                           for i in range(0, len(motion.poses), AT_ONCE)])
     return basis, np.swapaxes(out, 1, 2) + place
+
+
+def columns_of(frames: np.ndarray) -> np.ndarray:
+    """Orthonormal columns (N, r) in which frames (n, N, 3) lie, the first moves all vertices alike."""
+    made, _ = low_rank(frames)
+    return np.linalg.qr(np.hstack([np.full((made.shape[0], 1), made.shape[0] ** -0.5), made]))[0]
 
 
 def with_markers(content: Content, motion: Motion, markers: MarkerSequence) -> Content:

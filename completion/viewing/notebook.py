@@ -1,7 +1,7 @@
 """Bodies that turn in a notebook, without a server and without a network."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -89,23 +89,14 @@ def view(*things: Any, over: bool = False, up: str | None = None) -> Viewed:
 
 def _contents(thing: Any, name: str) -> list[Content]:
     """What is seen of a thing; `name` is what tells it from others."""
-    if isinstance(thing, Mesh | np.ndarray):
-        return [of_mesh(name, thing)]
-    if isinstance(thing, BodyModel):
-        return [of_model(name, thing)]
-    if isinstance(thing, Subject):
-        return [of_subject(name, thing)]
-    if isinstance(thing, Statue):
-        return [of_statue(name, thing)]
-    if isinstance(thing, Completion):
-        return [of_completion(name, thing)]
-    if isinstance(thing, tuple) and [type(part) for part in thing] == [Motion, Subject]:
-        return [of_motion(name, *thing)]
-    if isinstance(thing, tuple) and len(thing) == 2 and isinstance(thing[0], SoftTissue) and isinstance(
-            thing[1], BodyModel):
-        return [of_soft_tissue(name, *thing)]
+    kinds: tuple[tuple[tuple[Any, ...], Callable[..., Content]], ...] = (
+        ((Mesh | np.ndarray,), of_mesh), ((BodyModel,), of_model), ((Subject,), of_subject), ((Statue,), of_statue),
+        ((Completion,), of_completion), ((Motion, Subject), of_motion), ((SoftTissue, BodyModel), of_soft_tissue))
+    parts = thing if isinstance(thing, tuple) else (thing,)
+    for kind, show in kinds:
+        if len(parts) == len(kind) and all(map(isinstance, parts, kind)):
+            return [show(name, *parts)]
     if isinstance(thing, str | Path):
         return [entry.load() for entry in Files((Path(thing),)).entries() if entry.first]
-    raise ValueError(f"things: expected meshes, points, models, subjects, completions, statues, (motion, subject), "
-                     f"(soft tissue, model) or files, "
-                     f"got {type(thing).__name__}")
+    raise ValueError("things: expected meshes, points, models, subjects, completions, statues, (motion, subject), "
+                     f"(soft tissue, model) or files, got {type(thing).__name__}")

@@ -104,23 +104,19 @@ class Inside:
         path = next((path for path in self.files.models if str(path) == model), None)
         if path is None and model:
             raise ValueError(f"model: expected one that is among the things, got {model}")
-        if ("complete", path) not in self.opened:
-            self.opened["complete", path] = self._complete_page(path, progress)
-        page = self.opened["complete", path]
-        assert isinstance(page, CompletePage)
+        page = self.opened.get(("complete", path))
+        if not isinstance(page, CompletePage):
+            if path is None:
+                from ..synthetic_people import synthetic_model
+
+                loaded, name = synthetic_model(progress), PEOPLE
+            else:
+                loaded, name = self.files.read_model(path), str(path)
+            body = loaded if loaded.n_betas else loaded.subject(None)
+            work = Work(body, name, marks_of_template(loaded, None, name), CompletionConfig(), self.files.unit)
+            page = self.opened["complete", path] = CompletePage(loaded, work, self.output, self.dropped)
         page.open(scan)
         return page
-
-    def _complete_page(self, path: Path | None, progress: Progress) -> CompletePage:
-        if path is None:
-            from ..synthetic_people import synthetic_model
-
-            model, name = synthetic_model(progress), PEOPLE
-        else:
-            model, name = self.files.read_model(path), str(path)
-        body = model if model.n_betas else model.subject(None)
-        work = Work(body, name, marks_of_template(model, None, name), CompletionConfig(), self.files.unit)
-        return CompletePage(model, work, self.output, self.dropped)
 
     @property
     def completions(self) -> list[CompletePage]:

@@ -1,6 +1,7 @@
 """Bodies and poses of the sliders as files, never over one that is there."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,33 +9,30 @@ import numpy as np
 from scanprep.geometry.files import name_of, write_mesh
 
 from ..motion import Motion
-from .controls import Controls, Shown
+from .controls import Controls
+from .movable import MovableBody
 
 
 def save_bodies(controls: Controls, folder: Path) -> list[Path]:
     """Every body that is shown as `NAME_body.ply`, made the exact way."""
-    written = []
-    for one in whole(controls):
-        path = free_name(folder / f"{name_of(one.name)}_body.ply")
-        write_mesh(path, one.body.mesh(controls.betas_of(one.body), controls.pose_of(one.body), controls.trans))
-        written.append(path)
-    return written
+    return _save(controls, folder, "body.ply", lambda path, body: write_mesh(
+        path, body.mesh(controls.betas_of(body), controls.pose_of(body), controls.trans)))
 
 
 def save_poses(controls: Controls, folder: Path) -> list[Path]:
     """Pose, place and shape of every body as `NAME_pose.npz`, a motion of one frame."""
+    return _save(controls, folder, "pose.npz", lambda path, body: Motion(
+        controls.pose_of(body)[None], controls.trans[None], controls.betas_of(body), 1.0, np.zeros((1, 0))).save(path))
+
+
+def _save(controls: Controls, folder: Path, ending: str, write: Callable[[Path, MovableBody], None]) -> list[Path]:
+    """A file of each body that lies below no other one."""
     written = []
-    for one in whole(controls):
-        path = free_name(folder / f"{name_of(one.name)}_pose.npz")
-        Motion(controls.pose_of(one.body)[None], controls.trans[None], controls.betas_of(one.body), 1.0,
-               np.zeros((1, 0))).save(path)
-        written.append(path)
+    for one in controls.shown:
+        if not any(one.body in other.body.layers[1:] for other in controls.shown):
+            written.append(free_name(folder / f"{name_of(one.name)}_{ending}"))
+            write(written[-1], one.body)
     return written
-
-
-def whole(controls: Controls) -> list[Shown]:
-    """The bodies without those that lie below one."""
-    return [one for one in controls.shown if not any(one.body in other.body.layers[1:] for other in controls.shown)]
 
 
 def free_name(path: Path) -> Path:

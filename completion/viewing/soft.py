@@ -1,7 +1,6 @@
 """Soft tissue in the browser: a motion in which the shape changes, beside the same body of fixed shape."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +9,13 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.pictures.colors import Heat
-from scanprep.pictures.low_rank import low_rank
-from scanprep.pictures.shading import Moving, Shape, Solid
+from scanprep.pictures.shading import Moving, Solid
 
 from ..mocap.files.markers import MarkerSequence
 from ..mocap.soft_tissue.soft_tissue import SoftTissue
 from ..motion import Motion
 from .contents import Content
-from .motions import AT_ONCE, MADE, of_motion, with_markers
+from .motions import AT_ONCE, MADE, columns_of, of_motion, with_markers
 
 SOFT = (0.55, 0.66, 0.80)
 LEAST = 0.003                        # standard deviations: a direction in which the shape changes less is left out
@@ -30,8 +28,9 @@ def of_soft_tissue(name: str, soft: SoftTissue, model: BodyModel) -> Content:
 
 def soft_tissue_of(path: Path, motion: Motion) -> SoftTissue | None:
     """What is stored in a motion's file of soft tissue, or lies beside a motion of as many frames; None without."""
-    for file in (path, path.with_name("soft_tissue.npz")):
-        if file.is_file() and (file == path or path.name == "motion.npz") and SoftTissue.is_in(file):
+    beside = [path.with_name("soft_tissue.npz")] if path.name == "motion.npz" else []
+    for file in (path, *beside):
+        if file.is_file() and SoftTissue.is_in(file):
             soft = SoftTissue.load(file)
             return soft if len(soft.changes) == len(motion.poses) else None
     return None
@@ -50,21 +49,14 @@ def with_soft_tissue(content: Content, soft: SoftTissue, model: BodyModel, marke
     shade = Heat(moved, 0.0, max(float(np.quantile(moved, 0.995)), 1e-3), "moved by soft tissue")
     body = Solid(model.template.with_vertices(frames[0]), SOFT, shades={"soft tissue": shade}, name="with soft tissue")
     changing = Moving(body, frames[:1].astype(np.float32), soft.motion.rate, (basis, coefficients))
-    content = replace(content, shapes=[*_without(content.shapes), changing])
+    # the body of fixed shape is hidden at first
+    fixed = [replace(shape, shape=replace(shape.shape, name="fixed shape", visible=False))
+             if isinstance(shape, Moving) and isinstance(shape.shape, Solid) else shape for shape in content.shapes]
+    content = replace(content, shapes=[*fixed, changing])
     if markers is None:
         return content
     note = f"{content.name}: markers are coloured by their distance from the body with soft tissue"
     return replace(with_markers(content, soft.motion, markers), notes=(*content.notes, note))
-
-
-def _without(shapes: Sequence[Shape | Moving]) -> list[Shape | Moving]:
-    """Shapes of which bodies are hidden and called by what they are."""
-    out: list[Shape | Moving] = []
-    for shape in shapes:
-        if isinstance(shape, Moving) and isinstance(shape.shape, Solid):
-            shape = replace(shape, shape=replace(shape.shape, name="fixed shape", visible=False))
-        out.append(shape)
-    return out
 
 
 def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,9 +65,7 @@ def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tupl
     As `as_columns` for a body of fixed shape: what the fast path adds up is linear in betas too, so every direction in
     which they change adds a product of its own. Skin that moves on the body adds its displacements.
     """
-    made, _ = low_rank(frames)
-    even = np.full((made.shape[0], 1), made.shape[0] ** -0.5)              # moves all vertices alike
-    basis = np.linalg.qr(np.hstack([even, made]))[0]
+    basis = columns_of(frames)
     own = soft.betas(0.0)[0]
     shares, sizes, directions = np.linalg.svd(soft.changes, full_matrices=False)
     shares = (shares * sizes)[:, sizes > LEAST * np.sqrt(len(soft.changes))]

@@ -9,8 +9,8 @@ from model.body import BodyModel
 from model.files import load_model
 from model.statue.control.model import FOLDED, HOLE, MEASURED, Statue
 from model.statue.detail.reconstruction import Reconstruction, coverage_at
-from model.statue.detail.subdivision import Subdivision, chart_places, subdivide
-from model.statue.files import ABOUT, CONTROL, body_model, load_statue
+from model.statue.detail.subdivision import chart_places, subdivide
+from model.statue.files import body_model, load_statue
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import part_colors
 from scanprep.pictures.shading import CLAY, Solid
@@ -20,8 +20,7 @@ from .contents import Content, Stance, sizes
 from .movable import MovableBody
 
 LEVEL = 3                            # of detail: 64 triangles for one of the control mesh; a move takes 1 to 4 ms
-BODY = "body.npz"
-GUESSED, FILLED = (0.93, 0.62, 0.12), (0.55, 0.66, 0.80)
+FILLED = (0.55, 0.66, 0.80)
 
 
 class MovableStatue(MovableBody):
@@ -71,20 +70,10 @@ def movable(model: BodyModel, statue: Statue | None) -> MovableBody:
     return MovableBody(model) if statue is None else MovableStatue(statue, model)
 
 
-def statue_folder(path: Path) -> Path:
-    """The folder of a statue of which a file is named; any other path as it is."""
-    return path.parent if path.name in (ABOUT, CONTROL) and (path.parent / ABOUT).is_file() else path
-
-
-def is_statue(folder: Path) -> bool:
-    """Whether a folder is one of `scape statue fit`."""
-    return (folder / ABOUT).is_file() and (folder / CONTROL).is_file()
-
-
 def read_statue(name: str, folder: Path) -> Content:
     """The statue of a folder, moved by the model beside it, which knows what poses people take."""
     statue = load_statue(folder)
-    model = load_model(folder / BODY) if (folder / BODY).is_file() else None
+    model = load_model(folder / "body.npz") if (folder / "body.npz").is_file() else None
     same = model is not None and np.array_equal(model.template.faces, statue.control.mesh.faces)
     return of_statue(name, statue, model if same else None)
 
@@ -94,8 +83,11 @@ def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Cont
     control = statue.control
     fine = subdivide(control.mesh, control.chart, LEVEL)
     mesh = Reconstruction(control, statue.map, fine).mesh()
-    shades = {"parts": part_colors(control.skeleton.part_of_face)[fine.face_parent],
-              "what was measured": _told(statue, fine)}
+    # measured, folded, or filled where the scan has a hole
+    kind = coverage_at(control, statue.map, fine.parent, fine.bary)
+    measured = np.array([CLAY, (0.93, 0.62, 0.12), FILLED])[
+        np.select([kind == MEASURED, kind == FOLDED, kind == HOLE], [0, 1, 2])]
+    shades = {"parts": part_colors(control.skeleton.part_of_face)[fine.face_parent], "what was measured": measured}
     if statue.texture is not None:
         colors = bilinear(statue.texture, chart_places(control.chart, fine.parent, fine.bary)) / 255
         mesh, shades = Mesh(mesh.vertices, mesh.faces, colors), {"plain": np.array(CLAY), **shades}
@@ -103,9 +95,3 @@ def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Cont
               Solid(control.mesh, FILLED, name="control mesh", visible=False)]
     return Content(name, shapes, Stance.of(mesh), f"{sizes(mesh)}, {len(control.skeleton.parents)} parts",
                    model=model or body_model(control), statue=statue)
-
-
-def _told(statue: Statue, fine: Subdivision) -> np.ndarray:
-    """(n, 3) colours: measured, folded, or filled where the scan has a hole."""
-    found = coverage_at(statue.control, statue.map, fine.parent, fine.bary)
-    return np.array([CLAY, GUESSED, FILLED])[np.select([found == MEASURED, found == FOLDED, found == HOLE], [0, 1, 2])]

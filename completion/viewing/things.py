@@ -4,6 +4,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from .contents import Content
 from .files import Entry, Files
@@ -11,6 +12,7 @@ from .movable import MovableBody
 from .statues import movable
 
 MOST = 12                            # that are shown at a time
+T = TypeVar("T")
 
 
 class Things:
@@ -67,23 +69,28 @@ class Things:
 
         What is known of things that stay is kept; those that were shown and have changed are shown again.
         """
-        before = [(one, vars(one).copy()) for one in (self, self.files)]
+        known = self.files.known
+        before = self.entries, self.problems, self.contents, self.bodies, self.about
         try:
-            self._join(self.files.with_another(self.entries, path))
+            # numbers of the entries that stay; those that are new, or changed while they were shown
+            entries = self.files.with_another(self.entries, path)
+            place = {i: entries.index(entry) for i, entry in enumerate(self.entries) if entry in entries}
+            fresh = [i for i in range(len(entries)) if i not in place.values()]
+            changed = {self.entries[i].path for i in self.shown if i not in place}
+            new = [i for i in fresh if entries[i].path in changed] or [i for i in fresh if entries[i].first] \
+                or fresh[:1]
+            self.problems, self.about = _renumbered(self.problems, place), _renumbered(self.about, place)
+            self.contents, self.bodies = _renumbered(self.contents, place), _renumbered(self.bodies, place)
+            self.entries = entries
+            read = self.read(sorted([*(place[i] for i in self.shown if i in place), *new][-MOST:]))
+            if not set(new) & set(read):
+                raise ValueError(self.problems[new[0]])
         except (ValueError, OSError):
-            for one, kept in before:
-                vars(one).update(kept)
+            self.files.known = known
+            self.entries, self.problems, self.contents, self.bodies, self.about = before
             raise
-
-    def _join(self, entries: list[Entry]) -> None:
-        place = {i: entries.index(entry) for i, entry in enumerate(self.entries) if entry in entries}
-        fresh = [i for i in range(len(entries)) if i not in place.values()]
-        for name in ("problems", "contents", "bodies", "about"):
-            setattr(self, name, {place[i]: one for i, one in getattr(self, name).items() if i in place})
-        changed = {self.entries[i].path for i in self.shown if i not in place}
-        new = [i for i in fresh if entries[i].path in changed] or [i for i in fresh if entries[i].first] or fresh[:1]
-        self.entries = entries
-        read = self.read(sorted([*(place[i] for i in self.shown if i in place), *new][-MOST:]))
-        if not set(new) & set(read):
-            raise ValueError(self.problems[new[0]])
         self.put(read)
+
+
+def _renumbered(known: dict[int, T], place: dict[int, int]) -> dict[int, T]:
+    return {place[i]: one for i, one in known.items() if i in place}

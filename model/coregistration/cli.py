@@ -14,7 +14,6 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import read_landmarks, shared_landmarks, write_landmarks
-from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
 from scanprep.pipeline.prepare import mesh_file
@@ -25,7 +24,6 @@ from ..cli import ModelArg
 from ..files import load_model
 from .config import CoregistrationConfig
 from .rounds import Coregistration, coregister, coregistration_doubts, coregistration_problem
-from .single import Landmarks
 
 FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "starts")
 
@@ -34,8 +32,7 @@ ScansArg = Annotated[Path, Place("SCANS")]
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
                      first: Path | None = None, subject: Annotated[str, Person] = "template", unit: Unit | None = None,
-                     config: CoregistrationConfig = CoregistrationConfig(), *, space: Workspace  # noqa: B008
-                     ) -> Outcome:
+                     config: CoregistrationConfig = CoregistrationConfig(), *, space: Workspace) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
 
     Writes a registered set with model.npz in it. Killed and started again it goes on where it was. Of a scan that has
@@ -59,8 +56,9 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     read, marks, kept, failures = [], [], [], []
     for task in tasks:
         try:
-            scan = read_scan(task.scan, unit)
-            marks.append(_landmarks(loaded, task.landmarks, scan, unit))
+            scan, known = read_scan(task.scan, unit), loaded.info.get("landmarks")
+            marks.append(shared_landmarks(task.landmarks, known, read_landmarks(task.landmarks, scan, unit))
+                         if task.landmarks and known else None)
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
             failures.append(text if str(task.scan) in text or str(task.landmarks) in text else f"{task.scan}: {text}")
@@ -70,7 +68,11 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     if not kept:
         raise ValueError(f"{scans}: none of {len(tasks)} scans can be read; the first: {failures[0]}")
     names = [task.name for task in kept]
-    starts = _starts(first, loaded, names)
+    # the earlier registrations of scans, where a set has them
+    earlier = None if first is None else RegisteredSet.load(first)
+    if earlier is not None and not np.array_equal(earlier.template.faces, loaded.template.faces):
+        raise ValueError(f"{first}: expected the triangles of the model ({loaded.template}), found {earlier.template}")
+    starts = [earlier.vertices([name])[0] if earlier is not None and name in earlier.names else None for name in names]
     with bar("co-registering") as progress:
         done = coregister(loaded, read, marks, config, starts, [task.subject for task in kept], progress, names, space)
     with space.staging("set") as staged:
@@ -107,19 +109,3 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
             Metric("scan explained, mean", 100 * float(np.mean([r.explained for r in found])), "%"),
             Metric("distance from the model, median RMS", 1e3 * float(np.median([r.apart for r in found])), "mm"),
             Metric("inverted triangles", sum(r.inverted for r in found))]
-
-
-def _landmarks(model: BodyModel, path: Path | None, scan: Mesh | np.ndarray, unit: Unit | None) -> Landmarks | None:
-    if path is None or not model.info.get("landmarks"):
-        return None
-    return shared_landmarks(path, model.info["landmarks"], read_landmarks(path, scan, unit))
-
-
-def _starts(first: Path | None, model: BodyModel, names: Sequence[str]) -> list[np.ndarray | None]:
-    """The earlier registrations of scans, where a set has them."""
-    if first is None:
-        return [None for _ in names]
-    earlier = RegisteredSet.load(first)
-    if not np.array_equal(earlier.template.faces, model.template.faces):
-        raise ValueError(f"{first}: expected the triangles of the model ({model.template}), found {earlier.template}")
-    return [earlier.vertices([name])[0] if name in earlier.names else None for name in names]

@@ -13,10 +13,10 @@ from ..learning.config import LearnConfig
 
 # the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
 NEAR = RegistrationConfig(graph=(
-    GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08),
-    GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06),
-    GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
-    GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
+    GraphStage(300, 0.09, 0.7, 0.01, 0.08),
+    GraphStage(300, 0.06, 0.7, 0.01, 0.06),
+    GraphStage(1000, 0.04, 0.35, 0.01, 0.05, detail=0.008),
+    GraphStage(1000, 0.025, 0.35, 0.01, 0.037, detail=0.008),
 ))
 
 
@@ -41,7 +41,7 @@ class CoregistrationConfig(Settings):
     workers : Workers
     """
 
-    fit: ScanFitConfig = field(default_factory=ScanFitConfig)
+    fit: ScanFitConfig = field(default_factory=lambda: ScanFitConfig(scan_sd=0.015))
     registration: RegistrationConfig = NEAR
     learn: LearnConfig = field(default_factory=LearnConfig)
     rounds: Annotated[Count, FLAG] = 3

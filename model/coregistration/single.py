@@ -109,8 +109,8 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     """
     config = config or CoregistrationConfig()
     tell = progress or (lambda done, total: None)
-    vertices, points = checked_pairs(body.template, *(landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))),
-                                     "landmarks", 0)
+    given: Landmarks = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+    vertices, points = checked_pairs(body.template, *given, "landmarks", 0)
     target = target_of(scan)
     # lengths of the search are those of a person: bodies of another size are searched for as large as one
     size = float(np.sqrt(body.template.face_areas.sum()))

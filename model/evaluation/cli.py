@@ -72,22 +72,15 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     with bar("drawing the page") as progress:
         page = evaluation_page(model.stem, loaded, found, [m for m in metrics if m.name != "note"], notes, progress)
     page.write(output / "report.html")
+    measured = [(poses_found.errors, posed)] if poses_found is not None else []
+    measured += [(shapes_found.errors[-1], people)] if shapes_found is not None else []
+    problems = [errors_problem(errors, bodies, loaded) for errors, bodies in measured if bodies is not None]
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
                                      "train_shapes": train_shapes, "subject": subject},
-                   judgement=Judgement.of(_problems(loaded, found)))
+                   judgement=Judgement.of(filter(None, problems)))
 
 
-def _problems(model: BodyModel, found: Findings) -> list[str]:
-    told = []
-    if found.poses is not None and found.pose_bodies is not None:
-        told.append(errors_problem(found.poses.errors, found.pose_bodies, model))
-    if found.shapes is not None and found.shape_bodies is not None:
-        told.append(errors_problem(found.shapes.errors[-1], found.shape_bodies, model))
-    return [problem for problem in told if problem]
-
-
-def sample(model: ModelArg, output: Output,
-           count: Annotated[Count, Alias("-n")] = 9, seed: Seed = 0,
+def sample(model: ModelArg, output: Output, count: Annotated[Count, Alias("-n")] = 9, seed: Seed = 0,
            pose_too: bool = False) -> Outcome:
     """Write random bodies of a model, a sheet of their pictures, and their betas and poses.
 

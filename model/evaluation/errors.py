@@ -4,18 +4,17 @@ Every figure is made through the contract of `BodyModel` alone, so that kinds of
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from scanprep.judgement import HAND, extent, size, unit_problem
 
-from ..body import BodyModel
+from ..body import BodyModel, Progress
+from ..digests import checked_bodies
 from ..fitting.vertices import FitConfig, PoseFit, PoseFitter, ShapeFit, ShapeFitter
 from ..linear import Subject
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +106,7 @@ def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = 
     ValueError
         Bodies of another count of vertices or not finite.
     """
-    bodies = checked_bodies(model, bodies, "bodies")
+    bodies = checked_bodies(model.template, bodies, "bodies")
     subject = subject or model.subject()
     fitter, fits = PoseFitter(subject, config), list[PoseFit]()
     for body in bodies:
@@ -142,7 +141,7 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
     ValueError
         People of another count of vertices or not finite, a count below 1, a model without shape components.
     """
-    people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)
+    people, wanted = checked_bodies(model.template, people, "people"), checked_counts(model, counts)
     largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))
     fitters = [largest.first(count) for count in wanted]
     held, fits = [], list[list[ShapeFit]]()
@@ -160,7 +159,8 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
 
     return ShapeErrors(
         np.array(wanted), errors([f.vertices for f in row] for row in by_count), errors(zip(*held, strict=True)),
-        None if train is None else errors(_by_components(checked_bodies(model, train, "train"), people, wanted)),
+        None if train is None else errors(_by_components(checked_bodies(model.template, train, "train"), people,
+                                                         wanted)),
         *(np.array([[getattr(f, name) for f in row] for row in by_count])
           for name in ("betas", "pose", "trans", "converged")))
 
@@ -218,16 +218,6 @@ def checked_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:
     if not model.n_betas:
         raise ValueError("model: expected one with shape components, this one has none")
     return sorted({min(int(count), model.n_betas) for count in counts})
-
-
-def checked_bodies(model: BodyModel, bodies: np.ndarray, name: str) -> np.ndarray:
-    """At least one finite body (n, N, 3) in the topology of the model, or ValueError."""
-    bodies, N = np.asarray(bodies, dtype=np.float64), len(model.template.vertices)
-    if bodies.ndim != 3 or bodies.shape[1:] != (N, 3) or not len(bodies):
-        raise ValueError(f"{name}: expected shape (n, {N}, 3) like the template, got {bodies.shape}")
-    if not np.isfinite(bodies).all():
-        raise ValueError(f"{name}: expected finite numbers")
-    return bodies
 
 
 def errors_problem(errors: Errors, bodies: np.ndarray, model: BodyModel) -> str | None:

@@ -47,9 +47,8 @@ def evaluation_page(name: str, model: BodyModel, found: Findings, metrics: Seque
     for note in notes:
         page.text(f"Note: {note}.")
     page.figures(metrics)
-    sections = [_pose_section if found.poses else None, _shape_section if found.shapes else None,
-                _space_section if model.n_betas else None]
-    wanted = [s for s in sections if s]
+    wanted = [section for section, there in ((_pose_section, found.poses), (_shape_section, found.shapes),
+                                             (_space_section, model.n_betas)) if there]
     for i, section in enumerate(wanted):
         section(page, model, found)
         if tell:
@@ -68,14 +67,26 @@ def _pose_section(page: Page, model: BodyModel, found: Findings) -> None:
                 "where the error lies: mean of all bodies, shown on the body at rest")
     page.bodies(extreme_panes(model, poses.errors, names, bodies, lambda i: poses.vertices(model, i), poses.poses),
                 "the best and the worst body: as given, then the fitted body coloured by its error")
-    page.table(_part_rows(model, poses.errors, names), ("part", "mean (mm)", "worst body (mm)", "which"))
+    parts = poses.errors.by_part
+    page.table([(model.skeleton.names[p], MM * float(parts[:, p].mean()), MM * float(parts[:, p].max()),
+                 names[int(parts[:, p].argmax())]) for p in np.argsort(-parts.mean(axis=0))],
+               ("part", "mean (mm)", "worst body (mm)", "which"))
 
 
 def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
     shapes, bodies, names = found.shapes, found.shape_bodies, found.shape_names
     assert shapes is not None and bodies is not None
     page.section("People", "Of every person shape, pose and place were fitted, with more and more components.")
-    page.chart(chart_generalisation(shapes), "mean over people and vertices")
+    figure, axes = _figure(7.0, 3.0)
+    axes.plot(shapes.counts, [MM * e.overall for e in shapes.errors], "o-", label="shape, pose and place fitted")
+    axes.plot(shapes.counts, [MM * e.overall for e in shapes.pose_held], "s--", color="0.45",
+              label="pose held at the parts' own rotations")
+    if shapes.vertex_pca is not None:
+        axes.plot(shapes.counts, [MM * e.overall for e in shapes.vertex_pca], "^:", color="C1",
+                  label="plain PCA of vertices")
+    axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
+    axes.legend(frameon=False)
+    page.chart(figure, "mean over people and vertices")
     page.table(generalisation_rows(shapes), ("components", "fitted (mm)", "95th percentile (mm)", "worst vertex (mm)",
                                              "pose held (mm)", "vertex PCA (mm)"))
     last, count = shapes.errors[-1], int(shapes.counts[-1])
@@ -90,21 +101,28 @@ def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
 def _space_section(page: Page, model: BodyModel, found: Findings) -> None:
     page.section("Space of shapes", "How much of the training people's variance the components explain, and what "
                  "they do.")
-    page.chart(chart_compactness(model), "compactness")
+    figure, axes = _figure(7.0, 2.6)
+    explained = compactness(model)
+    axes.plot(np.arange(len(explained) + 1), 100 * np.concatenate([[0], explained]), "-")
+    axes.set(xlabel="shape components", ylabel="variance explained (%)", ylim=(0, 100), xlim=(0, len(explained)))
+    page.chart(figure, "compactness")
     page.bodies(component_panes(model), "the mean person, then the first components", 260)
     if found.specificity is not None:
         page.text("Specificity: random bodies of the model against the nearest training person. Small is good, as "
                   "long as it is not far below the distance between people themselves. The people were brought to "
                   "rest: each was fitted with all components, and what the fit leaves was turned back with the parts.")
-        page.chart(chart_specificity(found.specificity), "mean vertex distance to the nearest training person")
+        figure, axes = _figure(7.0, 2.6)
+        far, counts = MM * found.specificity.distances, found.specificity.counts
+        axes.fill_between(counts, *np.percentile(far, [10, 90], axis=1), alpha=0.25, linewidth=0,
+                          label="10th to 90th percentile")
+        axes.plot(counts, far.mean(axis=1), "o-", label="mean")
+        axes.axhline(MM * found.specificity.between_people, color="0.45", linestyle="--", linewidth=1,
+                     label="training people to their nearest other")
+        axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
+        axes.legend(frameon=False)
+        page.chart(figure, "mean vertex distance to the nearest training person")
     if found.samples is not None:
         page.bodies(sample_panes(model, found.samples)[:MOST], "random bodies", 220)
-
-
-def _part_rows(model: BodyModel, errors: Errors, names: Sequence[str]) -> list[tuple[str, float, float, str]]:
-    order = np.argsort(-errors.by_part.mean(axis=0))
-    return [(model.skeleton.names[p], MM * float(errors.by_part[:, p].mean()), MM * float(errors.by_part[:, p].max()),
-             names[int(errors.by_part[:, p].argmax())]) for p in order]
 
 
 def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float, float]]:
@@ -182,38 +200,4 @@ def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
     return figure
 
 
-def chart_generalisation(shapes: ShapeErrors) -> Any:
-    """A matplotlib figure: error over the number of components, with what it is compared to."""
-    figure, axes = _figure(7.0, 3.0)
-    axes.plot(shapes.counts, [MM * e.overall for e in shapes.errors], "o-", label="shape, pose and place fitted")
-    axes.plot(shapes.counts, [MM * e.overall for e in shapes.pose_held], "s--", color="0.45",
-              label="pose held at the parts' own rotations")
-    if shapes.vertex_pca is not None:
-        axes.plot(shapes.counts, [MM * e.overall for e in shapes.vertex_pca], "^:", color="C1",
-                  label="plain PCA of vertices")
-    axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
-    axes.legend(frameon=False)
-    return figure
 
-
-def chart_compactness(model: BodyModel) -> Any:
-    """A matplotlib figure: variance explained over the number of components."""
-    figure, axes = _figure(7.0, 2.6)
-    explained = compactness(model)
-    axes.plot(np.arange(len(explained) + 1), 100 * np.concatenate([[0], explained]), "-")
-    axes.set(xlabel="shape components", ylabel="variance explained (%)", ylim=(0, 100), xlim=(0, len(explained)))
-    return figure
-
-
-def chart_specificity(found: Specificity) -> Any:
-    """A matplotlib figure: distance of random bodies to the nearest person, over the number of components."""
-    figure, axes = _figure(7.0, 2.6)
-    far = MM * found.distances
-    axes.fill_between(found.counts, *np.percentile(far, [10, 90], axis=1), alpha=0.25, linewidth=0,
-                      label="10th to 90th percentile")
-    axes.plot(found.counts, far.mean(axis=1), "o-", label="mean")
-    axes.axhline(MM * found.between_people, color="0.45", linestyle="--", linewidth=1,
-                 label="training people to their nearest other")
-    axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
-    axes.legend(frameon=False)
-    return figure

@@ -1,18 +1,17 @@
 """Random bodies of a model, and how far they are from real people."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from model.priors import sample_poses
 
-from ..body import BodyModel
+from ..body import BodyModel, Progress
+from ..digests import checked_bodies
 from ..fitting.vertices import FitConfig, ShapeFitter
-from .errors import checked_bodies, checked_counts
-
-Progress = Callable[[int, int], None]
+from .errors import checked_counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +103,7 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
         Fewer than two people, a count below 1, a model without shape components.
     """
     rng = rng or np.random.default_rng(0)
-    people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)
+    people, wanted = checked_bodies(model.template, people, "people"), checked_counts(model, counts)
     if count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")
     if len(people) < 2:

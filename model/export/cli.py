@@ -1,7 +1,7 @@
 """`scape model export`: a model in the files of other programs."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,6 @@ from .conventions import for_programs, standing
 from .correctives import motion_correctives, off_exact, pose_features, write_body_npz
 from .glb import write_skinned_glb
 from .names import Names, names_of
-from .usd import USD, write_points_usd, write_skinned_usd
 
 MEASURED = 40                        # poses in which the files are compared with the exact model
 def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
@@ -45,17 +44,16 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     OUT.glb: a body that hangs on joints, with two morph targets for each beta, and its motion. OUT.bvh: the skeleton
     and its motion. OUT.npz: the whole model as linear blend skinning under the usual array names; with --motion of a
     model of the SMPL family, that motion as AMASS has it. OUT.ply, .obj, .stl, .off: the mesh at rest. A folder: the
-    exact mesh of every frame of the motion. OUT.usd, .usda, .usdc, .usdz: as GLB, in UsdSkel. OUT.points.usd: the exact
-    mesh of every frame in one file.
+    exact mesh of every frame of the motion.
 
-    GLB, USD, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from
-    the model's own. In GLB and USD further morph targets bring a motion to it.
+    GLB, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from the
+    model's own. In GLB further morph targets bring a motion to it.
 
     Example: scape model export model.npz --motion walk/motion.npz --root pelvis --names mixamo --ground -o walk.glb
 
     Args:
         model: Model file.
-        output: File or folder to write: .glb, .usd, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
+        output: File or folder to write: .glb, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
         betas: Shape in standard deviations, the first of them; else that of the motion, else the mean person.
         own_body: The template's own body.
         motion: Motion file of scape animate (.npz), or BVH or AMASS, which is brought onto the body.
@@ -64,15 +62,19 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
         correctives: Further morph targets by which the motion comes nearer to the exact one; as many as bring it within
             half a millimetre, at most 48; 0 for plain skinning.
         unit: Of the lengths in a BVH file; cm.
-        up: Axis of the model that points up, which GLB, USD and BVH turn to y; else that of the largest extent.
+        up: Axis of the model that points up, which GLB and BVH turn to y; else that of the largest extent.
         root: Part that the skeleton hangs on, as pelvis.
         names: Whose names the bones of a person have: mixamo, vrm, h-anim or opensim.
         ground: Soles on height 0, of the body and of the lowest frame.
-        front: Face to the viewer: +z in GLB, USD and BVH, -y of a mesh with z up.
+        front: Face to the viewer: +z in GLB and BVH, -y of a mesh with z up.
         fps: Frames a second of the motion, such as 24 or 30; else as many as its file has.
         rate: Frames a second of the motion's file, where it does not say or says it wrongly.
     """
-    writer = _writer(output)
+    # how the output is written, and whether all that was asked for says something about it
+    ending = max((ending for ending in WRITERS if output.name.lower().endswith(ending)), key=len)
+    if not ending and name_of(output) != output.name and not output.is_dir():
+        raise ValueError(f"{output}: expected a name ending in {', '.join(filter(None, WRITERS))}, or a folder")
+    writer = WRITERS[ending]
     given = {"betas": betas, "own_body": own_body, "motion": motion, "morphs": shapes,
              "correctives": correctives is not None, "unit": unit, "up": up is not None, "root": root, "names": names,
              "ground": ground, "front": front, "fps": fps, "rate": rate}
@@ -80,16 +82,21 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if wrong:
         hint = "; name a folder for the meshes of a motion" if (writer.kind, wrong[0]) == ("mesh", "motion") else ""
         raise UsageError(f"--{wrong[0].replace('_', '-')}: it says nothing about a {writer.kind}{hint}")
+    # the motion, and the betas of the body that is asked for; None is the template's own
     loaded = load_model(model)
-    judgement = person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement()
     chosen = loaded.subject(np.array(betas) if betas else None) if betas or own_body else None
     moves = None if motion is None else read_motion(motion, loaded, chosen, rate=rate)
     if moves is not None and fps is not None:
         moves = moves.at_rate(fps)
-    person = _person(model, loaded, betas, own_body, moves) if "betas" in writer.takes else None
+    if own_body and betas:
+        raise UsageError("--own-body: the template's own body has no betas")
+    person = np.array(betas) if betas else None if own_body else moves.betas if moves is not None else np.zeros(1)
+    if person is not None and not loaded.n_betas and "betas" in writer.takes:
+        raise ValueError(f"{model}: it has no shape components; ask for --own-body")
     order = Order(output, model, loaded, person, moves, shapes, correctives, unit or "cm",
                   None if up is None else "xyz".index(up), root, names, ground, front)
-    return Outcome(output, writer.write(order), judgement=judgement)
+    return Outcome(output, writer.write(order),
+                   judgement=person_judgement(loaded, np.array(betas), ASKED) if betas else Judgement())
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,18 +137,6 @@ def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans:
     return paths
 
 
-def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bool, moves: BodyMotion | None
-            ) -> np.ndarray | None:
-    """Betas of the body that is asked for; None is the template's own."""
-    if own_body and betas:
-        raise UsageError("--own-body: the template's own body has no betas")
-    if own_body or (moves is not None and moves.betas is None and not betas):
-        return None
-    if not model.n_betas:
-        raise ValueError(f"{path}: it has no shape components; ask for --own-body")
-    return np.array(betas) if betas else moves.betas if moves is not None else np.zeros(1)
-
-
 def _mesh(order: Order) -> list[Metric]:
     """The body at rest."""
     model = order.model
@@ -153,9 +148,15 @@ def _mesh(order: Order) -> list[Metric]:
 
 def _npz(order: Order) -> list[Metric]:
     """The model as linear blend skinning; with a motion, that motion as AMASS has it."""
-    if order.moves is not None:
-        return _amass(order, order.moves)
-    model = order.model
+    model, moves = order.model, order.moves
+    if moves is not None:
+        family = str(model.info.get("family") or "")
+        if not family:
+            raise ValueError(f"{order.path}: a motion under the names of AMASS is one of an imported model of the SMPL "
+                             f"family (scape model import); write {order.output.stem}.bvh, .glb or a folder")
+        write_amass(order.output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
+        return [_size(order.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
+                Metric("surface_model_type", family)]
     arrays = write_body_npz(order.output, model)
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean)
@@ -171,16 +172,6 @@ def _npz(order: Order) -> list[Metric]:
                         np.linalg.norm(rig.vertices(poses, changes=changes) - exact, axis=-1))]
 
 
-def _amass(order: Order, moves: BodyMotion) -> list[Metric]:
-    family = str(order.model.info.get("family") or "")
-    if not family:
-        raise ValueError(f"{order.path}: a motion under the names of AMASS is one of an imported model of the SMPL "
-                         f"family (scape model import); write {order.output.stem}.bvh, .glb or a folder")
-    write_amass(order.output, moves.poses, moves.trans, moves.betas, moves.rate, moves.gender, family)
-    return [_size(order.output), Metric("frames", len(moves.poses)), Metric("rate", moves.rate, "1/s"),
-            Metric("surface_model_type", family)]
-
-
 def _folder(order: Order) -> list[Metric]:
     """The exact mesh of every frame, in a file of its own."""
     subject, moves = order.model.subject(order.person), order.motion("a folder of meshes")
@@ -188,22 +179,6 @@ def _folder(order: Order) -> list[Metric]:
         paths = write_frames(order.output, subject, moves.poses, moves.trans, progress=progress)
     return [Metric("meshes", len(paths)), *moves.told, Metric("rate", moves.rate, "1/s"),
             Metric("size", sum(p.stat().st_size for p in paths) / 1e6, "MB")]
-
-
-def _points(order: Order) -> list[Metric]:
-    """The exact mesh of every frame, in one file."""
-    subject, moves = order.model.subject(order.person), order.motion("the points of its frames")
-    count = len(moves.poses)
-    rest = order.model.template.with_vertices(subject.vertices(np.zeros_like(moves.poses[0])))
-    axis = upright(rest)[0] if order.up is None else order.up
-    with bar("writing meshes") as progress:
-        def frames() -> Iterator[np.ndarray]:
-            for t in range(count):
-                yield subject.vertices(moves.poses[t], moves.trans[t])
-                progress(t + 1, count)
-
-        write_points_usd(order.output, rest, frames(), count, moves.rate, axis)
-    return [_size(order.output), Metric("frames", count), Metric("rate", moves.rate, "1/s"), Metric("up", "xyz"[axis])]
 
 
 def _bvh(order: Order) -> list[Metric]:
@@ -288,16 +263,6 @@ WRITERS = {
     ".glb": Writer("glb", _BONES | {"morphs", "correctives"}, partial(_skin, write=write_skinned_glb)),
     ".bvh": Writer("bvh", _BONES | {"unit"}, _bvh),
     ".npz": Writer("npz", {"motion", "fps", "rate"}, _npz),
-    **dict.fromkeys(USD, Writer("usd", _BONES | {"morphs", "correctives"}, partial(_skin, write=write_skinned_usd))),
-    **{f".points{ending}": Writer("point cache", _MOVES | {"up"}, _points) for ending in USD},
     **dict.fromkeys((".obj", ".ply", ".stl", ".off", ".ply.gz"), Writer("mesh", _PLACED, _mesh)),
     "": Writer("folder", _MOVES, _folder),
 }
-
-
-def _writer(output: Path) -> Writer:
-    name = output.name.lower()
-    ending = max((ending for ending in WRITERS if name.endswith(ending)), key=len)
-    if not ending and name_of(output) != output.name and not output.is_dir():
-        raise ValueError(f"{output}: expected a name ending in {', '.join(filter(None, WRITERS))}, or a folder")
-    return WRITERS[ending]

@@ -15,13 +15,12 @@ from .bvh import part_ends
 from .names import Names, renamed
 
 FRAMES = 200                         # of a motion, in which its lowest point is looked for
-_SOME = 20                           # of them at a time
 
 
 def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: str | None = None,
                  names: Names | None = None, ground: bool = False, front: bool = False
                  ) -> tuple[Rig, np.ndarray, np.ndarray]:
-    """The same body and motion as animation programs expect them; what GLB, BVH and USD files are written from.
+    """The same body and motion as animation programs expect them; what GLB and BVH files are written from.
 
     The surface moves as before, but for `ground` and `front`, which place the whole anew. Bones get axes along the
     limbs (`aimed`).
@@ -90,8 +89,9 @@ def placed(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool
     shift = step = -rig.mesh.vertices[:, up].min() * vertical
     if len(poses):
         chosen = spread_indices(len(poses), FRAMES)
+        # twenty bodies are held at a time
         step = -min(float(rig.vertices(poses[some], trans[some])[..., up].min())
-                    for some in np.array_split(chosen, -(-len(chosen) // _SOME))) * vertical
+                    for some in np.array_split(chosen, -(-len(chosen) // 20))) * vertical
     return carried(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
 
 

@@ -17,17 +17,13 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import save_arrays
 
 from ..body import BodyModel
-from ..features import RotationLift
 from ..linear import Subject
 from ..rig import Correctives, Rig, make_rig
-from ..skinning import SkinningModel
 
 AT_ONCE = 256                        # frames that are held at a time, of a few points
 SEEN = 100                           # frames whose whole bodies say what is lacking: 200 say the same to 0.02 mm
 POINTS = 600                         # that tell the weights of a frame; all 12,500 tell the same to 0.02 mm
 NEAR = 5e-4                          # metres, root mean square: where no number is asked for, correctives end here
-MOST = 48                            # of them: 2 s of kicks and punches need 11, 15 s need 37
-
 
 
 def rest_corrections(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarray:
@@ -104,7 +100,8 @@ def _directions(lacking: np.ndarray, count: int | None) -> tuple[np.ndarray, np.
     order = np.argsort(-power)
     power = np.maximum(power[order], 0)
     left = np.sqrt(np.maximum(power.sum() - np.cumsum(np.r_[0, power]), 0) / lacking[..., 0].size)
-    wanted = min(int(np.argmax(left <= NEAR)), MOST - 1) if count is None else count - 1
+    # at most 48 correctives: 2 s of kicks and punches need 11, 15 s need 37
+    wanted = min(int(np.argmax(left <= NEAR)), 48 - 1) if count is None else count - 1
     kept = order[:wanted][power[:wanted] > 1e-12 * max(float((lacking**2).sum()), 1e-12)]
     basis = modes[:, kept].T @ changes
     basis /= np.linalg.norm(basis, axis=1, keepdims=True)
@@ -142,8 +139,8 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
         "shapedirs": np.moveaxis(rig.shapes, 0, -1).astype(np.float32),
         "part_names": np.array(model.skeleton.names, dtype=str), "betas_unit": np.array("standard deviation"),
         "length_unit": np.array("metre")}
-    if isinstance(model, SkinningModel) and model.features.lift.kind == RotationLift.kind and len(model.correctives):
-        arrays["posedirs"] = np.moveaxis(model.correctives, 0, -1)
+    if model.pose_directions is not None:
+        arrays["posedirs"] = model.pose_directions
     elif draws and J > 1:
         poses = sample_poses(model, draws, np.random.default_rng(0))
         arrays["posedirs"] = pose_directions(rig, poses, model.subject(mean).vertices(poses)).astype(np.float32)

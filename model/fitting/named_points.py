@@ -1,12 +1,13 @@
 """Where a search begins that has nothing but a few named points."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
 from scanprep.geometry import rotations
-from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
+from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, normal_equations
 
 from ..priors import GaussianPrior, typical_poses
 from . import energy
@@ -24,7 +25,7 @@ def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prio
     Returns (n, P), unknowns of every start, best first; betas stay zero; (n,), their energies.
     """
     poses = typical_poses(body.pose_mean, body.pose_covariance, axes)
-    x = np.concatenate([_placed(body, follow, targets, pose) for pose in poses])
+    x = lay_on_points(body, lambda x: follow(x).positions, poses, targets)
     weights = np.full(len(targets), sd**-2)
     still = np.zeros(x.shape[1])
     still[body.n_angles + 3:] = 1e6
@@ -33,11 +34,39 @@ def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prio
         return normal_equations([energy.point_to_point(follow(x), targets, weights), energy.pose_prior(x, prior, stiff),
                                  energy.stay_near(x, 0 * x, still)])
 
-    for stiff in ANNEALING:
-        end = levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3)
-        x = end.x
+    end = anneal(lambda x, stiff: levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3), x)
     order = np.argsort(end.energy)
-    return x[order], end.energy[order]
+    return end.x[order], end.energy[order]
+
+
+def anneal(solve: Callable[[np.ndarray, float], Minimum[np.ndarray]], x: np.ndarray) -> Minimum[np.ndarray]:
+    """The end of solves, each from the end of the last, first near the usual poses, then free.
+
+    `solve` takes unknowns (n, P) and the weight of the pose prior.
+    """
+    for stiff in ANNEALING:
+        end = solve(x, stiff)
+        x = end.x
+    return end
+
+
+def lay_on_points(body: FixedBody, positions: Callable[[np.ndarray], np.ndarray], poses: np.ndarray, targets: np.ndarray
+                  ) -> np.ndarray:
+    """Unknowns (4 n, P) of poses (n, J, 3) laid on the targets, and turned by quarters about their long axis.
+
+    `positions` of unknowns (B, P) are points (B, L, 3), whose targets (L, 3), metres, are NaN where there is none.
+    """
+    there = ~np.isnan(targets).any(axis=1)
+    goal = targets[there]
+    centre = goal.mean(axis=0)
+    rest = positions(body.join(poses, np.zeros((len(poses), 3))))[:, there]
+    R, _ = rotations.procrustes(rest, np.broadcast_to(goal, rest.shape))
+    quarters = rotations.exp(np.arange(4)[:, None] * np.pi / 2 * np.linalg.svd(goal - centre)[2][0])
+    turned = np.repeat(poses, 4, axis=0)
+    turned[:, 0] = rotations.log(quarters @ (R @ rotations.exp(poses[:, 0]))[:, None]).reshape(-1, 3)
+    x = body.join(turned, np.zeros((len(turned), 3)))
+    x[:, body.n_angles:body.n_angles + 3] = centre - positions(x)[:, there].mean(axis=1)
+    return x
 
 
 def distinct(places: np.ndarray, count: int, apart: float = 0.02) -> list[int]:
@@ -49,22 +78,3 @@ def distinct(places: np.ndarray, count: int, apart: float = 0.02) -> list[int]:
         if (np.linalg.norm(place - places[kept], axis=2).mean(axis=1) > apart).all():
             kept.append(i)
     return kept
-
-
-def _placed(body: FixedBody, follow: Follow, targets: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Unknowns (4, P) of a pose laid on the targets, and turned by quarters about their long axis."""
-    there = ~np.isnan(targets).any(axis=1)
-    goal = targets[there]
-    centre = goal.mean(axis=0)
-
-    def here(placed: np.ndarray) -> np.ndarray:
-        return follow(body.join(placed, np.zeros(3))[None]).positions[0, there]
-
-    axis = np.linalg.svd(goal - centre)[2][0]
-    R, _ = rotations.procrustes(here(pose), goal)
-    out = []
-    for quarter in range(4):
-        placed = pose.copy()
-        placed[0] = rotations.log(rotations.exp(quarter * np.pi / 2 * axis) @ R @ rotations.exp(pose[0]))
-        out.append(body.join(placed, centre - here(placed).mean(axis=0)))
-    return np.array(out)

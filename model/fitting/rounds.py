@@ -3,10 +3,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from scanprep.geometry.least_squares import levenberg_marquardt
+from scanprep.geometry.least_squares import Deferred, levenberg_marquardt
 
 from .energy import shape_prior
 from .pull import Pull
@@ -75,7 +76,11 @@ def meet_vertices(fit: ScanFit, x: np.ndarray, vertices: np.ndarray, weights: np
     for _ in range(ALIGNINGS):
         points, at = fit.body.gathered(np.concatenate([fit.vertices, ids]), x)
         pull = Pull(points, at, targets, np.zeros_like(targets), to_point, np.zeros(len(targets)))
-        matched = Matched(pull, len(fit.vertices), len(ids), fit.prior_terms)
-        x = levenberg_marquardt(lambda at, m=matched: m.equations(at, shape_prior(at, fit.body.n_angles + 3)),
-                                x[None], 3, 1e-5).x[0]
+        x = levenberg_marquardt(partial(_equations, Matched(pull, len(fit.vertices), len(ids), fit.prior_terms),
+                                        fit.body.n_angles + 3), x[None], 3, 1e-5).x[0]
     return x
+
+
+def _equations(matched: Matched, first_beta: int, x: np.ndarray) -> Deferred:
+    """Those of matches, and of the prior of the betas, at unknowns (1, P)."""
+    return matched.equations(x, shape_prior(x, first_beta))

@@ -2,16 +2,15 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from scanprep.arguments import UsageError
 from scanprep.batch.opening import FileWorkspace
-from scanprep.batch.room import Step, T, inside
+from scanprep.batch.room import Step, inside
 from scanprep.batch.workspace import KeptSteps
 from scanprep.cli import Output, Person, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar, details
@@ -41,7 +40,7 @@ Kind = Literal["scape", "blendscape", "skinning", "mixed"]
 def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
           skeleton: Path | None = None, landmarks: Path | None = None, subject: Annotated[str | None, Person] = None,
           unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", by_sex: bool = False,
-          scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX,  # noqa: B008
+          scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX,
           *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
 
@@ -75,45 +74,50 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         raise UsageError("--by-sex: it needs --shapes and the kind scape")
     if kind not in ("scape", "blendscape") and scape == LearnConfig.published():
         raise UsageError(f"--kind {kind}: the paper of --preset published has SCAPE alone")
-    body, posed = read_poses(poses, template, subject, unit) if kind != "mixed" else _read_mix(poses)
+    # what is learned from, and what the model is to know besides
+    if kind == "mixed":
+        if not (poses / "set.json").exists():
+            raise ValueError(f"{poses}: expected a registered set, which says whose mesh each is, found a plain folder")
+        whole = RegisteredSet.load(poses)
+        body, posed, who = whole.template, whole.vertices(), [one.subject or one.name for one in whole.entries]
+    else:
+        (body, posed), who = read_poses(poses, template, subject, unit), []
     people = None if shapes is None else read_bodies(shapes, body, unit)[0]
-    known = None if not by_sex or shapes is None else _read_sexes(shapes)
+    sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
     tree = None if parts is not None else _read_skeleton(skeleton, poses, body)
-    marks = _read_marks(landmarks, poses, body)
-    kept_steps, seconds = KeptSteps(space), dict[str, float]()
-    step = _timed(kept_steps, seconds)
+    marks = landmarks or poses / "landmarks.json"
+    named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
+    # the parts, where none are given, and the model
+    step = KeptSteps(space)
     if tree is None:
         if kind == "mixed":
             raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
         with bar("finding the skeleton") as progress:
             tree = step("skeleton", (body, posed, parts), lambda: _find_skeleton(body, posed, parts, step, progress))
     with bar("learning the model") as progress:
-        models: dict[str, BodyModel]
-        if kind == "mixed":
-            who = [entry.subject or entry.name for entry in RegisteredSet.load(poses).entries]
-            models = {"neutral": learn_scape_mix(body, posed, who, tree, mixed, progress, step)}
-        elif known is not None:
-            assert people is not None
-            models = {**learn_by_sex(body, posed, people, known, tree, scape, progress, step)}
-        elif kind == "blendscape":
-            models = {"neutral": learn_blendscape(body, posed, people, tree, scape, progress, step)}
-        elif kind == "skinning":
-            models = {"neutral": learn_skinning(body, posed, people, tree, skinning, progress, step)}
-        else:
-            models = {"neutral": learn_scape(body, posed, people, tree, scape, progress, step)}
+        more = progress, step
+        models: Mapping[str, BodyModel] = (
+            {"neutral": learn_scape_mix(body, posed, who, tree, mixed, *more)} if kind == "mixed" else
+            learn_by_sex(body, posed, people, sexes, tree, scape, *more) if people is not None and sexes else
+            {"neutral": learn_blendscape(body, posed, people, tree, scape, *more)} if kind == "blendscape" else
+            {"neutral": learn_skinning(body, posed, people, tree, skinning, *more)} if kind == "skinning" else
+            {"neutral": learn_scape(body, posed, people, tree, scape, *more)})
     for name, model in models.items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
-        kept = dataclasses.replace(model, info={**model.info, "landmarks": marks})     # type: ignore[type-var]
+        kept = dataclasses.replace(model, info={**model.info, "landmarks": named})     # type: ignore[type-var]
         kept.save(path)
         _draw(kept, path)
+    # seconds of every step; of one that had been begun before, of what was left
+    begun = {name.split("/")[0] for name in step.found if "/" in name}
+    times = [*(Metric(f"time: {name}", "done before") for name in step.found if "/" not in name),
+             *(Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
+               for name, value in step.seconds.items() if "/" not in name)]
     return Outcome(output, [
         *about(models["neutral"]), Metric("poses", len(posed)),
         Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
-        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)),
-                  *_times(seconds, kept_steps.found)])],
-        {"scape": scape, "skinning": skinning, "mixed": mixed}, 
-        judgement=judge_model(models["neutral"], people),
+        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)), *times])],
+        {"scape": scape, "skinning": skinning, "mixed": mixed}, judgement=judge_model(models["neutral"], people),
         following=f"look at it: scape view {output}")
 
 
@@ -122,34 +126,6 @@ def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: Step,
     if parts is None:
         return choose_skeleton(body, posed, progress=progress, step=within).skeleton
     return find_skeleton(body, posed, SkeletonConfig(parts=parts), progress, within)
-
-
-def _timed(step: KeptSteps, seconds: dict[str, float]) -> Step:
-    """The same steps; how long each that was done now took is written into `seconds`."""
-    def timed(name: str, inputs: Any, make: Callable[[], T]) -> T:
-        begun = time.perf_counter()
-        value = step(name, inputs, make)
-        if "/" not in name and name in step.made:
-            seconds[name] = time.perf_counter() - begun
-        return value
-
-    return timed
-
-
-def _times(seconds: dict[str, float], found: list[str]) -> list[Metric]:
-    """Seconds of every step; of one that had been begun before, of what was left."""
-    begun = {name.split("/")[0] for name in found if "/" in name}
-    return [*[Metric(f"time: {name}", "done before") for name in found if "/" not in name],
-            *[Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
-              for name, value in seconds.items()]]
-
-
-def _read_mix(folder: Path) -> tuple[Mesh, np.ndarray]:
-    """Template and all meshes of a registered set."""
-    if not (folder / "set.json").exists():
-        raise ValueError(f"{folder}: expected a registered set, which says whose mesh each is, found a plain folder")
-    whole = RegisteredSet.load(folder)
-    return whole.template, whole.vertices()
 
 
 def _read_sexes(folder: Path) -> list[str]:
@@ -178,13 +154,6 @@ def _read_skeleton(given: Path | None, poses: Path, body: Mesh) -> Skeleton | No
         raise ValueError(f"{path}: expected a skeleton of {len(body.faces)} triangles as the meshes have, "
                          f"found {len(tree.part_of_face)}")
     return tree
-
-
-def _read_marks(given: Path | None, poses: Path, body: Mesh) -> dict[str, int]:
-    path = given or poses / "landmarks.json"
-    if given is None and not path.exists():
-        return {}
-    return read_landmark_vertices(path, body)
 
 
 def _draw(model: BodyModel, output: Path) -> None:

@@ -13,8 +13,8 @@ class LearnConfig(Settings):
 
     Attributes
     ----------
-    features : {"linear", "quadratic", "radial"}
-        What Q is linear in: the twists, also their products, or also Gaussian bells around the seen twists.
+    features : {"linear", "quadratic"}
+        What Q is linear in: the twists, or also their products.
     regressor : {"ridge", "svr"}
         Least squares with a penalty, or support-vector regression.
     prunings : floats, square radians
@@ -33,7 +33,7 @@ class LearnConfig(Settings):
         Shape components to keep, fewer where there are fewer people.
     """
 
-    features: Literal["linear", "quadratic", "radial"] = "linear"
+    features: Literal["linear", "quadratic"] = "linear"
     regressor: Literal["ridge", "svr"] = "ridge"
     prunings: tuple[float, ...] = (0.003, 0.01, 0.03)
     ridges: tuple[Positive, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)

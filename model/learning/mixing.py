@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import product
+from operator import attrgetter
 
 import numpy as np
 
@@ -16,21 +19,20 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
-from ..digests import body_digests, digest
-from ..fitting.vertices import FitConfig, ShapeFitter
+from ..digests import body_digests, checked_bodies, digest
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
-from .regression import Design, compress
-from .scape import Progress, Work, check_skeleton, checked_bodies, fit_poses, pose_examples, pose_prior
-from .within import choose_within, fit_within, held_out_bodies, number_people
+from .regression import Design, compress, make_design
+from .scape import Progress, Work, check_skeleton, fit_poses, pose_examples, pose_prior
 
-# what `learn_scape_mix` takes by default; `refinements` is the largest number of rounds
-MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005, refinements=6)
+# What `learn_scape_mix` takes by default. `refinements` is the number of rounds: of up to six, held-out bodies were met
+# best after two. Of a mix products of twists say more than of one person: 1.46 against 1.68 mm on new people.
+MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005,
+                  refinements=2)
 CORRECTIONS = 2                      # of Q and of S in a round, by what the stitched model leaves
-GAIN = 0.01                          # a round counts as progress when it lowers the held-out error by this share of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +43,6 @@ class Mix:
     bodies: np.ndarray
     who: np.ndarray
     config: LearnConfig
-
-    @property
-    def people(self) -> int:
-        """P, the number of people."""
-        return int(self.who.max()) + 1
-
-    def some(self, chosen: np.ndarray) -> Mix:
-        """The mix of some of the bodies, people numbered anew."""
-        return replace(self, bodies=self.bodies[chosen], who=np.unique(self.who[chosen], return_inverse=True)[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +63,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
 
     In every round the part rotations are fitted to the model, the pose model is regressed with the people's shapes
     held, and the shapes are solved for with the pose model held. Shapes are held down to a few components at first,
-    and what the bodies of one person have in common is never left to the pose model. The number of rounds is the one
-    with which bodies that were held out are met best; then everything trains.
+    and what the bodies of one person have in common is never left to the pose model.
 
     Q and S are determined up to a factor per triangle only, `S Q = (S A)(A⁻¹ Q)`. It is fixed by Q = I at zero
     twist, so that S carries all that the pose does not change, and the template's own body, which need not be among
@@ -105,83 +97,39 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
                          f"{config.regressor!r} and {config.refinements}")
     check_template(template)
     check_skeleton(template, skeleton)
-    bodies = checked_bodies(template, bodies, "bodies")
-    mix = Mix(BlendedTemplate(template, skeleton, rigid_weights(skeleton)), bodies,
-              number_people(subjects, len(bodies)), config)
-    work, inputs = Work(progress, step), (mix.parts, bodies, mix.who, config)
-    errors = work.step("how many rounds", inputs, 0.5, lambda inner: held_out_errors(mix, inner))
-    rounds = 1 + int(np.argmin(errors))
-    state, shapes = work.step("poses and shapes in turns", inputs, 0.5, lambda inner: _in_turns(mix, rounds, inner))
+    bodies = checked_bodies(template, bodies, "bodies", 2)
+    who, parts = number_people(subjects, len(bodies)), BlendedTemplate(template, skeleton, rigid_weights(skeleton))
+    mix, inputs = Mix(parts, bodies, who, config), (parts, bodies, who, config)
+
+    def in_turns(work: Work) -> tuple[State, ShapeSpace]:
+        # rigid parts, as Procrustes places them, and everybody of the template's shape
+        state = State(skeleton.pose_of(skeleton.fit_rotations(template, bodies)), PoseSpace.identity(skeleton),
+                      np.broadcast_to(np.eye(3, dtype=np.float32), (who.max() + 1, len(template.faces), 3, 3)), None)
+        for number in range(config.refinements):
+            state = work.step(f"round {number}", (*inputs, number), 1 / config.refinements,
+                              partial(_next_round, mix, state, number))
+        # the volume of a person is the mean of their bodies; their shapes are then no longer needed
+        volumes = np.bincount(who, body_volumes(template, bodies)) / np.bincount(who)
+        return replace(state, S=state.S[:0]), learn_shape_space(state.S, config.components, volumes)
+
+    state, shapes = Work(progress, step).step("poses and shapes in turns", inputs, 1.0, in_turns)
     assert state.design is not None
-    return _model(mix, state, shapes, {
-        "settings": asdict(config), "bodies": len(bodies), "people": mix.people, "rounds": rounds,
-        "held_out_errors": errors, "pruning": state.design.pruning, "ridge": state.design.ridge,
-        "features": state.space.features.count, "digest": digest(template, bodies, None),
-        "digests": body_digests(bodies)})
-
-
-def _in_turns(mix: Mix, rounds: int, work: Work) -> tuple[State, ShapeSpace]:
-    """What so many rounds reach, and the space of the shapes, which are then no longer needed."""
-    state = _start(mix)
-    for number in range(rounds):
-        state = _kept_round(mix, state, number, 1 / rounds, work)
-    return replace(state, S=np.zeros((0, 3, 3))), _shape_space(mix, state)
-
-
-def _shape_space(mix: Mix, state: State) -> ShapeSpace:
-    """The space of the people's shapes, whose volumes are the means of their bodies."""
-    volumes = np.bincount(mix.who, body_volumes(mix.parts.template, mix.bodies)) / np.bincount(mix.who)
-    return learn_shape_space(state.S, mix.config.components, volumes)
-
-
-def held_out_errors(mix: Mix, work: Work) -> list[float]:
-    """Mean error, metres, of bodies that are held out, after each round until it stops falling."""
-    # share of the bodies that is held out to find after how many rounds to stop
-    held = held_out_bodies(mix.who, 0.2)
-    train = mix.some(np.setdiff1d(np.arange(len(mix.bodies)), held))
-    state, errors, share = _start(train), list[float](), 0.5 / mix.config.refinements
-
-    def error(_: Work) -> float:
-        model = _model(train, state, _shape_space(train, state), {})
-        fitter = ShapeFitter(model, FitConfig(sample=400, polish=0))
-        return float(np.mean([fitter.fit(y).mean for y in mix.bodies[held]]))
-
-    for number in range(mix.config.refinements):
-        state = _kept_round(train, state, number, share, work)
-        errors.append(work.step(f"error of round {number}", (mix.parts, mix.bodies, mix.who, mix.config, number),
-                                share, error))
-        if number and errors[-1] > (1 - GAIN) * min(errors[:-1]):
-            break
-    return errors
-
-
-def _model(mix: Mix, state: State, shapes: ShapeSpace, info: dict[str, object]) -> ScapeModel:
-    """The model that a round has reached."""
-    template, skeleton = mix.parts.template, mix.parts.skeleton
     examples = pose_examples(template, skeleton, state.poses)
     prior = pose_prior(template, skeleton, examples, len(examples))
-    return ScapeModel(template, skeleton, state.space, shapes, *prior, info, pose_examples=examples)
-
-
-def _start(mix: Mix) -> State:
-    """Rigid parts, as Procrustes places them, and everybody of the template's shape."""
-    skeleton, template = mix.parts.skeleton, mix.parts.template
-    poses = skeleton.pose_of(skeleton.fit_rotations(template, mix.bodies))
-    S = np.broadcast_to(np.eye(3, dtype=np.float32), (mix.people, len(template.faces), 3, 3))
-    return State(poses, PoseSpace.identity(skeleton), S, None)
-
-
-def _kept_round(mix: Mix, state: State, number: int, share: float, work: Work) -> State:
-    """The next round, in a step."""
-    return work.step(f"round {number}", (mix.parts, mix.bodies, mix.who, mix.config, number), share,
-                     lambda inner: _next_round(mix, state, number, inner))
+    return ScapeModel(template, skeleton, state.space, shapes, *prior, {
+        "settings": asdict(config), "bodies": len(bodies), "people": int(who.max()) + 1, "rounds": config.refinements,
+        "pruning": state.design.pruning, "ridge": state.design.ridge, "features": state.space.features.count,
+        "digest": digest(template, bodies, None), "digests": body_digests(bodies)}, pose_examples=examples)
 
 
 def _next_round(mix: Mix, state: State, number: int, work: Work) -> State:
     """Part rotations with the model held, then the pose model with the shapes held, then the shapes."""
+    S, poses = state.S, state.poses.copy()
     # shape components that tell people apart: in each round twice as many as in the one before
-    S, poses = _simplified(state.S, 20 * 2**number), state.poses.copy()
-    for person in range(mix.people if number else 0):
+    if 20 * 2**number < len(S) - 1:
+        few = learn_shape_space(S, 20 * 2**number)
+        S = (few.mean + np.tensordot(few.betas_of(S), few.components, axes=1)).astype(np.float32)
+    for person in range(len(S) if number else 0):
         mine = mix.who == person
         poses[mine] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[mine], poses[mine], Work(None))
         work.tick(float(mine.mean()))
@@ -193,14 +141,16 @@ def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
     """The pose space with the shapes held, first as in the paper, then corrected on the stitched surface, as in
     `learn_pose`. [SCAPE] Eq. 4, Eq. 5
     """
-    parts, config, poses, S = mix.parts, mix.config, state.poses, state.S
+    parts, config, poses, S = mix.parts, mix.config, state.poses, state.S.astype(np.float64)
     gradients = GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
-    back = np.swapaxes(_safe_inverse(S), -1, -2)
+    # S⁻¹, a tenth damped against triangles that somebody has nearly flat; the identity stays the identity
+    inverse = 1.1 * np.swapaxes(S, -1, -2) @ np.linalg.inv(S @ np.swapaxes(S, -1, -2) + 0.1 * np.eye(3))
+    back = np.swapaxes(inverse, -1, -2)
     space, design = state.space, state.design
     for step in range(1 + CORRECTIONS):
         Q = space.gradients(poses)
         left = np.empty((len(poses), *parts.v_hat.shape))
-        for i, (body, pose, q) in enumerate(zip(mix.bodies, poses, S[mix.who] @ Q, strict=True)):
+        for i, (body, pose, q) in enumerate(zip(mix.bodies, poses, state.S[mix.who] @ Q, strict=True)):
             if step == 0:
                 left[i] = parts.local_edges(body, pose) - parts.posed(q)
             else:
@@ -209,52 +159,113 @@ def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
         design = design or choose_within(parts.template, parts.skeleton, poses, Q, mix.who, config)
         space = fit_within(design, poses, Q, mix.who)
     assert design is not None
-    return _at_rest(compress(space, poses, parts.template, config.detail * parts.template.mean_edge)), design
-
-
-def _safe_inverse(S: np.ndarray) -> np.ndarray:
-    """`S⁻¹`, a tenth damped against triangles that somebody has nearly flat; the identity stays the identity."""
-    S = S.astype(np.float64)
-    St = np.swapaxes(S, -1, -2)
-    return 1.1 * St @ np.linalg.inv(S @ St + 0.1 * np.eye(3))
-
-
-def _at_rest(space: PoseSpace) -> PoseSpace:
-    """The pose space with Q = I at zero twist; S takes over what was there."""
-    back = np.linalg.inv(space.gradients(np.zeros((len(space.skeleton.parents), 3))))
-    coefficients = tuple((back[faces] @ a.astype(np.float64)).astype(np.float32)
-                         for faces, a in zip(space.faces_of_part, space.coefficients, strict=True))
-    return PoseSpace(space.features, coefficients)
+    space = compress(space, poses, parts.template, config.detail * parts.template.mean_edge)
+    # the gauge: Q = I at zero twist; S takes over what was there
+    rest = np.linalg.inv(space.gradients(np.zeros(parts.skeleton.joints.shape)))
+    return PoseSpace(space.features, tuple((rest[faces] @ a.astype(np.float64)).astype(np.float32) for faces, a in
+                                           zip(space.faces_of_part, space.coefficients, strict=True))), design
 
 
 def _learn_people(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
     """S (P, F, 3, 3) of every person from all of their bodies together, in float32 to halve the memory. As with Q, what
     the stitched bodies leave is added and solved for again. [SCAPE] Eq. 8
     """
-    parts = mix.parts
+    def side_by_side(edges: np.ndarray) -> np.ndarray:
+        """Edges (n, F, 2, 3) of several scans as those (F, 2n, 3) of one."""
+        return np.concatenate(list(edges), axis=1)
+
+    parts, P = mix.parts, int(mix.who.max()) + 1
     system = GradientSystem(parts.template, mix.config.smoothness)
-    S = np.empty((mix.people, len(parts.template.faces), 3, 3), dtype=np.float32)
-    for person in range(mix.people):
+    S = np.empty((P, len(parts.template.faces), 3, 3), dtype=np.float32)
+    for person in range(P):
         bodies, mine = mix.bodies[mix.who == person], poses[mix.who == person]
         Q = space.gradients(mine)
-        posed = _side_by_side(parts.posed(Q))
+        posed = side_by_side(parts.posed(Q))
         solve = ShapeSolver(system, posed)
-        found = solve(_side_by_side(parts.local_edges(bodies, mine)))
+        found = solve(side_by_side(parts.local_edges(bodies, mine)))
         for _ in range(CORRECTIONS):
             left = bodies - np.stack([parts.stitched(found @ q, pose) for q, pose in zip(Q, mine, strict=True)])
-            found = solve(posed @ np.swapaxes(found, -1, -2) + _side_by_side(parts.local_edges(left, mine)))
+            found = solve(posed @ np.swapaxes(found, -1, -2) + side_by_side(parts.local_edges(left, mine)))
         S[person] = found
     return S
 
 
-def _side_by_side(edges: np.ndarray) -> np.ndarray:
-    """Edges (n, F, 2, 3) of several scans as those (F, 2n, 3) of one."""
-    return np.concatenate(list(edges), axis=1)
+@dataclass(frozen=True, eq=False)
+class Within:
+    """The transform that makes a regression with a random effect a person an ordinary one; `who` (M,) says whose each
+    body is, 0..P-1. From every body a share of the mean over its person's bodies is taken, the larger the more there
+    are. What people have of their own weighs little then; where each has one body only, all are weighed alike.
+    """
+
+    who: np.ndarray
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Values (M, ...) without that share."""
+        out = np.array(values, dtype=np.float64)
+        for person in range(int(self.who.max()) + 1):
+            mine = self.who == person
+            # 30: variance between people over that within, of what regression does not explain
+            out[mine] -= (1 - 1 / np.sqrt(1 + 30.0 * mine.sum())) * out[mine].mean(axis=0)
+        return out
+
+    def without_the_person(self, X: np.ndarray, operator: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Residuals (M, n) of transformed targets, every person predicted from the others, in closed form, with
+        transformed features X (M, k) and the operator (k, M) from targets to coefficients.
+        """
+        hat = X @ operator
+        left = target - hat @ target
+        for person in range(int(self.who.max()) + 1):
+            mine = np.flatnonzero(self.who == person)
+            left[mine] = np.linalg.solve(np.eye(len(mine)) * (1 + 1e-9) - hat[np.ix_(mine, mine)], left[mine])
+        return left
 
 
-def _simplified(S: np.ndarray, count: int) -> np.ndarray:
-    """S (P, F, 3, 3) held down to its first components."""
-    if count >= len(S) - 1:
-        return S
-    space = learn_shape_space(S, count)
-    return (space.mean + np.tensordot(space.betas_of(S), space.components, axes=1)).astype(np.float32)
+def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, who: np.ndarray,
+                  config: LearnConfig) -> Design:
+    """The pruning and penalty that predict the edges of left-out people best, of poses (M, J, 3), Q (M, F, 3, 3), and
+    whose body each is (M,). [SCAPE] Eq. 4
+    """
+    designs = (make_design(template, skeleton, poses, config, pruning, ridge)
+               for pruning, ridge in product(config.prunings, config.ridges))
+    return min((replace(design, left_out_error=_left_out_error(design, poses, Q, who)) for design in designs),
+               key=attrgetter("left_out_error"))
+
+
+def fit_within(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> PoseSpace:
+    """Q as a function of the features, as `Design.fit`, were it not for what each person has of their own.
+    [SCAPE] Eq. 4
+    """
+    within = Within(who)
+    delta = within(design.features.evaluate(poses))
+    return design.space(lambda used, faces: _operator(delta[:, used], design.ridge) @ within(Q[:, faces]).reshape(
+        len(poses), -1))
+
+
+def _operator(X: np.ndarray, ridge: float) -> np.ndarray:
+    """(k, M) from targets to coefficients of features (M, k), the first of which is the constant and free."""
+    penalty = np.full(X.shape[1], len(X) * ridge + 1e-12)
+    penalty[0] = 1e-12
+    return np.linalg.solve(X.T @ X + np.diag(penalty), X.T)
+
+
+def _left_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> float:
+    """Root mean square error in metres of the edges of left-out people, apart from what is their own."""
+    within = Within(who)
+    delta, total = within(design.features.evaluate(poses)), 0.0
+    v_hat = np.swapaxes(design.template.corners[:, 1:] - design.template.corners[:, :1], -1, -2)
+    for part, used, faces in design.groups:
+        X = delta[:, np.r_[design.features.starts[part], used]]
+        target = within(Q[:, faces] @ v_hat[faces]).reshape(len(poses), -1)
+        total += float((within.without_the_person(X, _operator(X, design.ridge), target) ** 2).sum())
+    return float(np.sqrt(total / (Q.shape[0] * Q.shape[1] * 2)))
+
+
+def number_people(subjects: Sequence[Hashable], count: int) -> np.ndarray:
+    """(M,) numbers of the people in order of appearance, or ValueError."""
+    if len(subjects) != count:
+        raise ValueError(f"subjects: expected {count} labels, one a body, got {len(subjects)}")
+    order = {label: i for i, label in enumerate(dict.fromkeys(subjects))}
+    if len(order) < 2 or count < 4:
+        raise ValueError(f"subjects: expected at least 2 people and 4 bodies, got {len(order)} people and "
+                         f"{count} bodies; learn_scape learns from the poses of one person")
+    return np.array([order[label] for label in subjects])

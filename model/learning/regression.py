@@ -10,12 +10,9 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift, RadialLift, part_features, twists
+from ..features import PoseFeatures, QuadraticLift, linear_features, part_features
 from ..pose_space import PoseSpace, faces_of_part, kept_directions, nearest_joints
 from .config import LearnConfig
-
-RADII = (0.5, 0.7, 1.0)              # radians: standard deviations of the bells, of which the best is chosen
-TUBE = 2e-4                          # metres: smaller errors of an edge cost nothing to support-vector regression
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +29,6 @@ class Design:
     groups: list[tuple[int, np.ndarray, np.ndarray]]
     regressor: str
     pruning: float
-    radius: float
     ridge: float
     left_out_error: float = float("nan")
 
@@ -124,8 +120,7 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config:
     judge gives the error of a design in metres. The choices begin with those of `start`, or with the middle of what
     there is. [SCAPE] Eq. 4
     """
-    choices = {"pruning": config.prunings, "radius": RADII if config.features == "radial" else (float("nan"),),
-               "ridge": config.ridges}
+    choices = {"pruning": config.prunings, "ridge": config.ridges}
     at = {name: values[len(values) // 2] for name, values in choices.items()}
     if start is not None:
         at = {name: getattr(start, name) for name in choices}
@@ -142,48 +137,14 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config:
 
 
 def make_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: LearnConfig, pruning: float,
-                radius: float, ridge: float) -> Design:
-    """One design: for every part a constant and the lifted twists of its joints, whitened joint by joint."""
-    features = part_features(skeleton, *_make_lift(twists(poses), config.features, pruning, radius))
-    return Design(template, features, _groups(template, features), config.regressor, pruning, radius, ridge)
-
-
-def _make_lift(t: np.ndarray, kind: str, pruning: float, radius: float) -> tuple[Lift, list[np.ndarray]]:
-    """The lift of twists (M, J, 3), and for every joint the mixtures (m, k_j) of its numbers to regress on."""
-    J = t.shape[1]
-    kept = kept_directions(t, pruning)
-    if kind == "linear":
-        return LinearLift(), list(kept)
-    if kind == "quadratic":
-        quadratic, axes = QuadraticLift(), []
-        first, second = np.triu_indices(3)
-        for j in range(J):
-            directions = kept[j]
-            k = directions.shape[1]
-            mine = np.zeros((9, k + k * (k + 1) // 2))
-            mine[:3, :k] = directions
-            for c, (a, b) in enumerate(zip(*np.triu_indices(k), strict=True)):
-                pair = np.outer(directions[:, a], directions[:, b])
-                pair = pair + pair.T
-                mine[3:, k + c] = np.where(first == second, 0.5, 1.0) * pair[first, second]
-            axes.append(mine)
-        return quadratic, axes
-    radial = RadialLift(np.ascontiguousarray(t.transpose(1, 0, 2)), np.full(J, radius))
-    bells = radial.evaluate(t)[..., 3:]
-    axes = []
-    for j in range(J):
-        if not kept[j].shape[1]:
-            axes.append(np.zeros((radial.width, 0)))
-            continue
-        # the penalty is that of the kernel: on K^-1/2 k(t) a plain ridge is kernel ridge regression
-        values, vectors = np.linalg.eigh(bells[:, j])
-        good = values > 1e-6 * values[-1]
-        k = kept[j].shape[1]
-        white = np.zeros((radial.width, k + int(good.sum())))
-        white[:3, :k] = kept[j]
-        white[3:, k:] = vectors[:, good] / np.sqrt(values[good])
-        axes.append(white)
-    return radial, axes
+                ridge: float) -> Design:
+    """One design: for every part a constant, the twist directions of its joints that vary in the poses, and where they
+    are asked for the products of these.
+    """
+    kept = kept_directions(poses, pruning)
+    features = linear_features(skeleton, kept) if config.features == "linear" else part_features(
+        skeleton, QuadraticLift(), [QuadraticLift.of_directions(each) for each in kept])
+    return Design(template, features, _groups(template, features), config.regressor, pruning, ridge)
 
 
 def _groups(template: Mesh, features: PoseFeatures) -> list[tuple[int, np.ndarray, np.ndarray]]:
@@ -264,7 +225,8 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
     size = np.sqrt(modes.shape[1])
     slopes, offsets = np.zeros((X.shape[1], len(unit))), np.zeros(len(unit))
     for c in range(len(unit)):
-        machine = SVR(kernel="linear", C=1 / max(M * ridge, 1e-12), epsilon=min(TUBE * size / unit[c], 0.5))
+        # metres: smaller errors of an edge cost nothing to support-vector regression
+        machine = SVR(kernel="linear", C=1 / max(M * ridge, 1e-12), epsilon=min(2e-4 * size / unit[c], 0.5))
         machine.fit(X, normal[:, c])
         slopes[:, c], offsets[c] = machine.coef_[0], machine.intercept_[0]
     back = (unit[:, None] * modes[good]).reshape(len(unit), *mean.shape) / weight

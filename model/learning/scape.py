@@ -20,8 +20,8 @@ from scanprep.threads import one_thread
 
 from ..blend_weights import face_weights
 from ..blending import BlendedTemplate, rigid_weights
-from ..body import BodyModel
-from ..digests import body_digest, body_digests, digest
+from ..body import BodyModel, Progress
+from ..digests import body_digest, body_digests, checked_bodies, digest
 from ..features import twists
 from ..fitting.vertices import FitConfig, PoseFitter
 from ..gradients import GradientSystem, pose_gradients, shape_gradients
@@ -32,9 +32,8 @@ from ..priors import CRUDE, STIFF, stiff_joints
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
-from .regression import Design, Judge, by_edges, choose_design, compress, left_out
+from .regression import Design, by_edges, choose_design, compress, left_out
 
-Progress = Callable[[int, int], None]
 T = TypeVar("T")
 POSES = 2 / 3                        # of the time of learning, where there are people as well
 
@@ -91,14 +90,8 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
 
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
-    config = config or LearnConfig()
-    poses, shapes = checked_training(template, skeleton, poses, shapes)
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
-    work = Work(progress, step)
-    learned = learn_pose(parts, poses, config, work)                                       # [SCAPE] Eq. 3, Eq. 4, Eq. 5
-    people = learn_people(parts, learned.space, shapes, config, work)                      # [SCAPE] Eq. 7, Eq. 8
-    return ScapeModel(template, skeleton, learned.space, people,
-                      **seen_in_training(template, skeleton, learned, poses, shapes, config))
+    return ScapeModel(template, skeleton, **_learned(parts, poses, shapes, config, Work(progress, step)))
 
 
 @one_thread()
@@ -122,16 +115,23 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     [BlendSCAPE]
     """
-    config = config or LearnConfig()
-    poses, shapes = checked_training(template, skeleton, poses, shapes)
+    checked_training(template, skeleton, poses, shapes)
     # a share of the template's diagonal: so far a rotation blends over the border of its part
     blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
-    work = Work(progress, step)
-    learned = learn_pose(parts, poses, config, work)
-    people = learn_people(parts, learned.space, shapes, config, work)
-    return BlendScapeModel(template, skeleton, learned.space, people, blend=blend,
-                           **seen_in_training(template, skeleton, learned, poses, shapes, config))
+    return BlendScapeModel(template, skeleton, **_learned(parts, poses, shapes, config, Work(progress, step)),
+                           blend=blend)
+
+
+def _learned(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig | None,
+             work: Work) -> dict[str, Any]:
+    """Pose space, shape space, pose prior and info of a SCAPE model of either kind."""
+    config = config or LearnConfig()
+    poses, shapes = checked_training(parts.template, parts.skeleton, poses, shapes)
+    learned = learn_pose(parts, poses, config, work)                                       # [SCAPE] Eq. 3, Eq. 4, Eq. 5
+    people = learn_people(parts, learned.space, shapes, config, work)                      # [SCAPE] Eq. 7, Eq. 8
+    return {"pose_space": learned.space, "shape_space": people,
+            **seen_in_training(parts.template, parts.skeleton, learned, poses, shapes, config)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,30 +145,28 @@ class LearnedPose:
 
 def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: Work) -> LearnedPose:
     """The pose space, first as in the paper, then refined on the stitched surface. [SCAPE] Eq. 3, Eq. 4, Eq. 5"""
-    inputs = parts, bodies, replace(config, components=0)
-    return work.step("pose space", inputs, POSES, lambda inner: _learned(parts, bodies, config, inputs, inner))
+    template, skeleton, inputs = parts.template, parts.skeleton, (parts, bodies, replace(config, components=0))
+    system = GradientSystem(template, config.smoothness, skeleton.part_of_face)
 
+    def first(_: Work) -> LearnedPose:
+        """Q of every body from the rotations of Procrustes, regressed on the joint twists."""
+        poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))                      # R, then Δr
+        Q = pose_gradients(system, parts.local_edges(bodies, poses))                            # [SCAPE] Eq. 5
+        design = choose_design(template, skeleton, poses, config, by_edges(template, poses, Q))
+        return LearnedPose(design.fit(poses, Q), poses, design)                                 # [SCAPE] Eq. 4
 
-def _learned(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, inputs: object, work: Work
-             ) -> LearnedPose:
-    share = 1 / (1 + config.refinements)
-    system = GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
-    learned = work.step("first fit", inputs, share, lambda _: _first(parts, system, bodies, config))
-    for k in range(config.refinements):
-        learned = work.step(f"refinement {k}", inputs, share,
-                            partial(_refined, parts, system, bodies, config, learned, k == 0))
-    tolerance = config.detail * parts.template.mean_edge
-    return learned if not tolerance else replace(
-        learned, space=compress(learned.space, learned.poses, parts.template, tolerance))
+    def learn(inner: Work) -> LearnedPose:
+        share = 1 / (1 + config.refinements)
+        learned = inner.step("first fit", inputs, share, first)
+        for k in range(config.refinements):
+            learned = inner.step(f"refinement {k}", inputs, share,
+                                 partial(_refined, parts, system, bodies, config, learned, k == 0))
+        # features are joined to the few mixtures that matter
+        tolerance = config.detail * template.mean_edge
+        return learned if not tolerance else replace(
+            learned, space=compress(learned.space, learned.poses, template, tolerance))
 
-
-def _first(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig) -> LearnedPose:
-    """Q of every body from the rotations of Procrustes, regressed on the joint twists."""
-    skeleton = parts.skeleton
-    poses = skeleton.pose_of(skeleton.fit_rotations(parts.template, bodies))                     # R, then Δr
-    Q = pose_gradients(system, parts.local_edges(bodies, poses))                                # [SCAPE] Eq. 5
-    design = choose_design(parts.template, skeleton, poses, config, by_edges(parts.template, poses, Q))
-    return LearnedPose(design.fit(poses, Q), poses, design)                                     # [SCAPE] Eq. 4
+    return work.step("pose space", inputs, POSES, learn)
 
 
 def _refined(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig,
@@ -188,8 +186,14 @@ def _refined(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray,
         left = parts.local_edges(bodies - subject.vertices(poses), poses)
         if choosing and number == 0:
             Q = space.gradients(poses) + _correction(parts, system, left)
-            design = choose_design(parts.template, parts.skeleton, poses, config,
-                                   _by_vertices(parts, bodies, poses, Q), design)
+
+            def by_vertices(tried: Design, Q: np.ndarray = Q) -> float:
+                """The mean distance of the stitched vertices of left-out poses, well placed, metres."""
+                off = np.stack([parts.stitched(predicted, pose) - body for body, pose, predicted in
+                                zip(bodies, poses, left_out(tried, poses, Q), strict=True)])
+                return float(np.linalg.norm(off - off.mean(axis=1, keepdims=True), axis=2).mean())
+
+            design = choose_design(parts.template, parts.skeleton, poses, config, by_vertices, design)
         seen = design.seen(poses)
         space = seen.fit(seen.of_space(space) + _correction(parts, system, seen.sums(left)))    # [SCAPE] Eq. 4
     return LearnedPose(space, poses, design)
@@ -209,18 +213,6 @@ def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Wor
         fitted.append(fitter.fit(body, pose).pose)
         work.tick(1 / len(bodies))
     return np.stack(fitted)
-
-
-def _by_vertices(parts: BlendedTemplate, bodies: np.ndarray, poses: np.ndarray, Q: np.ndarray) -> Judge:
-    """The mean distance of the stitched vertices of left-out poses, well placed, metres, of Q (M, F, 3, 3)."""
-    def error(design: Design) -> float:
-        far = []
-        for body, pose, predicted in zip(bodies, poses, left_out(design, poses, Q), strict=True):
-            off = parts.stitched(predicted, pose) - body
-            far.append(np.linalg.norm(off - off.mean(axis=0), axis=1).mean())
-        return float(np.mean(far))
-
-    return error
 
 
 def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig, work: Work
@@ -310,8 +302,8 @@ def checked_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shap
     """Poses (M, N, 3) and people (P, N, 3) that a model can be learned from, or ValueError."""
     check_template(template)
     check_skeleton(template, skeleton)
-    return (checked_bodies(template, poses, "poses"),
-            None if shapes is None else checked_bodies(template, shapes, "shapes"))
+    return (checked_bodies(template, poses, "poses", 2),
+            None if shapes is None else checked_bodies(template, shapes, "shapes", 2))
 
 
 def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
@@ -322,19 +314,6 @@ def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
     root = template.vertices[skeleton.part_of_vertex(template) == 0].mean(axis=0)
     if np.linalg.norm(root - skeleton.joints[0]) > 1e-6 * np.ptp(template.vertices, axis=0).max():
         raise ValueError("skeleton: joints[0] is not the centroid of part 0, so it belongs to another template")
-
-
-def checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
-    """At least two bodies (n, N, 3) in the template's topology, or ValueError."""
-    bodies, N = np.asarray(bodies, dtype=np.float64), len(template.vertices)
-    if bodies.ndim != 3 or bodies.shape[1:] != (N, 3):
-        raise ValueError(f"{name}: expected shape (n, {N}, 3) like the template, got {bodies.shape}")
-    bad = np.flatnonzero(~np.isfinite(bodies).all(axis=(1, 2)))
-    if len(bad):
-        raise ValueError(f"{name}: body {bad[0]} has vertices that are not finite")
-    if len(bodies) < 2:
-        raise ValueError(f"{name}: expected at least 2 bodies, got {len(bodies)}")
-    return bodies
 
 
 def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement:

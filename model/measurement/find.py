@@ -15,10 +15,8 @@ from .marks import Places, places_of
 from .section import Carried, Curve, direction, mean_of, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
 
-STATURE = 1.75                       # metres: lengths below are those of somebody so tall
 BAND = 0.10                          # how far from its place on the template a tape may run, along the surface
 LIMB_BAND = 0.07
-CORRIDOR = 0.05                      # how much longer a way may be than the shortest, for what it crosses to count
 BELOW_BUST, BELOW_CROTCH = 0.085, 0.04
 PAST_ARMPIT = (0.5, 0.56, 0.62, 0.68)                  # of the way from the shoulder to the elbow
 APART = 0.12                         # metres from the middle of a section to where its part is sought
@@ -67,7 +65,8 @@ class _Finder:
         self.graph = SurfaceGraph(self.mesh)
         height = self.mesh.vertices @ places.up
         self.floor, self.stature = float(height.min()), float(np.ptp(height))
-        self.scale = self.stature / STATURE
+        # lengths above are those of somebody of 1.75 m
+        self.scale = self.stature / 1.75
         self.limbs: dict[str, tuple[Carried, Carried]] = {}
         self.done: dict[str, Girth] = {}
 
@@ -287,7 +286,8 @@ class _Finder:
             over = self.graph.distances(np.array([start, end])).sum(axis=0)        # of ways over each vertex
             if not np.isfinite(over[start]):
                 raise _NotThere("no way along the surface joins its ends")
-            faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + CORRIDOR * self.scale).all(axis=1)])
+            # triangles count that a way crosses which is up to 5 cm longer than the shortest
+            faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + 0.05 * self.scale).all(axis=1)])
         return Way(tuple(vertices), tuple(faces))
 
     def foot(self, side: str) -> Extent:

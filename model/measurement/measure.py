@@ -13,7 +13,6 @@ from .reading import NotMeasured, Reading, Standing, read
 from .tapes import Tapes
 
 TURNED = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}       # degrees from the standard pose that change little
-NEARLY = 0.5                         # of these: not worth the millimetres that another pose costs
 ROUNDS = 20                          # of laying a template on a body
 # Chosen on half views of the ten even people of `tests/benchmarks/measures.py`, which tells how far the odd ones agree.
 REACH = 0.10                         # metres, over which errors of the surface go together
@@ -107,7 +106,8 @@ def laid_on(template: Mesh, vertices: np.ndarray) -> np.ndarray:
 def stands(vertices: np.ndarray, tapes: Tapes) -> bool:
     """Whether a body (N, 3) stands so nearly as its template that it need not be brought into that pose."""
     mesh = tapes.template.with_vertices(vertices)
-    return not turned_limbs(tapes, Standing(mesh, tapes.axes @ laid_on(tapes.template, vertices).T), NEARLY)
+    # half of what changes little is not worth the millimetres that another pose costs
+    return not turned_limbs(tapes, Standing(mesh, tapes.axes @ laid_on(tapes.template, vertices).T), 0.5)
 
 
 def turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple[str, ...]:

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MOST_BENT = 0.5                      # radians between two points of a tape: beyond, it lies on an edge
-
 
 @dataclass(frozen=True, eq=False)
 class Carried:
@@ -126,7 +124,8 @@ def around(points: np.ndarray, near: np.ndarray | None = None) -> tuple[float, n
     lengths = np.linalg.norm(steps, axis=1)
     ways = steps / np.maximum(lengths, 1e-12)[:, None]
     turn = np.arccos(np.clip(np.einsum("md,md->m", ways, np.roll(ways, -1, axis=0)), -1, 1))
-    bend = np.minimum(0.5 * (turn + np.roll(turn, 1)), MOST_BENT)
+    # radians between two points of a tape: beyond, it lies on an edge
+    bend = np.minimum(0.5 * (turn + np.roll(turn, 1)), 0.5)
     arc = 1 + (0 if near is None else near) * bend**2 / 24                # of a circle over its chord
     pull = arc[:, None] * ways if near is not None else ways
     return float((arc * lengths).sum()), pull - np.roll(pull, -1, axis=0)

@@ -12,7 +12,7 @@ import numpy as np
 from scanprep.geometry.storage import save_arrays
 from scanprep.skeleton.tree import Skeleton
 
-from ..rig import turn_up
+from ..rig import joint_places, turn_up
 from .files import StoredMotion
 from .moving import MovingSkeleton
 
@@ -48,13 +48,9 @@ def moving_body(motion: StoredMotion) -> tuple[MovingSkeleton, str]:
     high = R[:, 0, :, 1].mean(axis=0)                    # where the trunk points; z is up, but for y in some files
     up = 1 if high[1] > abs(high[2]) + 0.3 else 2
     U = turn_up(up)
-    R = U @ R
     offsets = rest - np.where(PARENTS[:, None] < 0, 0, rest[PARENTS])
-    places = np.empty((*R.shape[:2], 3))
-    places[:, 0] = motion.trans @ U.T
-    for j in range(1, BODY):
-        places[:, j] = places[:, PARENTS[j]] + R[:, PARENTS[j]] @ offsets[j]
-    return MovingSkeleton(NAMES, PARENTS, offsets, {}, R, places, motion.rate), "xyz"[up]
+    places = joint_places(tree, motion.poses[:, :BODY], motion.trans - rest[0]) @ U.T
+    return MovingSkeleton(NAMES, PARENTS, offsets, {}, U @ R, places, motion.rate), "xyz"[up]
 
 
 def with_joints(poses: np.ndarray, count: int) -> np.ndarray:

@@ -13,9 +13,10 @@ from scanprep.geometry.storage import StorageError
 from scanprep.ranges import BETAS, TINY, TURNS, Range
 
 from ..body import BodyModel
+from ..files import KINDS
 from .bvh import USUAL_RATE
 
-OURS = ("scape", "blendscape", "skinning")           # what files of our models say they are made for
+OURS = tuple(KINDS)                                  # what files of our models say they are made for
 FAMILY = ("smpl", "star", "supr")                    # how the names of the models begin whose motions AMASS holds
 JOINTS = (22, 24, 52, 55)                            # joints of these models: the body, with hands, fingers, face
 RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate", "framerate")

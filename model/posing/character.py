@@ -1,9 +1,8 @@
 """A character as the mean of a body model: betas are then offsets from it, and poses bend it as they bend people."""
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import singledispatch
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,16 +14,10 @@ from scanprep.ranges import FLAG, Settings
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 
-from ..body import BodyModel
-from ..gradients import GradientSystem, ShapeSolver
+from ..body import BodyModel, Progress
 from ..learning.sexes import PLANE
 from ..linear import check_pose
-from ..scape import ScapeModel
-from ..skinning import SkinningModel
 
-Progress = Callable[[int, int], None]
-
-NORMAL = 0.3                         # how much normals count beside edges: triangles thicken as they grow
 # registrations of the template, each from where the last one left it: one alone does not stretch so far
 REGISTRATIONS = 2
 LOST = 0.5                           # share of the character missed, or of joints outside it, that means nothing
@@ -77,9 +70,8 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
     if pose is None:
         pose = character_pose(model, vertices, config)
     pose, _ = check_pose(model.skeleton, pose, None)
-    found = recentred(model, vertices, pose)
+    found = model.recentred(vertices, pose)
     kept = {name: value for name, value in model.info.items() if name != PLANE}   # these betas are nobody's
-    # its place in a model's info
     return replace(found, info={**kept, "character": True})                      # type: ignore[type-var]
 
 
@@ -89,45 +81,6 @@ def character_pose(model: BodyModel, vertices: np.ndarray, config: CharacterConf
     if config.pose == "rest":
         R[:] = R[0]
     return model.skeleton.pose_of(R)
-
-
-@singledispatch
-def recentred(model: BodyModel, vertices: np.ndarray, pose: np.ndarray) -> BodyModel:
-    """The model whose mean person is in the pose (J, 3) the character with vertices (N, 3), for one kind of model."""
-    raise ValueError(f"model: the kind '{model.kind}' cannot take a character")
-
-
-@recentred.register
-def _of_triangles(model: ScapeModel, vertices: np.ndarray, pose: np.ndarray) -> ScapeModel:
-    """S by Eq. 8, and again for what the stitched character then lacks.
-
-    Two edges leave open how a triangle thickens. People are smooth enough to share it with their neighbours; where a
-    character is squeezed and stretched, poses that turn triangles out of their plane would then turn them over.
-    """
-    posed, wanted = model.posed_edges(pose), model.parts.local_edges(vertices, pose)
-    with_normals = np.concatenate([posed, NORMAL * _normals(posed)], axis=1)
-    # a tenth of the paper's smoothness: a character's triangles share less of their shape than people's
-    solver = ShapeSolver(GradientSystem(model.template, 0.0001), with_normals)
-    target, S = np.concatenate([wanted, NORMAL * _normals(wanted)], axis=1), np.zeros((len(posed), 3, 3))
-    # twice what is left of the character is added to its shape
-    for _ in range(3):
-        S += solver(target - with_normals @ np.swapaxes(S, -1, -2))
-    return replace(model, shape_space=replace(model.shape_space, mean=S.astype(np.float32)))
-
-
-def _normals(pairs: np.ndarray) -> np.ndarray:
-    """A third edge (F, 1, 3) for each pair of edges (F, 2, 3): square to both, as long as the triangle is wide.
-
-    [Sumner]
-    """
-    cross = np.cross(pairs[:, 0], pairs[:, 1])
-    length = np.sqrt(np.linalg.norm(cross, axis=1, keepdims=True))
-    return np.asarray(cross / np.maximum(length, np.finfo(float).tiny))[:, None]
-
-
-@recentred.register
-def _of_vertices(model: SkinningModel, vertices: np.ndarray, pose: np.ndarray) -> SkinningModel:
-    return replace(model, shape_mean=model.unposed(vertices, pose))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from scanprep.arguments import Alias, Called, Place, UsageError
-from scanprep.cli import Output, Unit
+from scanprep.cli import MeshArg, Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh, write_mesh
@@ -17,7 +17,7 @@ from scanprep.judgement import HAND, Judgement, size
 from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
-from ..cli import ModelArg
+from ..cli import ModelArg, read_body
 from ..export.cli import write_frames
 from ..export.conventions import standing
 from ..files import load_model
@@ -25,10 +25,9 @@ from ..linear import Subject
 from ..motion.files import betas_for
 from ..motion.onto import read_motion
 from ..people import ASKED, person_judgement
-from .character import Character, CharacterMeshConfig, character_problem, register_character
+from .character import CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
-CharacterArg = Annotated[Path, Place("MESH")]
 BodyArg = Annotated[Path, Place("BODY")]
 
 
@@ -45,10 +44,8 @@ def repose(model: ModelArg, body: BodyArg, poses: Annotated[Path, Called("--moti
         output: Folder for the meshes.
         unit: Unit of the body.
     """
-    loaded, mesh = load_model(model), read_mesh(body, unit)
-    if not np.array_equal(mesh.faces, loaded.template.faces):
-        raise ValueError(f"{body}: expected the triangles of the model ({loaded.template}), found {mesh}; "
-                         "register the template to it first (scape prep register)")
+    loaded = load_model(model)
+    mesh = read_body(body, loaded.template, unit)
     moves = read_motion(poses, loaded, rate=1.0)            # meshes have none
     found = own_body(loaded, mesh.vertices)
     with bar("writing meshes") as progress:
@@ -61,10 +58,9 @@ def repose(model: ModelArg, body: BodyArg, poses: Annotated[Path, Called("--moti
         f"the body is {1e3 * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?"))
 
 
-def character(mesh: CharacterArg, model: Annotated[Path, Alias("-m")], output: Output,
-              landmarks: Path | None = None, template_landmarks: Path | None = None, unit: Unit | None = None,
-              config: CharacterMeshConfig = CharacterMeshConfig()  # noqa: B008
-              ) -> Outcome:
+def character(mesh: MeshArg, model: Annotated[Path, Alias("-m")], output: Output, landmarks: Path | None = None,
+              template_landmarks: Path | None = None, unit: Unit | None = None,
+              config: CharacterMeshConfig = CharacterMeshConfig()) -> Outcome:
     """A character of any triangles as the mean of a model: it moves as people do, betas are offsets from it.
 
     The template is registered to the character by landmarks of the same names on both, of which a dozen spread over the
@@ -96,26 +92,18 @@ def character(mesh: CharacterArg, model: Annotated[Path, Alias("-m")], output: O
         found = register_character(loaded, body, theirs, ours, config, progress)
     found.model.save(output)
     save_png(output.with_suffix(".png"), picture_character(found.model))
-    return Outcome(output, _about(loaded, found), {"character": config},
-                   judgement=Judgement.of(character_problem(found), _outside(loaded, found)))
-
-
-def _outside(model: BodyModel, found: Character) -> list[str]:
-    """The joints that do not lie inside a character, in one line; none where all do."""
-    outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
-    return [f"outside: {', '.join(outside)}"] if outside else []
-
-
-def _about(model: BodyModel, found: Character) -> list[Metric]:
     rows = [] if found.registration is None else [
         Metric("distance to the character, RMS", 1e3 * found.registration.rms, "mm"),
         Metric("character off the template", 100 * found.registration.uncovered, "%"),
         Metric("distance of landmarks, RMS", 1e3 * found.registration.landmark_rms, "mm"),
         Metric("inverted triangles", found.registration.inverted)]
-    return [*rows, Metric("height, length or width", float(np.ptp(found.mesh.vertices, axis=0).max()), "m"),
-            Metric("joints inside it", f"{found.inside.sum()} of {len(found.inside)}"
-                   + "".join(f", {told}" for told in _outside(model, found))),
-            Metric("most turned joint", float(np.degrees(np.linalg.norm(found.pose[1:], axis=1).max())), "°")]
+    outside = ", ".join(name for name, within in zip(loaded.skeleton.names, found.inside, strict=True) if not within)
+    rows += [Metric("height, length or width", float(np.ptp(found.mesh.vertices, axis=0).max()), "m"),
+             Metric("joints inside it", f"{found.inside.sum()} of {len(found.inside)}"
+                    + (f", outside: {outside}" if outside else "")),
+             Metric("most turned joint", float(np.degrees(np.linalg.norm(found.pose[1:], axis=1).max())), "°")]
+    return Outcome(output, rows, {"character": config}, judgement=Judgement.of(
+        character_problem(found), [f"outside: {outside}"] if outside else []))
 
 
 def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[Beta, ...] = (),
@@ -177,11 +165,7 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     if given.suffix in (".json", ".npz"):
         betas = betas_for(given, _read_betas(given), model)
         return model.subject(betas if betas is not None and len(betas) else None)
-    person = read_mesh(given, unit)
-    if not np.array_equal(person.faces, model.template.faces):
-        raise ValueError(f"{given}: expected the triangles of the model ({model.template}), found {person}; "
-                         "register the template to it first (scape prep register)")
-    return subject_from_body(model, person.vertices)
+    return subject_from_body(model, read_body(given, model.template, unit).vertices)
 
 
 def _read_betas(path: Path) -> np.ndarray:

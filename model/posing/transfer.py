@@ -2,16 +2,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import singledispatch
 
 import numpy as np
 
 from ..body import BodyModel
 from ..fitting.vertices import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
-from ..gradients import GradientSystem, shape_gradients
 from ..linear import Subject, check_pose
-from ..scape import ScapeModel
-from ..skinning import SkinningModel
 
 QUICK = FitConfig(polish=0)          # of pose and betas: the body's own shape takes up what a rough fit leaves
 
@@ -61,40 +57,9 @@ def own_body(model: BodyModel, vertices: np.ndarray, fit: PoseFit | None = None)
     if vertices.shape != model.template.vertices.shape or not np.isfinite(vertices).all():
         raise ValueError(f"vertices: expected finite numbers of shape {model.template.vertices.shape}, "
                          f"got shape {vertices.shape}")
-    subject = replace(exact_subject(model, vertices, fit),
-                      betas=fit.betas if isinstance(fit, ShapeFit) else None)
+    betas = fit.betas if isinstance(fit, ShapeFit) else None
+    subject = replace(model.exact_subject(vertices, pose, betas), betas=betas)
     trans = (model.joint_regressor[[0]] @ (vertices - subject.vertices(pose)))[0]
     found = subject.vertices(pose, trans)
     far = np.linalg.norm(found - vertices, axis=1)
     return OwnBody(subject, pose, trans, found, float(far.mean()), float(far.max()))
-
-
-@singledispatch
-def exact_subject(model: BodyModel, vertices: np.ndarray, fit: PoseFit) -> Subject:
-    """The subject that in the fitted pose is the body with vertices (N, 3), for one kind of model."""
-    raise ValueError(f"model: the kind '{model.kind}' cannot take the shape of a registered body")
-
-
-@exact_subject.register
-def _of_triangles(model: ScapeModel, vertices: np.ndarray, fit: PoseFit) -> Subject:
-    """S of the betas, and Eq. 8 for what the stitched body then still lacks.
-
-    Eq. 8 for the whole body would take what stitching did to it near the borders of parts, in this one pose, for
-    its shape.
-    """
-    parts, Q, posed = model.parts, model.pose_space.gradients(fit.pose), model.posed_edges(fit.pose)
-    system = GradientSystem(model.template)
-    S = model.shape_space.gradients(fit.betas if isinstance(fit, ShapeFit) else None)
-    # twice what is left of the body is added to its shape
-    for _ in range(2):
-        left = vertices - parts.stitched(S @ Q, fit.pose)
-        S += shape_gradients(system, posed, posed + parts.local_edges(left, fit.pose)) - np.eye(3)
-    return replace(parts.subject(model.pose_space, S), pose_mean=model.pose_mean,
-                   pose_covariance=model.pose_covariance, pose_examples=model.pose_examples,
-                   left_out_error=model.info.get("left_out_error"))
-
-
-@exact_subject.register
-def _of_vertices(model: SkinningModel, vertices: np.ndarray, fit: PoseFit) -> Subject:
-    return replace(model, rest=model.unposed(vertices, fit.pose)).subject(None)
-

@@ -1,7 +1,6 @@
 """`scape model resample`: a model with fewer or more triangles."""
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +23,7 @@ MEASURED = 20                        # poses in which the two models are compare
 
 
 def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: Faces | None = None,
-                   unit: Unit | None = None, config: ResolutionConfig
-                   = ResolutionConfig()) -> Outcome:  # noqa: B008
+                   unit: Unit | None = None, config: ResolutionConfig = ResolutionConfig()) -> Outcome:
     """Transfer a model to fewer or more triangles; poses, betas and places keep their meaning.
 
     Example: scape model resample model.npz --vertices 5389 -o coarse.npz
@@ -55,11 +53,6 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         Metric("triangles", len(mesh.faces)),
         *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", 1000.0 * float(value), "mm")
           for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
-        {"resample": config}, judgement=_judge_gaps(dict(gaps)))
-
-
-def _judge_gaps(gaps: Mapping[str, np.ndarray]) -> Judgement:
-    """Whether bodies are where those of the model before are."""
-    off = {who: float(gap.mean()) for who, gap in gaps.items()}
-    return Judgement.of(check=[f"{who} in random poses: {1000 * mean:.0f} mm from where it was; take more vertices"
-                               for who, mean in off.items() if mean > FAR])
+        {"resample": config}, judgement=Judgement.of(check=[
+            f"{who} in random poses: {1000 * float(gap.mean()):.0f} mm from where it was; take more vertices"
+            for who, gap in gaps if gap.mean() > FAR]))

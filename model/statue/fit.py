@@ -1,7 +1,7 @@
 """From one scan to a statue: registration by features, shape-constrained fit, displacement map."""
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -12,6 +12,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.ranges import Settings
 
+from ..body import Progress
 from .control.files import humanoid
 from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, bake, unfold_control
@@ -19,7 +20,6 @@ from .registration.automatic import Features, find_features
 from .registration.features import FeatureFit, fit_features, head_share, warp
 from .registration.surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
 
-Progress = Callable[[int, int], None]
 FACE = ("left eye", "right eye", "nose tip", "mouth", "chin", "left ear", "right ear", "top of head")
 
 

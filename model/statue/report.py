@@ -13,13 +13,13 @@ from scanprep.geometry.surface import Surface
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
-from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Shape, Solid, part_colors, render, side_by_side
+from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, part_colors, render, side_by_side
 from scanprep.pictures.sheets import webp_bytes
 from scanprep.pictures.thinning import MOST, thinned
 from scanprep.synthetic.people import named_pose, walk
 
 from .control.files import humanoid
-from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
+from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, Statue
 from .detail.reconstruction import Level, Reconstruction, coverage_at
 from .detail.subdivision import subdivide
 from .motion.motions import people_motion
@@ -27,7 +27,6 @@ from .motion.motions import people_motion
 HEIGHT = 520                         # pixels of the pictures
 MOVED = MOST // 2                    # triangles of one of several bodies beside each other
 THINNED = "Shown with fewer triangles than it has."
-WORST = 0.003                        # metres: the end of the colours of errors
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
 
 
@@ -66,31 +65,28 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
                 HEIGHT, webp_bytes(picture))
     page.figures(metrics)
     page.section("Joints", "Red: joint centres. Blue: feature points of the control model.")
-    page.bodies([_inside(scan, statue)], height=HEIGHT)
-    page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "
-                 "measured; red is folded, not one-to-one with the control mesh; yellow is a hole of the scan. Red and "
-                 "yellow were filled smoothly.")
-    page.picture(webp_bytes(side_by_side(map_pictures(statue.map), ("displacement", "coverage"))))
-    _errors(page, scan, statue, levels, adaptive)
-    if frames:
-        page.section("In motion", "The skeleton moves the control mesh, and the detail stands on its moving normals.")
-        page.bodies([Pane([thinned(Solid(mesh), MOVED)], cameras(statue, mesh, (20,))[0], label)
-                     for label, mesh in frames], THINNED, HEIGHT)
-    return page
-
-
-def _inside(scan: Mesh, statue: Statue) -> Pane:
     control, joints = statue.control, statue.control.skeleton.joints
     marks, names = list(control.landmarks.values()), list(control.landmarks)
-    shapes: list[Shape] = [
+    page.bodies([Pane([
         thinned(Solid(Mesh(scan.vertices, scan.faces), opacity=0.35, name="scan"), MOVED),
         Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True, name="skeleton"),
         Dots(joints, on_top=True, name="joints", labels=control.skeleton.names),
-        Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)]
-    return Pane(shapes, cameras(statue, scan, (20,))[0])
-
-
-def _errors(page: Page, scan: Mesh, statue: Statue, levels: Sequence[Level], adaptive: Level) -> None:
+        Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)],
+        cameras(statue, scan, (20,))[0])], height=HEIGHT)
+    page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "
+                 "measured; red is folded, not one-to-one with the control mesh; yellow is a hole of the scan. Red and "
+                 "yellow were filled smoothly.")
+    # heights as grey values (white out, black in, the middle grey zero), and the coverage in colours
+    step = max(1, len(statue.map.heights) // 640)
+    heights, coverage = statue.map.heights[::step, ::step], statue.map.coverage[::step, ::step]
+    covered = coverage != OUTSIDE
+    most = float(np.quantile(np.abs(heights[covered]), 0.995)) if covered.any() else 1.0
+    grey = np.where(covered, 127.5 + 127.5 * np.clip(heights / max(most, 1e-9), -1, 1), 255).astype(np.uint8)
+    colors = np.zeros((256, 3))
+    colors[list(KINDS)] = list(KINDS.values())
+    page.picture(webp_bytes(side_by_side(
+        (np.repeat(grey[..., None], 3, axis=-1), (255 * colors[coverage]).astype(np.uint8)),
+        ("displacement", "coverage"))))
     page.section("Levels of detail, and their distance to the scan", "The same map on ever fewer triangles, and on "
                  "triangles that are small only where the displacement asks for it. Grey: holes of the scan, which "
                  "do not count.")
@@ -100,21 +96,15 @@ def _errors(page: Page, scan: Mesh, statue: Statue, levels: Sequence[Level], ada
     for one in [*reversed(levels), adaptive]:
         far = surface.closest(one.mesh.vertices).distances
         far[one.mesh.faces[~one.shown]] = np.nan
-        solid = Solid(one.mesh, Heat(far, 0.0, WORST, "distance to the scan"), shades={"plain": np.array(CLAY)})
+        # to 3 mm, the end of the colours
+        solid = Solid(one.mesh, Heat(far, 0.0, 0.003, "distance to the scan"), shades={"plain": np.array(CLAY)})
         panes.append(Pane([thinned(solid, MOVED)], camera, f"{one.name}: {len(one.mesh.faces):,} triangles"))
     page.bodies(panes, THINNED, 420)
-
-
-def map_pictures(map_: DisplacementMap, size: int = 640) -> tuple[np.ndarray, np.ndarray]:
-    """The heights as grey values (white out, black in, the middle grey zero), and the coverage in colours."""
-    step = max(1, len(map_.heights) // size)
-    heights, coverage = map_.heights[::step, ::step], map_.coverage[::step, ::step]
-    covered = coverage != OUTSIDE
-    most = float(np.quantile(np.abs(heights[covered]), 0.995)) if covered.any() else 1.0
-    grey = np.where(covered, 127.5 + 127.5 * np.clip(heights / max(most, 1e-9), -1, 1), 255)
-    colors = np.zeros((256, 3))
-    colors[list(KINDS)] = list(KINDS.values())
-    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1), (255 * colors[coverage]).astype(np.uint8)
+    if frames:
+        page.section("In motion", "The skeleton moves the control mesh, and the detail stands on its moving normals.")
+        page.bodies([Pane([thinned(Solid(mesh), MOVED)], cameras(statue, mesh, (20,))[0], label)
+                     for label, mesh in frames], THINNED, HEIGHT)
+    return page
 
 
 def coverage_of_vertices(statue: Statue) -> np.ndarray:

@@ -10,7 +10,6 @@ from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 
 NEIGHBOURS = 20                        # points that tell a normal, and to which it is oriented
-DEEPEST = 10                           # octree of Poisson reconstruction: cells of 2 mm on a person
 
 
 class MissingLibrary(ImportError):
@@ -32,7 +31,7 @@ def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(mesh.vertices)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
     closed, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    return recolored(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
+    return recolor(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
 
 
 def oriented_normals(points: np.ndarray) -> np.ndarray:
@@ -49,7 +48,8 @@ def screened_poisson(points: np.ndarray, normals: np.ndarray, spacing: float) ->
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals))
-    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(points, axis=0).max() / spacing)), 6, DEEPEST))
+    # octree of Poisson reconstruction: cells of 2 mm on a person
+    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(points, axis=0).max() / spacing)), 6, 10))
     found, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
 
@@ -64,7 +64,7 @@ def ball_pivoting(points: np.ndarray, normals: np.ndarray, spacing: float) -> Me
     return Mesh(np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64))
 
 
-def recolored(mesh: Mesh, source: Mesh) -> Mesh:
+def recolor(mesh: Mesh, source: Mesh) -> Mesh:
     """The mesh with the colours of the closest points of another one, when that has any."""
     if source.colors is None:
         return mesh

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..geometry.mesh import Mesh
 from ..threads import asked
-from .open3d_filters import library, recolored
+from .open3d_filters import library, recolor
 
 
 def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
@@ -27,7 +27,7 @@ def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     """A closed surface near the mesh by screened Poisson reconstruction."""
     meshes = _meshes(mesh)
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=asked() or 1)
-    return recolored(_result(meshes), mesh)
+    return recolor(_result(meshes), mesh)
 
 
 def read_layers(path: str) -> dict[str, np.ndarray]:

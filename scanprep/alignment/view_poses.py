@@ -88,7 +88,7 @@ def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Gener
     other. The best pairs are chained from the first view. It may be wrong where views overlap little: see `trusted`.
     """
     extent = float(max(np.ptp(mesh.vertices, axis=0).max() for mesh, _ in views))
-    described = [_described(mesh, extent) for mesh, _ in views]
+    described = [_describe(mesh, extent) for mesh, _ in views]
     count = len(views)
     pairs = {(i, j): _place(described[i], described[j], views[i], views[j], extent, rng)
              for i in range(count) for j in range(i)}
@@ -104,7 +104,7 @@ def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Gener
     return T
 
 
-def _described(mesh: Mesh, extent: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _describe(mesh: Mesh, extent: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 3) spread over a view, their normals, and a histogram (n, 33) for each."""
     even = smooth(mesh, 10)
     rows = thin(even.vertices, extent / 120)
@@ -156,7 +156,7 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
     tree, back = OrientedPoints(q, m), SeenSpace([view])
     front = SeenSpace([target])
     for k in np.argsort(-hits)[:12]:
-        r, s = _refined(p, n, tree, R[k], t[k], extent)
+        r, s = _refine(p, n, tree, R[k], t[k], extent)
         found = tree.match(p @ r.T + s, n @ r.T, extent / 120, 0.7).valid.mean()
         through = max(float((front.ahead(p @ r.T + s) > extent / 60).mean()),
                       float((back.ahead((q - s) @ r) > extent / 60).mean()))
@@ -166,7 +166,7 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
     return best
 
 
-def _refined(p: np.ndarray, n: np.ndarray, tree: OrientedPoints, R: np.ndarray, t: np.ndarray,
+def _refine(p: np.ndarray, n: np.ndarray, tree: OrientedPoints, R: np.ndarray, t: np.ndarray,
              extent: float) -> tuple[np.ndarray, np.ndarray]:
     """A motion after a few rounds of point-to-point matching."""
     for reach in extent * np.linspace(1 / 30, 1 / 90, 12):

@@ -74,8 +74,8 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
         start = place_by_landmarks(landmarks, len(pairs))
     elif features:
         start = place_by_features(pairs, rng)
-    pairs = [_moved(pair, T) for pair, T in zip(pairs, start, strict=True)]
-    samples = [_oriented(mesh, config, rng) for mesh, _ in pairs]
+    pairs = [_move(pair, T) for pair, T in zip(pairs, start, strict=True)]
+    samples = [_sample(mesh, config, rng) for mesh, _ in pairs]
     poses = np.tile(np.eye(4), (len(pairs), 1, 1))
     reach, rms, settled, rounds = config.reach, np.nan, len(pairs) == 1, 0
     while rounds < config.iterations and not settled:
@@ -91,18 +91,18 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
         rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < 5e-5, rounds + 1
         distances = np.concatenate([d for *_, d in matches])
         reach = min(reach, max(3 * float(np.median(distances)), 0.005))
-    out = [_moved(pair, T) for pair, T in zip(pairs, poses, strict=True)]
+    out = [_move(pair, T) for pair, T in zip(pairs, poses, strict=True)]
     overlap, conflict = fit_of_views(out)
     trusted = settled & (overlap >= config.min_overlap) & (conflict <= config.max_conflict) | (len(out) == 1)
     return AlignedViews(out, poses @ start, rms, settled, rounds, overlap, conflict, trusted)
 
 
-def _moved(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:
+def _move(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:
     mesh, camera = view
     return mesh.with_vertices(mesh.vertices @ T[:3, :3].T + T[:3, 3]), T[:3, :3] @ camera + T[:3, 3]
 
 
-def _oriented(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
+def _sample(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a view, their normals, and which of them lie well inside."""
     even = smooth(mesh, 10)

@@ -41,6 +41,8 @@ class KeptCall:
     @classmethod
     def read(cls: type[Of], folder: Path) -> Of:
         """That of a folder; StorageError for one that does not tell."""
+        import msgspec
+
         path = _file(folder)
         if path is None:
             raise storage.StorageError(f"{folder}: it does not tell what it was made from, as what {cls.command} made "
@@ -52,7 +54,9 @@ class KeptCall:
             hints = typing.get_type_hints(cls)
             usual: Callable[[], Settings] = hints["config"]
             config = config_files.parsed(told.pop("config"), path, {"config": usual()})["config"]
-            return cls(**{name: _as(value, hints[name]) for name, value in told.items()} | {"config": config})
+            # values of JSON in the types of the fields: Path, text, one of some words, tuples of these, or None
+            return cls(**{name: msgspec.convert(value, hints[name], dec_hook=lambda kind, text: kind(text))
+                          for name, value in told.items()} | {"config": config})
 
 
 def command_of(folder: Path) -> str:
@@ -72,10 +76,3 @@ def _file(folder: Path) -> Path | None:
 
 def _kind(call: KeptCall | type[KeptCall]) -> str:
     return CALL + call.command
-
-
-def _as(value: Any, kind: Any) -> Any:
-    """A value of JSON in the type of a field: Path, text, one of some words, tuples of these, or None."""
-    import msgspec
-
-    return msgspec.convert(value, kind, dec_hook=lambda kind, text: kind(text))

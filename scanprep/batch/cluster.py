@@ -50,7 +50,7 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
             """The next job; few at a time, so that shipped files do not pile up at the scheduler."""
             for job in waiting:
                 given = with_paths(job.given, Path.absolute)
-                sent = job.name, job.place, given, _files(given) if ship else None
+                sent = job.name, job.place, given, _files(given) if ship else {}
                 future = client.submit(there, shared, pickle.dumps(sent), pure=False)
                 job_of[future] = job
                 running.add(future)
@@ -116,8 +116,11 @@ def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[
         raise RuntimeError(f"the worker has {_described(_versions())}")
     name, place, given, sent = pickle.loads(packed)
     with tempfile.TemporaryDirectory() as temporary:
-        here = Path(temporary)
-        paths = {} if sent is None else _unpacked(sent, here / "sent")
+        here, paths = Path(temporary), dict[Path, Path]()
+        for i, (path, data) in enumerate(sent.items()):         # names stay, as they tell what is in the files
+            paths[path] = here / "sent" / str(i) / path.name
+            paths[path].parent.mkdir(parents=True)
+            paths[path].write_bytes(data)
         job = Job(name, with_paths(given, lambda path: paths.get(path, path)), here / "made", place, here / "steps")
         outcome, notes = attempt_elsewhere(work, job)
         for theirs, mine in paths.items():
@@ -138,17 +141,6 @@ def _files(given: Any) -> dict[Path, bytes]:
         with contextlib.suppress(OSError):
             found[path] = path.read_bytes()
     return found
-
-
-def _unpacked(sent: dict[Path, bytes], folder: Path) -> dict[Path, Path]:
-    """Path there -> path here; names stay, as they tell what is in the files."""
-    here = {}
-    for i, (path, data) in enumerate(sent.items()):
-        place = folder / str(i)
-        place.mkdir(parents=True)
-        (place / path.name).write_bytes(data)
-        here[path] = place / path.name
-    return here
 
 
 def _versions() -> dict[str, str]:

@@ -86,6 +86,11 @@ class Digests:
             self._known[key], self._changed = [*now, found], True
         return found
 
+    def of_files(self, folder: Path) -> dict[str, str]:
+        """File -> digest of all files in a folder."""
+        return {path.relative_to(folder).as_posix(): self.of_file(path)
+                for path in sorted(folder.rglob("*")) if path.is_file()}
+
     def _update(self, whole: Any, value: Any) -> None:
         """Every value with its kind and length before it, so that no two run together."""
         if isinstance(value, Path):

@@ -100,8 +100,11 @@ def locked(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
                 file.seek(0)
                 raise ValueError(f"{output}: another run is at work on this output ({file.read().strip()}); "
                                  "wait for it, or name another output")
-            if not _still_there(file, path):
-                continue                # the run before removed it between our opening and our taking it
+            try:
+                if os.fstat(file.fileno()).st_ino != path.stat().st_ino:
+                    continue            # the run before removed it between our opening and our taking it
+            except OSError:
+                continue
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
             file.flush()
@@ -111,12 +114,6 @@ def locked(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
                 with contextlib.suppress(OSError):      # where open files cannot be removed it stays, unlocked
                     path.unlink()
             return
-
-
-def _still_there(file: IO[str], path: Path) -> bool:
-    with contextlib.suppress(OSError):
-        return os.fstat(file.fileno()).st_ino == path.stat().st_ino
-    return False
 
 
 def _take(file: IO[str]) -> bool:

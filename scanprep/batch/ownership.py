@@ -14,32 +14,10 @@ class ForeignFileError(ValueError):
     """Something stands where an output should go, and scapekit did not write it."""
 
 
-class Ownership:
-    """Which files of a folder are as scapekit wrote them."""
-
-    def __init__(self, folder: Path, digests: Digests) -> None:
-        self.folder, self.digests = folder, digests
-        self._written: dict[str, set[str]] = {}
-
-    def add(self, files: Mapping[str, str], place: Path) -> None:
-        """Files, from a place in the folder on, with the digests that they were written with."""
-        for file, digest in files.items():
-            self._written.setdefault((place.relative_to(self.folder) / file).as_posix(), set()).add(digest)
-
-    def has(self, file: str) -> bool:
-        """Whether a file was written by scapekit and has not been changed since."""
-        return self.digests.of_file(self.folder / file) in self._written.get(file, ())
-
-    def check_free(self, files: Mapping[str, str]) -> None:
-        """ForeignFileError where something else stands in the places of files with these digests."""
-        taken = []
-        for file, digest in files.items():
-            place = storage.path_inside(self.folder, file, self.folder)      # no link leads the file elsewhere
-            if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
-                    or (place.exists() and self.digests.of_file(place) != digest and not self.has(file)):
-                taken.append(place)
-        if taken:
-            raise ForeignFileError(refusal(*taken))
+def add_written(known: dict[str, set[str]], files: Mapping[str, str], place: Path) -> None:
+    """Add files, from a place in the output on, with the digests that they were written with."""
+    for file, digest in files.items():
+        known.setdefault((place / file).as_posix(), set()).add(digest)
 
 
 def report_path(output: Path) -> Path:

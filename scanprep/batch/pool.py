@@ -1,12 +1,11 @@
 """Tasks side by side: in this process, in processes of this machine, or on a Dask cluster."""
 from __future__ import annotations
 
-import contextlib
 import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Generic, TypeVar, cast
 
@@ -50,20 +49,30 @@ def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress 
 def _run_in_processes(work: Any, jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Any]]:
     """A process that dies, say for want of memory, stops no other job: those under way are tried again one at a
     time, so that the guilty one is known."""
+    from loky import ProcessPoolExecutor, as_completed
+    from loky.process_executor import BrokenProcessPool
+
     left = list(jobs)
     for at_once in (len(jobs), 1):
         while left:
             group = left[:at_once]
+            pool = ProcessPoolExecutor(min(count, len(group)), initializer=_begin, initargs=(work, os.getpid()))
             try:
-                with contextlib.closing(_in_parallel(work, group, count)) as outcomes:
-                    for job, outcome in outcomes:
-                        left.remove(job)
-                        yield job, outcome
-            except _Died as death:
+                job_of = {pool.submit(_do, job): job for job in group}
+                for future in as_completed(job_of):
+                    outcome, notes = future.result()
+                    for note in notes:
+                        warnings.warn(note, stacklevel=2)
+                    left.remove(job_of[future])
+                    yield job_of[future], outcome
+            except BrokenProcessPool as error:
                 if at_once > 1:
                     break
                 left.remove(group[0])
-                yield group[0], Failure(f"{group[0].name}: the process at work on it died: {death}")
+                why = " ".join(str(error).split())
+                yield group[0], Failure(f"{group[0].name}: the process at work on it died: {why}")
+            finally:
+                pool.shutdown(kill_workers=True)
 
 
 class SideBySide(Generic[T, R]):
@@ -116,28 +125,6 @@ class SideBySide(Generic[T, R]):
 
             self._pool = ProcessPoolExecutor(self._helpers, initializer=_begin, initargs=(self._function, os.getpid()))
         return result
-
-
-class _Died(Exception):
-    """A process ended without an answer."""
-
-
-def _in_parallel(work: Any, jobs: Sequence[Job], count: int) -> Generator[tuple[Job, Any], None, None]:
-    from loky import ProcessPoolExecutor, as_completed
-    from loky.process_executor import BrokenProcessPool
-
-    pool = ProcessPoolExecutor(min(count, len(jobs)), initializer=_begin, initargs=(work, os.getpid()))
-    try:
-        job_of = {pool.submit(_do, job): job for job in jobs}
-        for future in as_completed(job_of):
-            outcome, notes = future.result()
-            for note in notes:
-                warnings.warn(note, stacklevel=2)
-            yield job_of[future], outcome
-    except BrokenProcessPool as error:
-        raise _Died(" ".join(str(error).split())) from None
-    finally:
-        pool.shutdown(kill_workers=True)
 
 
 _work: Any = None

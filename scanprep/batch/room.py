@@ -73,32 +73,23 @@ class Room:
         def made() -> tuple[T, dict[str, str]]:
             shutil.rmtree(kept, ignore_errors=True)
             kept.mkdir(parents=True)
-            return make(kept), self._held(kept)
+            return make(kept), self._digests.of_files(kept)
 
         value, files = self.step(name, inputs, made)
-        if self._held(kept) != files:                    # other ones than those of the step
+        if self._digests.of_files(kept) != files:        # other ones than those of the step
             self._step_file(name).unlink()
             value, files = self.step(name, inputs, made)
         for file in files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
-            _link(kept / file, self.folder / file)
+            try:
+                os.link(kept / file, self.folder / file)
+            except OSError:                              # where that cannot be
+                shutil.copyfile(kept / file, self.folder / file)
         return value
 
     def _step_file(self, name: str) -> Path:
         assert self._steps is not None, "steps are kept"
         return self._steps / f"{quote(name, safe=' ')}.npz"
-
-    def _held(self, folder: Path) -> dict[str, str]:
-        return {path.relative_to(folder).as_posix(): self._digests.of_file(path)
-                for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def _link(path: Path, place: Path) -> None:
-    """The same file under another name, or a copy where that cannot be."""
-    try:
-        os.link(path, place)
-    except OSError:
-        shutil.copyfile(path, place)
 
 
 def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:

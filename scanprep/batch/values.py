@@ -77,14 +77,9 @@ def _unpacked(told: Any, arrays: list[np.ndarray]) -> Any:
         return tuple(_unpacked(v, arrays) for v in told["tuple"])
     if "dict" in told:
         return {_unpacked(k, arrays): _unpacked(v, arrays) for k, v in told["dict"]}
-    return _remade(told["class"], {name: _unpacked(v, arrays) for name, v in told["fields"].items()})
-
-
-def _remade(name: str, values: dict[str, Any]) -> Any:
-    """An object of a frozen dataclass of this project, by its constructor, which does nothing but check its values.
-
-    Folders of results travel, so the name may be anything.
-    """
+    # an object of a frozen dataclass of this project, by its constructor, which does nothing but check its values;
+    # folders of results travel, so the name may be anything
+    name, values = told["class"], {name: _unpacked(v, arrays) for name, v in told["fields"].items()}
     module, _, qualified = name.partition(":")
     if module.split(".")[0] not in PACKAGES:
         raise ValueError(f"{name} is not of this project")

@@ -15,6 +15,7 @@ import contextlib
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,7 +25,7 @@ from urllib.parse import quote, unquote
 
 from ..geometry import storage
 from .digests import Digests
-from .ownership import HOME, ForeignFileError, Ownership, refusal, report_path, written_of
+from .ownership import HOME, ForeignFileError, add_written, refusal, report_path, written_of
 from .pool import Failure, Job, Progress, Workers, run_jobs
 from .values import load_header, load_value, save_value
 
@@ -77,13 +78,14 @@ class Workspace:
         self._made: set[str] = set()
 
     @cached_property
-    def _own(self) -> Ownership:
-        found = Ownership(self.folder, self.digests)
+    def _written(self) -> dict[str, set[str]]:
+        """File of the output -> digests that it was written with."""
+        found: dict[str, set[str]] = {}
         for place in {self.folder, self.output or self.folder}:
             for record in (place / HOME / "done").glob("*.npz"):
-                found.add(_files_of(record, place), place)
+                add_written(found, _files_of(record, place), place.relative_to(self.folder))
         if self.output is not None:
-            found.add(written_of(self.output), report_path(self.output).parent)
+            add_written(found, written_of(self.output), report_path(self.output).parent.relative_to(self.folder))
         return found
 
     def run(self, work: Any, tasks: Sequence[Task], workers: Workers | None = None, progress: Progress | None = None,
@@ -99,35 +101,37 @@ class Workspace:
         common = self.digests.of(work)
         keys = {task.name: self._key(common, task) for task in tasks}
         assert len(keys) == len(tasks), "names of tasks differ"
-        by_name = {task.name: task for task in tasks}
-        values = {task.name: self._kept(task.name, keys[task.name]) for task in tasks}
-        wanted = [task for task in tasks if values[task.name] is NOTHING]
-        failures = {task.name: line for task in wanted if (line := self._blocked(task))}
+        # what is kept, what has no place to write to, and the jobs that are left
+        outcomes: dict[str, Any] = {name: self._kept(name, key) for name, key in keys.items()}
+        wanted = [task for task in tasks if outcomes[task.name] is NOTHING]
+        outcomes |= {task.name: Failure(line) for task in wanted if (line := self._blocked(task))}
         jobs = [Job(task.name, task.given, self._making(), task.place, self.home / "steps" / _plain(task.name),
-                    self.force) for task in wanted if task.name not in failures]
+                    self.force) for task in wanted if outcomes[task.name] is NOTHING]
         done = len(tasks) - len(jobs)
         tell(done, len(tasks))
         try:
             for job, outcome in run_jobs(work, jobs, workers or Workers(), inside):
-                if isinstance(outcome, Failure):
-                    where = str(self.folder / by_name[job.name].place)
-                    failures[job.name] = outcome.reason.replace(str(job.folder / job.place), where)
-                    self.drop(job.name)             # what was made of other inputs than there are now
-                else:
-                    try:
-                        self._publish(job.name, job.folder, keys[job.name], outcome, common)
-                        values[job.name] = self.value(job.name)
-                    except ForeignFileError as error:
-                        failures[job.name] = str(error)
+                outcomes[job.name] = self._accept(job, outcome, keys[job.name], common)
                 done += 1
                 tell(done, len(tasks))
         finally:
             for job in jobs:
                 shutil.rmtree(job.folder, ignore_errors=True)
+        failures = {name: one.reason for name, one in outcomes.items() if isinstance(one, Failure)}
         self.all_failed |= bool(tasks) and len(failures) == len(tasks)
-        return Results({name: value for name, value in values.items() if name not in failures},
-                       {task.name: failures[task.name] for task in tasks if task.name in failures},
+        return Results({name: value for name, value in outcomes.items() if name not in failures}, failures,
                        tuple(job.name for job in jobs if job.name not in failures))
+
+    def _accept(self, job: Job, outcome: Any, key: str, work: str) -> Any:
+        """The value of a job as it is kept, its files in their place; or a Failure, which tells of that place."""
+        if isinstance(outcome, Failure):
+            self.drop(job.name)                     # what was made of other inputs than there are now
+            return Failure(outcome.reason.replace(str(job.folder / job.place), str(self.folder / job.place)))
+        try:
+            self._publish(job.name, job.folder, key, outcome, work)
+        except ForeignFileError as error:
+            return Failure(str(error))
+        return self.value(job.name)
 
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
         """What `make` returns, or returned for the same inputs before; it gets a folder for files of the output."""
@@ -194,8 +198,8 @@ class Workspace:
         return found
 
     def is_ours(self, file: str) -> bool:
-        """Whether a file of the output is as scapekit wrote it."""
-        return self._own.has(file)
+        """Whether a file of the output is as scapekit wrote it, and has not been changed since."""
+        return self.digests.of_file(self.folder / file) in self._written.get(file, ())
 
     def value(self, name: str) -> Any:
         """A result as it is kept: how arrays lie in memory decides the last digits of sums."""
@@ -234,9 +238,14 @@ class Workspace:
 
     def _publish(self, name: str, staged: Path, key: str, value: Any, work: str = "") -> None:
         """Whole from the moment at which the folder gets its name among the ready ones."""
-        files = {path.relative_to(staged).as_posix(): self.digests.of_file(path)
-                 for path in sorted(staged.rglob("*")) if path.is_file()}
-        self._own.check_free(files)
+        files, taken = self.digests.of_files(staged), list[Path]()
+        for file, digest in files.items():
+            place = storage.path_inside(self.folder, file, self.folder)      # no link leads the file elsewhere
+            if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
+                    or (place.exists() and self.digests.of_file(place) != digest and not self.is_ours(file)):
+                taken.append(place)
+        if taken:
+            raise ForeignFileError(refusal(*taken))
         save_value(staged / RECORD, value, {"digest": key, "work": work, "files": files})
         ready = self.home / "ready" / _plain(name)
         ready.parent.mkdir(exist_ok=True)
@@ -259,7 +268,7 @@ class Workspace:
         for file, digest in before.items():
             if file not in header["files"]:
                 self._remove(file, digest)
-        self._own.add(header["files"], self.folder)
+        add_written(self._written, header["files"], Path())
         record.parent.mkdir(exist_ok=True)
         os.replace(ready / RECORD, record)
         shutil.rmtree(ready)
@@ -333,15 +342,20 @@ class KeptSteps:
 
     space: Workspace
     found: list[str] = field(default_factory=list)          # the steps that had been done before this run
-    made: set[str] = field(default_factory=set)             # those that were done now
+    seconds: dict[str, float] = field(default_factory=dict)     # that those which were done now took
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
+        begun, made = time.perf_counter(), False
+
         def now(folder: Path) -> T:
-            self.made.add(name)
+            nonlocal made
+            made = True
             return make()
 
         value = self.space.step(name, inputs, now)
-        if name not in self.made:
+        if made:
+            self.seconds[name] = time.perf_counter() - begun
+        elif name not in self.seconds:
             self.found.append(name)
         self.space.drop_others(f"{name}/")
         return value

@@ -4,13 +4,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
 from ..geometry.places import spacing
 from ..geometry.sanitise import sanitise
+from ..geometry.sparse import connected_pieces
 from ..ranges import Settings
 from .floor import Plane, find_plane, floor_points
 
@@ -188,8 +187,7 @@ def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
                            _sparse_links(points[first], link, SPARSE * link)])
     a = np.concatenate([sides[:, 0], first[near[:, 0]], np.arange(len(points))])
     b = np.concatenate([sides[:, 1], first[near[:, 1]], first[cell.reshape(-1)]])
-    _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(points), len(points))),
-                                    directed=False)
+    label = connected_pieces(a, b, len(points))
     size = np.bincount(label[first])                    # by cells, not by points, which crowd near the scanner
     rank = np.argsort(np.argsort(-size, kind="stable"), kind="stable")
     return np.asarray(rank[label])

@@ -58,17 +58,17 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
             plane, height = plane.flipped(), -height
         if np.mean(height < -WIDEST) > MOST_BELOW:
             continue
-        area = _covered_area(plane.flat(few[np.abs(height) < WIDEST / 2]), WIDEST)
+        area = _area_of_cells(plane.flat(few[np.abs(height) < WIDEST / 2]), WIDEST)
         if area > best_area:
             best, best_area = plane, area
     if best is None:
         return None
-    plane = _refined(best, points)
+    plane = _refine(best, points)
     height = plane.height(points)
     on_it = np.abs(height) <= plane.thickness
     if (plane.noise > 2 * local_noise(points, rng)           # a back is nearly flat, but only nearly
             or np.mean(height < -WIDEST / 2) > MOST_BELOW
-            or _covered_area(plane.flat(points[on_it]), WIDEST) < min_area):
+            or _area_of_cells(plane.flat(points[on_it]), WIDEST) < min_area):
         return None
     return plane
 
@@ -115,7 +115,7 @@ def inside_outline(points: np.ndarray, outline: np.ndarray, bridge: float) -> np
     return inside
 
 
-def _covered_area(flat: np.ndarray, cell: float) -> float:
+def _area_of_cells(flat: np.ndarray, cell: float) -> float:
     """Square metres of the cells, `cell` metres wide, that have one of the points (n, 2)."""
     place = np.floor((flat - flat.min(axis=0, initial=np.inf)) / cell).astype(np.int64)
     return len(np.unique(place[:, 0] * (place[:, 1].max(initial=0) + 1) + place[:, 1])) * cell**2
@@ -127,7 +127,7 @@ def _fit(points: np.ndarray) -> Plane:
     return Plane(axes[:, 0], float(axes[:, 0] @ centre), float(np.sqrt(max(spread[0], 0.0))))
 
 
-def _refined(plane: Plane, points: np.ndarray) -> Plane:
+def _refine(plane: Plane, points: np.ndarray) -> Plane:
     """Fitted to points that are closer every time, the noise by the median so that feet do not count."""
     band = WIDEST
     for _ in range(8):

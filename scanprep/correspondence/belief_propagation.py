@@ -45,30 +45,30 @@ def propagate(field: PairField, iterations: int = 40, damping: float = 0.3, tole
     return_ = np.exp(-np.ascontiguousarray(field.pairwise, dtype=np.float32))
     done, change = 0, np.inf
     while done < iterations and change > tolerance:
-        belief = _gathered(field, forth, back)
-        new_forth = _passed(onward, _scaled(belief[i] - back))
-        new_back = _passed(return_, _scaled(belief[j] - forth))
+        belief = _gather(field, forth, back)
+        new_forth = _send(onward, _normalise(belief[i] - back))
+        new_back = _send(return_, _normalise(belief[j] - forth))
         change = max(float(np.abs(new_forth - forth).mean()), float(np.abs(new_back - back).mean())) if len(i) else 0.0
         forth = damping * forth + (1 - damping) * new_forth
         back = damping * back + (1 - damping) * new_back
         done += 1
-    p = np.exp(_scaled(_gathered(field, forth, back)))
+    p = np.exp(_normalise(_gather(field, forth, back)))
     return Beliefs(p / p.sum(axis=1, keepdims=True), p.argmax(axis=1), done, change <= tolerance)
 
 
-def _gathered(field: PairField, forth: np.ndarray, back: np.ndarray) -> np.ndarray:
+def _gather(field: PairField, forth: np.ndarray, back: np.ndarray) -> np.ndarray:
     belief = -np.asarray(field.unary, dtype=np.float64)
     np.add.at(belief, field.edges[:, 1], forth)
     np.add.at(belief, field.edges[:, 0], back)
     return belief
 
 
-def _passed(weights: np.ndarray, log_belief: np.ndarray) -> np.ndarray:
+def _send(weights: np.ndarray, log_belief: np.ndarray) -> np.ndarray:
     sums = np.matmul(weights, np.exp(log_belief).astype(np.float32)[..., None])[..., 0]
-    return _scaled(np.log(np.maximum(sums.astype(np.float64), 1e-37)))
+    return _normalise(np.log(np.maximum(sums.astype(np.float64), 1e-37)))
 
 
-def _scaled(messages: np.ndarray) -> np.ndarray:
+def _normalise(messages: np.ndarray) -> np.ndarray:
     """Log-messages with their largest entry at zero; those below e^-60 say no more than that."""
     if not messages.size:
         return messages

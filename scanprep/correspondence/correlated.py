@@ -96,7 +96,7 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypothese
     seen, seen_ways = _ends(sheet.points, sheet.distances, ends + 2, APART * size)
     if len(seen) < 3:
         raise ValueError(f"scan: expected at least three ends of limbs, found {len(seen)}")
-    matches = matched_ends(ways[:, own], seen_ways[:, seen], hypotheses)
+    matches = match_ends(ways[:, own], seen_ways[:, seen], hypotheses)
     trials = []
     for image in matches:
         there = image >= 0
@@ -145,7 +145,7 @@ def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], cou
     return ends, distances(ends) if len(ends) else np.zeros((0, len(points)))
 
 
-def matched_ends(template: np.ndarray, scan: np.ndarray, count: int) -> list[np.ndarray]:
+def match_ends(template: np.ndarray, scan: np.ndarray, count: int) -> list[np.ndarray]:
     """So many matches of the ends that keep the ways between them, (E, E) and (F, F) metres, best, best first.
 
     Each is the scan's end for every end of the template (E,), -1 for none.

@@ -16,11 +16,6 @@ from ..geometry.mesh import Mesh
 
 KIND, VERSION = "correspondences", 1
 
-# Median confidence of correspondences, below which they mean nothing, and from which they are right. Right ones have
-# 0.81 to 0.87 on five real scans of the template's kind, 0.79 and 0.81 on two others, 0.72 on a person with long hair.
-# Of mistaken limbs two scans have 0.66 and 0.73, three of a depth camera 0.31 to 0.43; a ball has 0.25 to 0.37.
-GUESSED, SURE = 0.55, 0.77
-
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
@@ -59,13 +54,17 @@ def checked_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name
 def correspondences_doubts(found: Correspondences) -> list[str]:
     """Why correspondences are to be looked at: limbs may have been mistaken for each other."""
     sure = float(np.median(found.confidence)) if len(found) else 0.0
-    return [f"the median confidence is {sure:.2f}: limbs may be mistaken for each other"] if sure < SURE else []
+    # Median confidence of correspondences, below which they mean nothing, and from which they are right. Right ones
+    # have 0.81 to 0.87 on five real scans of the template's kind, 0.79 and 0.81 on two others, 0.72 on a person with
+    # long hair. Of mistaken limbs two scans have 0.66 and 0.73, three of a depth camera 0.31 to 0.43; a ball has 0.25
+    # to 0.37.
+    return [f"the median confidence is {sure:.2f}: limbs may be mistaken for each other"] if sure < 0.77 else []
 
 
 def correspondences_problem(found: Correspondences) -> str | None:
     """Why correspondences mean nothing, with the likely cause; None where they mean something."""
     sure = float(np.median(found.confidence)) if len(found) else 0.0
-    if sure >= GUESSED:
+    if sure >= 0.55:
         return None
     return (f"{len(found)} pairs were found with a median confidence of {sure:.2f}; a scan of something else, too "
             "little of the body, or landmarks of other places?")

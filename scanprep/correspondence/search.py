@@ -98,12 +98,27 @@ def search(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config
     """Belief propagation over the places of one level, in domains pruned by what is known; the template rescaled."""
     spread = np.arange(min(level.places, len(surfaces.places)))
     unary = place_energy(surfaces.scan, surfaces.places[spread], surfaces.size)
-    wanted = unary if before is None else -_passed_on(surfaces, before, spread)
+    wanted = unary if before is None else -_expected_places(surfaces, before, spread)
     domains = np.argsort(wanted, axis=1)[:, :level.domain]
-    field = _field(surfaces, spread[domains], np.take_along_axis(unary, domains, axis=1))
+    n, K = domains.shape
+    # The field has one more state that says: no image. It costs half of what the worst one may cost, and so does each
+    # edge to it. All that speaks for a single image counts half.
+    energies = np.full((n, K + 1), 0.5 * 0.5 * most_place_energy(surfaces.scan.to_seeds.shape[1]))
+    energies[:, :K] = 0.5 * np.take_along_axis(unary, domains, axis=1)
+    domains = spread[domains]
+    pairwise = np.full((len(surfaces.edges), K + 1, K + 1), 0.5 * MOST_EDGE, dtype=np.float32)
+    pairwise[:, :K, :K] = edge_energy(surfaces.scan, surfaces.places, surfaces.edges, domains, surfaces.size)
+    field = PairField(energies, surfaces.edges, pairwise)
     beliefs = propagate(field, config.iterations)
-    images = Images(spread[domains], beliefs, field.energy(beliefs.states))
-    return _rescaled(surfaces, images), images
+    images = Images(domains, beliefs, field.energy(beliefs.states))
+    # The template is scaled by the edges whose images are known: bending changes paths, but not short edges.
+    i, j = surfaces.edges[images.found[surfaces.edges].all(axis=1)].T
+    x, y = surfaces.scan.points, surfaces.places.points[images.chosen]
+    far = np.linalg.norm(y[i] - y[j], axis=1)
+    ratio = np.linalg.norm(x[i] - x[j], axis=1)[far > 0] / far[far > 0]
+    grown = float(np.median(ratio)) if len(ratio) else 1.0
+    places = replace(surfaces.places, points=grown * surfaces.places.points)
+    return replace(surfaces, places=places, scale=grown * surfaces.scale), images
 
 
 def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Correspondences:
@@ -112,7 +127,12 @@ def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Corr
     image, domains = images.chosen[found], images.domains[found]
     apart = np.linalg.norm(surfaces.places.points[domains] - surfaces.places.points[image][:, None], axis=2)
     sure = (images.beliefs.probabilities[found, :K] * (apart < 0.03 * surfaces.size)).sum(axis=1)
-    confidence = sure * np.exp(-_strain(surfaces, images)[found] / 4.0)
+    # mean energy of the edges around every point, each with the images chosen
+    edges = surfaces.edges[images.found[surfaces.edges].all(axis=1)]
+    cost = edge_energy(surfaces.scan, surfaces.places, edges, images.chosen[:, None], surfaces.size)[:, 0, 0]
+    total, count = (np.bincount(edges.ravel(), np.repeat(w, 2), len(images.domains))
+                    for w in (cost, np.ones(len(edges))))
+    confidence = sure * np.exp(-(total / np.maximum(count, 1))[found] / 4.0)
     order = np.argsort(-confidence, kind="stable")[:config.keep]
     energies = {"field": images.energy, "scale": surfaces.scale,
                 "without_image": float(len(images.domains) - len(found))}
@@ -138,7 +158,11 @@ def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedCo
     """Template and scan seen from seeds."""
     size = float(np.sqrt(template.face_areas.sum()))
     clicked, on_scan, on_template = seeds.points, seeds.on_scan, seeds.on_template
-    scale = _scale_between(on_template[:, seeds.vertices], on_scan[:, clicked])
+    # how much larger the scan is, by the distances between seeds: bending changes some of them
+    a, b = np.triu_indices(len(clicked), 1)
+    far, near = on_template[a, seeds.vertices[b]], on_scan[a, clicked[b]]
+    good = np.isfinite(far) & np.isfinite(near) & (far > 0) & (near > 0)
+    scale = float(np.median(near[good] / far[good])) if good.any() else 1.0
     chosen, edges = sheet.spread(config.points, 0.3 * size)
     off = np.linalg.norm(sheet.points[clicked] - seeds.places, axis=1)     # a click where there are no data
     same = (sheet.piece[chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
@@ -167,29 +191,7 @@ def _scale_between(template: np.ndarray, scan: np.ndarray) -> float:
     return float(np.median(near[good] / far[good])) if good.any() else 1.0
 
 
-def _field(surfaces: Surfaces, domains: np.ndarray, unary: np.ndarray) -> PairField:
-    """The field over the domains (n, K), with one more state that says: no image."""
-    (n, K), single = domains.shape, 0.5                            # weight of all that speaks for a single image
-    # no image costs half of what the worst one may cost, and so does each edge to it
-    energies = np.full((n, K + 1), 0.5 * single * most_place_energy(surfaces.scan.to_seeds.shape[1]))
-    energies[:, :K] = single * unary
-    pairwise = np.full((len(surfaces.edges), K + 1, K + 1), 0.5 * MOST_EDGE, dtype=np.float32)
-    pairwise[:, :K, :K] = edge_energy(surfaces.scan, surfaces.places, surfaces.edges, domains, surfaces.size)
-    return PairField(energies, surfaces.edges, pairwise)
-
-
-def _rescaled(surfaces: Surfaces, images: Images) -> Surfaces:
-    """The template scaled by the edges whose images are known: bending changes paths, but not short edges."""
-    i, j = surfaces.edges[images.found[surfaces.edges].all(axis=1)].T
-    x, y = surfaces.scan.points, surfaces.places.points[images.chosen]
-    far = np.linalg.norm(y[i] - y[j], axis=1)
-    ratio = np.linalg.norm(x[i] - x[j], axis=1)[far > 0] / far[far > 0]
-    grown = float(np.median(ratio)) if len(ratio) else 1.0
-    return replace(surfaces, places=replace(surfaces.places, points=grown * surfaces.places.points),
-                   scale=grown * surfaces.scale)
-
-
-def _passed_on(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
+def _expected_places(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
     """Beliefs so far, spread over other places near by: (n, m), not normalised."""
     n, K = images.domains.shape
     reach = 0.012 * surfaces.size
@@ -201,12 +203,3 @@ def _passed_on(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.nda
     share = csr_array(coo_array((np.exp(-0.5 * (near.data / reach) ** 2), (near.row, near.col)),
                                 shape=(len(old), len(places))))
     return p @ share
-
-
-def _strain(surfaces: Surfaces, images: Images) -> np.ndarray:
-    """Mean energy (n,) of the edges around every point, each with the images chosen."""
-    n = len(images.domains)
-    edges = surfaces.edges[images.found[surfaces.edges].all(axis=1)]
-    cost = edge_energy(surfaces.scan, surfaces.places, edges, images.chosen[:, None], surfaces.size)[:, 0, 0]
-    total, count = (np.bincount(edges.ravel(), np.repeat(w, 2), n) for w in (cost, np.ones(len(edges))))
-    return total / np.maximum(count, 1)

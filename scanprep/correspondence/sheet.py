@@ -27,12 +27,20 @@ class Sheet:
     def __init__(self, target: Target, spacing: float) -> None:
         keep = thin(target.points, spacing)
         self.spacing = spacing
-        self.points, self.normals = _averaged(target, keep, spacing)
+        # points and normals, each the mean over those close by that face the same way: less noise
+        near_distance, near = cKDTree(target.points).query(target.points[keep], min(24, len(target.points)))
+        cosine = np.einsum("nkd,nd->nk", target.normals[near], target.normals[keep])
+        sign = np.where(cosine < 0, -1.0, 1.0) if not target.oriented else np.ones_like(cosine)
+        w = (near_distance < spacing) * (np.abs(cosine) if not target.oriented else cosine > 0.3)
+        w[:, 0] = 1.0
+        points = np.einsum("nk,nkd->nd", w, target.points[near]) / w.sum(axis=1, keepdims=True)
+        normals = np.einsum("nk,nkd->nd", w * sign, target.normals[near])
+        self.points, self.normals = points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         if not target.oriented:
-            self.normals = _oriented(self.points, self.normals, self.REACH * spacing)
+            self.normals = _orient(self.points, self.normals, self.REACH * spacing)
         self.surface = self._edges()
         _, self.piece = connected_components(self.surface, directed=False)
-        self.graph = _joined(self.points, self.surface, self.piece)
+        self.graph = _join(self.points, self.surface, self.piece)
         self.tree = cKDTree(self.points)
         self._spread: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}
 
@@ -77,24 +85,12 @@ def _neighbours(between: np.ndarray) -> np.ndarray:
     return np.unique(np.sort(np.stack([i[linked], j[linked]], axis=1), axis=1), axis=0)
 
 
-def _averaged(target: Target, keep: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals, each the mean over those close by that face the same way: less noise."""
-    near_distance, near = cKDTree(target.points).query(target.points[keep], min(24, len(target.points)))
-    cosine = np.einsum("nkd,nd->nk", target.normals[near], target.normals[keep])
-    sign = np.where(cosine < 0, -1.0, 1.0) if not target.oriented else np.ones_like(cosine)
-    w = (near_distance < spacing) * (np.abs(cosine) if not target.oriented else cosine > 0.3)
-    w[:, 0] = 1.0
-    points = np.einsum("nk,nkd->nd", w, target.points[near]) / w.sum(axis=1, keepdims=True)
-    normals = np.einsum("nk,nkd->nd", w * sign, target.normals[near])
-    return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
 def _symmetric(i: np.ndarray, j: np.ndarray, length: np.ndarray, count: int) -> csr_array:
     rows, columns = np.r_[i, j], np.r_[j, i]
     return csr_array(coo_array((np.maximum(np.r_[length, length], 1e-9), (rows, columns)), shape=(count, count)))
 
 
-def _joined(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_array:
+def _join(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_array:
     """The graph with its larger pieces linked by the shortest straight bridges, as holes may part a body."""
     size = np.bincount(label)
     large = np.flatnonzero(size >= max(20, 0.002 * len(points)))
@@ -115,7 +111,7 @@ def _joined(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_arra
     return graph + _symmetric(i[used].astype(np.int64), j[used].astype(np.int64), length[used], len(points))
 
 
-def _oriented(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray:
+def _orient(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray:
     """Normals (n, 3) with signs that agree between neighbours and point outward on the whole."""
     i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
     along = points[j] - points[i]

@@ -12,7 +12,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.remeshing import improve_triangles
 from ..geometry.surface import Surface
 from ..ranges import FLAG, Settings
-from .edge_collapse import FIXED, HOLD, Rounds, followed
+from .edge_collapse import FIXED, HOLD, Rounds, final_owner
 from .quadrics import lowest, sum_at, surface_quadrics
 
 Method = Literal["quadric", "even", "fast", "open3d", "pymeshlab"]
@@ -138,7 +138,15 @@ def _mean_colors(mesh: Mesh, owner: np.ndarray, count: int) -> np.ndarray | None
 
 def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
     if method == "even":
-        return _even(mesh, faces)
+        # shortest edges collapse to their middles, which are then put back onto the surface
+        import igl
+
+        vertices, triangles = igl.decimate(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces), faces)[:2]
+        smaller = Mesh(vertices, triangles)
+        placed = np.array(vertices)
+        inner = np.setdiff1d(np.arange(len(placed)), smaller.boundary_vertices)
+        placed[inner] = Surface(mesh).closest(placed[inner]).points
+        return smaller.with_vertices(placed)
     if method == "fast":
         mended = fast_collapses(mesh, faces)
         return mended if len(mended.faces) <= faces else collapse(mended, faces).mesh
@@ -147,18 +155,6 @@ def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
     else:
         from ..adapters.pymeshlab_filters import quadric_decimation
     return quadric_decimation(mesh, faces)
-
-
-def _even(mesh: Mesh, faces: int) -> Mesh:
-    """Shortest edges collapse to their middles, which are then put back onto the surface."""
-    import igl
-
-    vertices, triangles = igl.decimate(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces), faces)[:2]
-    smaller = Mesh(vertices, triangles)
-    placed = np.array(vertices)
-    inner = np.setdiff1d(np.arange(len(placed)), smaller.boundary_vertices)
-    placed[inner] = Surface(mesh).closest(placed[inner]).points
-    return smaller.with_vertices(placed)
 
 
 def fast_collapses(mesh: Mesh, faces: int) -> Mesh:
@@ -179,7 +175,7 @@ def fast_collapses(mesh: Mesh, faces: int) -> Mesh:
     while True:
         owner = np.arange(len(mesh.vertices))
         owner[collapses[~undone, 1]] = collapses[~undone, 0]      # the second goes into the first
-        kept, number = np.unique(followed(owner), return_inverse=True)
+        kept, number = np.unique(final_owner(owner), return_inverse=True)
         corners = number[mesh.faces]
         whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
         left = Mesh(lowest(sum_at(number[:, None], quadrics, len(kept))) + centre, corners[whole])

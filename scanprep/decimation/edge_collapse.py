@@ -29,11 +29,11 @@ class Rounds:
     def __init__(self, mesh: Mesh, points: np.ndarray, keep: np.ndarray | None = None,
                  labels: np.ndarray | None = None, crease: float | None = None, onto_vertices: bool = False) -> None:
         N = len(points)
-        curves = kept_curves(mesh, labels, crease)
+        curves = curves_to_keep(mesh, labels, crease)
         kinds = np.minimum(np.bincount(curves.ravel(), minlength=N), 3)
         self.kinds = np.array([FREE, FIXED, CURVE, FIXED])[kinds]    # the end of a curve, or where several meet, stays
         if keep is not None:
-            self.kinds[checked_vertices(mesh, keep)] = FIXED
+            self.kinds[check_vertices(mesh, keep)] = FIXED
         self.onto_vertices, self.thinnest = onto_vertices, THINNEST
         self.points, (self.quadrics, areas) = np.array(points), surface_quadrics(points, mesh.faces, HOLD)
         self.quadrics += wall_quadrics(mesh, points, areas, curves)
@@ -65,7 +65,7 @@ class Rounds:
 
     def numbered(self) -> tuple[np.ndarray, np.ndarray]:
         """The remaining vertices (n,), and for every original one (N,) which of them it ended in."""
-        return np.unique(followed(self.owner), return_inverse=True)
+        return np.unique(final_owner(self.owner), return_inverse=True)
 
     def _price(self, rows: np.ndarray) -> None:
         """Order the ends of edges (kept first), and set the cost of collapsing them."""
@@ -144,7 +144,11 @@ class Rounds:
         good &= self._keeps_triangles(rows, goal[:, 0], star[~gone], of[~gone])
         self.refused[rows[~good]] = True
         good[good] = np.cumsum(removed[good]) - removed[good] < surplus
-        self._apply(rows[good], Q[good], goal[good])
+        # merge the ends of edges
+        keep, drop = self.ends[rows[good]].T
+        self.owner[drop] = keep
+        self.points[keep], self.quadrics[keep] = goal[good], Q[good]
+        self.areas[keep] += self.areas[drop]
         self._rejoin(rows, good, star, gone, of, near, of_near, outer, twin)
 
     def _keeps_topology(self, count: int, removed: np.ndarray, near: np.ndarray, of_near: np.ndarray,
@@ -183,13 +187,6 @@ class Rounds:
         good = np.ones(len(rows), dtype=bool)
         good[of[bad]] = False
         return good
-
-    def _apply(self, rows: np.ndarray, quadrics: np.ndarray, goal: np.ndarray) -> None:
-        """Merge the ends of edges."""
-        keep, drop = self.ends[rows].T
-        self.owner[drop] = keep
-        self.points[keep], self.quadrics[keep] = goal, quadrics
-        self.areas[keep] += self.areas[drop]
 
     def _rejoin(self, rows: np.ndarray, good: np.ndarray, star: np.ndarray, gone: np.ndarray, of: np.ndarray,
                 near: np.ndarray, of_near: np.ndarray, outer: np.ndarray, twin: np.ndarray) -> None:
@@ -245,7 +242,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...d,...d->...", a, b)
 
 
-def followed(owner: np.ndarray) -> np.ndarray:
+def final_owner(owner: np.ndarray) -> np.ndarray:
     """Where every vertex ends when each goes to its owner (N,), that one to its own, and so on."""
     while not np.array_equal(further := owner[owner], owner):
         owner = further
@@ -262,7 +259,7 @@ def wall_quadrics(mesh: Mesh, points: np.ndarray, areas: np.ndarray, curves: np.
     return curve_quadrics(points, curves, areas[curves].sum(axis=1), weight)
 
 
-def kept_curves(mesh: Mesh, labels: np.ndarray | None = None, crease: float | None = None) -> np.ndarray:
+def curves_to_keep(mesh: Mesh, labels: np.ndarray | None = None, crease: float | None = None) -> np.ndarray:
     """(E, 2) vertices of border edges, edges between labels, and creases sharper than an angle in radians."""
     stays = mesh.edge_use == 1
     inner, (left, right) = np.flatnonzero(mesh.edge_use == 2), mesh.face_pairs.T
@@ -277,7 +274,7 @@ def kept_curves(mesh: Mesh, labels: np.ndarray | None = None, crease: float | No
     return mesh.edges[stays]
 
 
-def checked_vertices(mesh: Mesh, keep: np.ndarray) -> np.ndarray:
+def check_vertices(mesh: Mesh, keep: np.ndarray) -> np.ndarray:
     """The vertices as integers, or ValueError when some are not of the mesh."""
     keep = np.asarray(keep, dtype=np.int64).reshape(-1)
     wrong = keep[(keep < 0) | (keep >= len(mesh.vertices))]

@@ -17,7 +17,7 @@ from ..geometry.landmarks import read_landmark_vertices, write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
 from ..skeleton.tree import Skeleton
-from .edge_collapse import FIXED, Rounds, checked_vertices, kept_curves, wall_quadrics
+from .edge_collapse import FIXED, Rounds, check_vertices, curves_to_keep, wall_quadrics
 from .quadrics import lowest, sum_at, surface_quadrics
 
 Progress = Callable[[int, int], None]
@@ -69,16 +69,16 @@ class DecimatedSet:
         kept = vertices[..., self.vertex_map, :]
         if self.config.placement == "vertices":
             return kept
-        curves = kept_curves(self.source, self.labels)
+        curves = curves_to_keep(self.source, self.labels)
         for place in np.ndindex(vertices.shape[:-2]):
-            kept[place] = self._solved(vertices[place], curves)
+            kept[place] = self._solve(vertices[place], curves)
         return kept
 
     def landmarks(self, vertices: Mapping[str, int]) -> dict[str, int]:
         """New numbers of named vertices; of the vertex that stands for it where one was not kept."""
         return {name: int(self.owner[v]) for name, v in vertices.items()}
 
-    def _solved(self, vertices: np.ndarray, curves: np.ndarray) -> np.ndarray:
+    def _solve(self, vertices: np.ndarray, curves: np.ndarray) -> np.ndarray:
         """Vertices (n, 3) of one small mesh, each where the error of those it stands for is least."""
         centre = vertices.mean(axis=0)
         points = (vertices - centre)[:, None]
@@ -131,13 +131,13 @@ def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: D
     if skeleton is not None and len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"skeleton: expected {len(template.faces)} faces as the template has, "
                          f"got {len(skeleton.part_of_face)}")
-    keep = checked_vertices(template, np.zeros(0) if keep is None else keep)
+    keep = check_vertices(template, np.zeros(0) if keep is None else keep)
     labels = None if skeleton is None else skeleton.part_of_face
     points = _different_meshes(template, poses, config.meshes)
     rounds = Rounds(template, points.swapaxes(0, 1), keep, labels, onto_vertices=config.placement == "vertices")
     rounds.run(faces, progress)
     kept, owner = rounds.numbered()
-    return _assembled(template, skeleton, kept, owner, rounds.face_rows, rounds.kinds[kept] == FIXED, config)
+    return _assemble(template, skeleton, kept, owner, rounds.face_rows, rounds.kinds[kept] == FIXED, config)
 
 
 def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> np.ndarray:
@@ -153,7 +153,7 @@ def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> n
         placed, count, 0, lambda i, _: np.sqrt(((placed - placed[i]) ** 2).sum(axis=2).mean(axis=1)), least=1e-9)]
 
 
-def _assembled(source: Mesh, skeleton: Skeleton | None, vertex_map: np.ndarray, owner: np.ndarray,
+def _assemble(source: Mesh, skeleton: Skeleton | None, vertex_map: np.ndarray, owner: np.ndarray,
                face_map: np.ndarray, fixed: np.ndarray, config: DecimateSetConfig) -> DecimatedSet:
     """The result of `decimate_set` from its maps and the original template and skeleton."""
     labels = None if skeleton is None else skeleton.part_of_face
@@ -242,4 +242,4 @@ def _load_map(path: Path, source: RegisteredSet, config: DecimateSetConfig, sett
         for name, most in (("vertex_map", len(owner)), ("face_map", len(source.template.faces))):
             if len(arrays[name]) and not 0 <= arrays[name].min() <= arrays[name].max() < most:
                 raise ValueError(f"{name}: expected numbers 0..{most - 1}")
-        return _assembled(source.template, source.skeleton, vertex_map, owner, face_map, fixed, config)
+        return _assemble(source.template, source.skeleton, vertex_map, owner, face_map, fixed, config)

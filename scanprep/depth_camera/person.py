@@ -7,17 +7,13 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from ..geometry.sparse import connected_pieces
 from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
 LEAST_AREA, LEAST_RADIUS = 0.075, 0.08  # of what is seen of a body, and of the largest circle in it: a leg has less
-MOST_AREA = 0.5                      # two people that touch show more
-PLANE_AREA, OPEN_AREA = 0.2, 0.6     # of floors and walls; of what something is behind: two backs are not that large
-BEHIND = 0.02                        # share of the picture that may seem to be behind a wall
 PIECE = 0.003                        # area below which a piece is noise
 APART = 0.08                         # pieces closer than this are one: an arm in front of its body
-NEAR = 0.15                          # pieces too small for a person are of the person who is so near: an arm behind
-GUESSES, PLANES = 300, 8             # of planes, and planes taken away at most
 THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, cosine within which points are on one
 
 
@@ -60,7 +56,7 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     """
     small = picture.without_flying_pixels().halved()
     pieces = _pieces(small, small.seen & ~room_planes(small, size), size)
-    shown = [_shown(small, mask, size) for mask in pieces]
+    shown = [_area_and_radius(small, mask, size) for mask in pieces]
     people = [mask for mask, (area, radius) in zip(pieces, shown, strict=True)
               if area >= LEAST_AREA and radius >= LEAST_RADIUS]
     if not people:
@@ -70,9 +66,15 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     if len(people) > 1:
         raise ValueError(f"picture: {len(people)} people, or things as large, are in it; one is expected: set the "
                          "depth of all else to 0, or give landmarks on the person")
-    mask = _with_neighbours(small, people[0], pieces, size)
-    area = _shown(small, mask, size)[0]
-    if area > MOST_AREA:
+    # pieces too small for a person are of the person who is so near: an arm behind
+    points, mask = small.points(), people[0].copy()
+    tree = cKDTree(points[people[0]][::3])
+    for piece in pieces:
+        if piece is not people[0] and tree.query(points[piece][::3])[0].min() < 0.15 * size:
+            mask |= piece
+    area = _area_and_radius(small, mask, size)[0]
+    # two people that touch show more
+    if area > 0.5:
         raise ValueError(f"picture: what stands in it shows {area * size**2:.1f} m², more than a person does: two "
                          "people who touch, or a wall that was not recognised; set the depth of all else to 0")
     return Person(small, mask)
@@ -86,14 +88,15 @@ def room_planes(picture: DepthPicture, size: float) -> np.ndarray:
     points, normals = picture.points(), picture.normals()
     open_, rng = picture.seen & np.isfinite(normals).all(axis=2), np.random.default_rng(0)
     taken = np.zeros(open_.shape, dtype=bool)
-    for _ in range(PLANES):
+    # of planes, and planes taken away at most
+    for _ in range(8):
         p, n = points[open_], normals[open_]
         if len(p) < 100:
             break
         some = rng.choice(len(p), min(4000, len(p)), replace=False)
         area = _areas(picture, p[some], n[some]) * len(p) / len(some)
         guesses = [(area[_on(p[some], n[some], n[i], n[i] @ p[i])].sum(), i)
-                   for i in rng.choice(len(p), min(GUESSES, len(p)), replace=False)]
+                   for i in rng.choice(len(p), min(300, len(p)), replace=False)]
         _, best = max(guesses)
         normal, offset = n[best], n[best] @ p[best]
         for _ in range(3):
@@ -106,7 +109,8 @@ def room_planes(picture: DepthPicture, size: float) -> np.ndarray:
             offset = normal @ centre
         mine = _on(p, n, normal, offset)
         behind = np.mean(points[picture.seen] @ normal - offset < -2 * _thickness(points[picture.seen]))
-        if _areas(picture, p[mine], n[mine]).sum() < (OPEN_AREA if behind > BEHIND else PLANE_AREA) * size**2:
+        # of floors and walls; of what something is behind: two backs are not that large
+        if _areas(picture, p[mine], n[mine]).sum() < (0.6 if behind > 0.02 else 0.2) * size**2:
             break
         taken[picture.seen] |= np.abs(points[picture.seen] @ normal - offset) < _thickness(points[picture.seen])
         open_ &= ~taken
@@ -139,7 +143,7 @@ def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.nda
     """Masks (h, w) of what hangs together in space, largest first."""
     across, down = (np.abs(np.diff(picture.depth, axis=a)) < 1.5 * JUMP * np.maximum(
         np.nan_to_num(picture.depth[:, 1:] if a else picture.depth[1:]), 1) for a in (1, 0))
-    number = _joined(mask, across, down)
+    number = _label_pieces(mask, across, down)
     count = np.bincount(number[mask])
     area = np.bincount(number[mask], weights=picture.depth[mask]**2) / np.prod(np.diag(picture.intrinsics)[:2])
     kept = [i for i in np.argsort(-area) if area[i] > PIECE * size**2 and count[i] > 20]
@@ -156,30 +160,16 @@ def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.nda
     return sorted(found, key=lambda piece: -float((picture.depth[piece]**2).sum()))
 
 
-def _with_neighbours(picture: DepthPicture, person: np.ndarray, pieces: list[np.ndarray], size: float) -> np.ndarray:
-    """The mask (h, w) of a person with the pieces near."""
-    points, out = picture.points(), person.copy()
-    tree = cKDTree(points[person][::3])
-    for piece in pieces:
-        if piece is not person and tree.query(points[piece][::3])[0].min() < NEAR * size:
-            out |= piece
-    return out
-
-
-def _joined(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+def _label_pieces(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
     """(h, w) numbers of pieces of a mask whose neighbours hang together; `across` (h, w - 1), `down` (h - 1, w)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     index = np.arange(mask.size).reshape(mask.shape)
     right, below = across & mask[:, 1:] & mask[:, :-1], down & mask[1:] & mask[:-1]
     a = np.concatenate([index[:, :-1][right], index[:-1][below]])
     b = np.concatenate([index[:, 1:][right], index[1:][below]])
-    graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(mask.size, mask.size))
-    return np.asarray(connected_components(graph, directed=False)[1].reshape(mask.shape))
+    return connected_pieces(a, b, mask.size).reshape(mask.shape)
 
 
-def _shown(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:
+def _area_and_radius(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:
     """Area of a piece, and radius of the largest circle in it, in sizes; the border of the picture is no end."""
     z = np.where(mask, np.nan_to_num(picture.depth), 0.0)
     fx, fy = np.diag(picture.intrinsics)[:2]

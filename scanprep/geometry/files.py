@@ -39,7 +39,7 @@ from .format_common import (
 )
 from .mesh import Mesh
 from .sanitise import sanitise
-from .seams import merged_mean, seams_closed
+from .seams import mean_of_merged, seams_closed
 from .thinning import thin_scan
 
 __all__ = ["ENDINGS", "SCAN_ENDINGS", "UNITS", "EmptyFileError", "MeshFileError", "PointCloud", "Registered",
@@ -165,7 +165,7 @@ def _seamless(path: Path, mesh: Mesh) -> Mesh:
     if vertex_of is None:
         return mesh
     _, first = np.unique(vertex_of, return_index=True)
-    colors = None if mesh.colors is None else merged_mean(mesh.colors, vertex_of)
+    colors = None if mesh.colors is None else mean_of_merged(mesh.colors, vertex_of)
     warnings.warn(f"{path}: {len(vertex_of) - len(first)} of {len(vertex_of)} vertices repeat others along seams "
                   "(flat shading or textures) and were merged with them", stacklevel=3)
     if mesh.of_file is not None:             # -1 of what was left out before

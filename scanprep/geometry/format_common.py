@@ -15,11 +15,9 @@ from ..words import number_of
 from . import storage
 
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
-MOST_INSIDE = 0.1                     # of the extent: where nine points in ten span less, the others are no body
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 _SPELLED = {"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm", "centimetres": "cm",
             "centimeters": "cm", "inches": "in"}
-_SHORTEST = 4                        # letters that tell a word: some programs keep no more of each
 PERSON = 1.3, 2.3                    # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
 
 
@@ -48,13 +46,13 @@ def load_bytes(path: Path) -> bytes:
     """The whole file, unpacked when its name ends in `.gz`; MeshFileError for one that is missing, damaged or empty."""
     data = storage.read_bytes(path, error=MeshFileError)
     if path.suffix.lower() == ".gz":
-        data = _unpacked(path, data)
+        data = _unpack(path, data)
     if not data:
         raise EmptyFileError(f"{path}: the file is empty")
     return data
 
 
-def _unpacked(path: Path, data: bytes) -> bytes:
+def _unpack(path: Path, data: bytes) -> bytes:
     """What a gzip file holds, up to far more than any mesh can be packed."""
     most = 2**20 + 50 * len(data)
     try:
@@ -92,7 +90,8 @@ def unit_named(text: str) -> str | None:
     ('mm', 'm', None)
     """
     word = text.strip(" .[]()\0").lower()
-    whole = (unit for full, unit in _SPELLED.items() if len(word) >= _SHORTEST and full.startswith(word))
+    # letters that tell a word: some programs keep no more of each
+    whole = (unit for full, unit in _SPELLED.items() if len(word) >= 4 and full.startswith(word))
     return word if word in UNITS else next(whole, None)
 
 
@@ -127,7 +126,8 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent > 10:                          # 65.535 m is what many a depth camera writes where it saw nothing
         inner = float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())
-        if inner < MOST_INSIDE * extent:
+        # of the extent: where nine points in ten span less, the others are no body
+        if inner < 0.1 * extent:
             warnings.warn(f"{path}: a few points lie far off the rest, which spans {inner:.3g} m and alone tells the "
                           "unit; scape prep clean drops them", stacklevel=3)
             extent = inner
@@ -233,7 +233,7 @@ def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
     size, begin = sizes[of], start[of]
     faces = np.stack([corners[begin + first[of]], corners[begin + (within + 1) % size],
                       corners[begin + (within + 2) % size]], axis=1)
-    if vertices is not None and len(folded := _folded(vertices, faces, of)):
+    if vertices is not None and len(folded := _find_folds(vertices, faces, of)):
         warnings.warn(f"{path}: {number_of(len(folded), 'polygon folds', 'polygons fold')} over where cut into "
                       f"triangles, the first is face {folded[0]}: cut them in the program they are from", stacklevel=4)
     return faces
@@ -253,7 +253,7 @@ def strip_triangles(corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     return np.asarray(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
 
 
-def _folded(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
+def _find_folds(vertices: np.ndarray, faces: np.ndarray, of: np.ndarray) -> np.ndarray:
     """The polygons some of whose triangles (F, 3), `of` (F,) them, face away from the whole."""
     c = vertices[faces]
     with np.errstate(all="ignore"):                          # what is not finite is refused later
@@ -328,7 +328,7 @@ def as_bytes(colors: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)
 
 
-def structured(columns: Iterable[tuple[Sequence[str], str, np.ndarray | None]]) -> np.ndarray:
+def as_rows(columns: Iterable[tuple[Sequence[str], str, np.ndarray | None]]) -> np.ndarray:
     """Rows with named fields, little-endian, of arrays (N, k) with the names of their columns and their kind."""
     given = [(names, kind, values) for names, kind, values in columns if values is not None]
     rows = np.zeros(len(given[0][2]), dtype=[(name, "<" + kind) for names, kind, _ in given for name in names])

@@ -112,7 +112,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             for primitive in tree["meshes"][node["mesh"]]["primitives"]:
                 if primitive.get("mode", 4) not in shown:
                     continue
-                primitive, own, data = _unpacked(path, tree, binary, primitive)
+                primitive, own, data = _unpack(path, tree, binary, primitive)
                 points = primitive["attributes"]["POSITION"], primitive["attributes"].get("JOINTS_0")
                 local = accessor(own, data, points[0], "VEC3").astype(np.float64)
                 if own is not tree or points not in placed:
@@ -151,7 +151,7 @@ def _instances(tree: dict[str, Any], binary: bytes, node: dict[str, Any], matrix
     return [matrix @ _matrix({key: values[i] for key, values in rows.items()}) for i in range(count)]
 
 
-def _unpacked(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
+def _unpack(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]
               ) -> tuple[dict[str, Any], dict[str, Any], bytes]:
     """A primitive, and the tree and buffer that hold its numbers: one of its own where Draco has compressed them."""
     packed = primitive.get("extensions", {}).get(_DRACO)
@@ -373,10 +373,14 @@ def encode(contents: Contents, double: bool) -> bytes:
     assert contents.faces is not None, "a GLB file is written for meshes"
     up = tallest(contents.vertices)
     glb, mesh = Glb(), Mesh(contents.vertices @ turn_up(up).T, contents.faces, contents.colors)
-    return glb.pack({
-        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [glb.add_surface(mesh)]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}]}, up)
+    material = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}
+    return glb.pack(one_mesh({"primitives": [glb.add_surface(mesh)]}, material, {}), up)
+
+
+def one_mesh(mesh: dict[str, Any], material: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+    """The document of a scene that shows one mesh in one node, for `Glb.pack`."""
+    return {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{**node, "mesh": 0}], "meshes": [mesh],
+            "materials": [material]}
 
 
 class Glb:

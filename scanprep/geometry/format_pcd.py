@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from . import storage
-from .format_common import Contents, Lines, MeshFileError, as_bytes, fields_of, quote, structured
+from .format_common import Contents, Lines, MeshFileError, as_bytes, as_rows, fields_of, quote
 
 _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
 
@@ -36,7 +36,7 @@ def read(path: Path, data: bytes) -> Contents:
         table = np.frombuffer(data, row, count, start)
         columns = {name: table[name] for name in row.names or ()}
     elif how == b"binary_compressed":
-        columns = _compressed(path, data[start:], row, count)
+        columns = _decompress(path, data[start:], row, count)
     else:
         raise MeshFileError(f"{path}: expected DATA ascii, binary or binary_compressed in the PCD header, "
                             f"found {quote(how)}")
@@ -87,7 +87,7 @@ def _ascii(lines: Lines, row: np.dtype, count: int) -> dict[str, np.ndarray]:
     return columns
 
 
-def _compressed(path: Path, data: bytes, row: np.dtype, count: int) -> dict[str, np.ndarray]:
+def _decompress(path: Path, data: bytes, row: np.dtype, count: int) -> dict[str, np.ndarray]:
     """The columns one after the other, packed as a whole; before them their packed and unpacked sizes."""
     packed, size = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
     if len(data) < 8 + packed or size != row.itemsize * count:
@@ -147,7 +147,7 @@ def encode(contents: Contents, double: bool) -> bytes:
     packed = None
     if contents.colors is not None:
         packed = as_bytes(contents.colors).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
-    rows = structured([(("x", "y", "z"), "f8" if double else "f4", contents.vertices),
+    rows = as_rows([(("x", "y", "z"), "f8" if double else "f4", contents.vertices),
                        (("normal_x", "normal_y", "normal_z"), "f4", contents.normals),
                        (("rgb",), "u4", None if packed is None else packed[:, None])])
     fields = fields_of(rows)

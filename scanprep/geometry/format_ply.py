@@ -20,11 +20,11 @@ from .format_common import (
     MeshFileError,
     as_bytes,
     as_colors,
+    as_rows,
     fields_of,
     polygons,
     quote,
     strip_triangles,
-    structured,
 )
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -131,7 +131,7 @@ def _binary_element(path: Path, data: bytes, element: Element, start: int, order
         fields.append((f"value{i}", order + p.kind, (n,) if p.length_kind else ()))
         at += n * int(p.kind[1])
         if at > len(data) and element.count:
-            raise _truncated(path, element, 0)
+            raise _truncation(path, element, 0)
     row = np.dtype(fields)
     if start + row.itemsize * element.count > len(data):
         return _binary_rows(path, data, element, start, order)
@@ -161,7 +161,7 @@ def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: s
             if n < 0:
                 raise MeshFileError(f"{path}: row {row} of element {element.name}: a list of {n} values")
             if end > len(data):
-                raise _truncated(path, element, row)
+                raise _truncation(path, element, row)
             size.append(n)
             item += data[start:end]
             start = end
@@ -176,7 +176,7 @@ def _length(data: bytes, at: int, kind: str, order: str) -> int:
     return int.from_bytes(data[at:at + int(kind[1])], "big" if order == ">" else "little", signed=kind[0] == "i")
 
 
-def _truncated(path: Path, element: Element, found: int) -> MeshFileError:
+def _truncation(path: Path, element: Element, found: int) -> MeshFileError:
     return MeshFileError(f"{path}: truncated: expected {element.count} rows of element {element.name}, "
                          f"found {found}")
 
@@ -185,7 +185,7 @@ def ascii_element(lines: Lines, element: Element, start: int) -> tuple[dict[str,
     """All rows at once where there are no lists, or one of whole numbers that has always the same length."""
     stop = start + element.count
     if stop > len(lines):
-        raise _truncated(lines.path, element, max(len(lines) - start, 0))
+        raise _truncation(lines.path, element, max(len(lines) - start, 0))
     properties, width = element.properties, len(element.properties)
     kind = np.int64 if all(p.kind[0] in "iu" for p in properties) else np.float64
     if not any(p.length_kind for p in properties):
@@ -266,11 +266,6 @@ def _strips(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return strip_triangles(corners[listed].astype(np.int64), np.unique(strip[listed], return_counts=True)[1])
 
 
-# of the edges between neighbours of a range scan, against their median: what is longer spans a jump from one surface to
-# another. Triangles seen at 75 degrees have edges four times as long as those seen from the front
-_JUMP = 4.0
-
-
 def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertices: np.ndarray) -> np.ndarray:
     """(F, 3) triangles between neighbours in the grid of a range scanner, whose cells hold one vertex or none."""
     if rows <= 0 or len(sizes) % rows or not np.isin(sizes, (0, 1)).all():
@@ -294,7 +289,9 @@ def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertice
     a, b, c = vertices[faces].transpose(1, 0, 2)
     if np.cross(b - a, c - a)[:, 2].sum() < 0:
         faces = faces[:, ::-1]
-    kept = longest <= _JUMP * np.median(longest) if len(longest) else np.zeros(0, bool)
+    # of the edges between neighbours of a range scan, against their median: what is longer spans a jump from one
+    # surface to another. Triangles seen at 75 degrees have edges four times as long as those seen from the front
+    kept = longest <= 4.0 * np.median(longest) if len(longest) else np.zeros(0, bool)
     warnings.warn(f"{path}: a range grid of {rows} x {cells.shape[1]}: neighbours were joined by {kept.sum()} "
                   f"triangles, {len(kept) - kept.sum()} that span jumps were left out", stacklevel=2)
     return np.asarray(faces[kept])
@@ -303,7 +300,7 @@ def _grid(path: Path, sizes: np.ndarray, corners: np.ndarray, rows: int, vertice
 def encode(contents: Contents, double: bool) -> bytes:
     """A binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
     number = "f8" if double else "f4"
-    rows = structured([(("x", "y", "z"), number, contents.vertices), (("nx", "ny", "nz"), number, contents.normals),
+    rows = as_rows([(("x", "y", "z"), number, contents.vertices), (("nx", "ny", "nz"), number, contents.normals),
                        (_COLORS[0], "u1", None if contents.colors is None else as_bytes(contents.colors))])
     words = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]

@@ -195,8 +195,19 @@ def read_xyz(path: Path, data: bytes) -> Contents:
     lines.text = _with_decimal_points(lines, first)
     table = lines.table(range(first, len(lines)), "numbers 'x y z', as many on every line", 3)
     if names:
-        return _named_columns(lines, names, table)
-    return _guessed_columns(table, 4 if path.name.lower().endswith(".pts") and table.shape[1] in (4, 7) else 3)
+        return _columns_by_name(lines, names, table)
+    # normals and colours among the columns from `start` on; a column that begins neither is skipped
+    start = 4 if path.name.lower().endswith(".pts") and table.shape[1] in (4, 7) else 3
+    normals = colors = None
+    while start + 3 <= table.shape[1]:
+        triple = table[:, start:start + 3]
+        if normals is None and np.allclose(np.linalg.norm(triple, axis=1), 1, atol=1e-2):
+            normals, start = triple, start + 3
+        elif colors is None and triple.min() >= 0 and triple.max() <= 255:
+            colors, start = as_colors(triple), start + 3
+        else:
+            start += 1
+    return Contents(table[:, :3], None, normals, colors)
 
 
 def _words(line: str) -> list[str]:
@@ -229,7 +240,7 @@ def _with_decimal_points(lines: Lines, first: int) -> list[bytes]:
     return [*lines.text[:first], *body.split(b"\n")]
 
 
-def _named_columns(lines: Lines, names: list[str], table: np.ndarray) -> Contents:
+def _columns_by_name(lines: Lines, names: list[str], table: np.ndarray) -> Contents:
     """The columns that a heading names; MeshFileError where it does not name x, y and z or has other columns."""
     if len(names) > table.shape[1]:
         raise lines.fail(0, f"a heading of {table.shape[1]} columns, as the points have")
@@ -242,20 +253,6 @@ def _named_columns(lines: Lines, names: list[str], table: np.ndarray) -> Content
         raise lines.fail(0, "a heading with x, y and z")
     colors = as_colors(found["colors"]) if "colors" in found else None
     return Contents(found["points"], None, found.get("normals"), colors)
-
-
-def _guessed_columns(table: np.ndarray, start: int) -> Contents:
-    """Normals and colours among the columns from `start` on; a column that begins neither is skipped."""
-    normals = colors = None
-    while start + 3 <= table.shape[1]:
-        triple = table[:, start:start + 3]
-        if normals is None and np.allclose(np.linalg.norm(triple, axis=1), 1, atol=1e-2):
-            normals, start = triple, start + 3
-        elif colors is None and triple.min() >= 0 and triple.max() <= 255:
-            colors, start = as_colors(triple), start + 3
-        else:
-            start += 1
-    return Contents(table[:, :3], None, normals, colors)
 
 
 def encode_xyz(contents: Contents, double: bool) -> bytes:

@@ -51,7 +51,7 @@ class _Scene:
                         metres=metres)
 
 
-def _parsed(data: bytes) -> ElementTree.Element:
+def _parse(data: bytes) -> ElementTree.Element:
     """The root of a document, names without their namespaces."""
     if b"<!ENTITY" in data:
         raise ValueError("it declares entities of its own, which no mesh needs")
@@ -76,7 +76,7 @@ def read_dae(path: Path, data: bytes) -> Contents:
     A mesh on joints is where it was bound to them.
     """
     with storage.taking_apart(path, "a whole COLLADA file", MeshFileError), np.errstate(all="ignore"):
-        root = _parsed(data)
+        root = _parse(data)
         if root.tag != "COLLADA":
             raise ValueError(f"it begins with {root.tag}")
         scene, ids = _Scene(path, 10**6 + 4 * len(data)), {e.attrib["id"]: e for e in root.iter() if "id" in e.attrib}
@@ -188,14 +188,14 @@ def read_3mf(path: Path, data: bytes) -> Contents:
         if sum(info.file_size for info in archive.infolist()) > 2**24 + _UNPACKED * len(data):
             raise ValueError("it would unpack to far more than a mesh has")
         names = {"/" + name.lower().lstrip("/"): name for name in archive.namelist()}
-        links = _parsed(archive.read(names["/_rels/.rels"]))
+        links = _parse(archive.read(names["/_rels/.rels"]))
         start = next(e.attrib["Target"] for e in links.iter("Relationship") if e.attrib["Type"].endswith("3dmodel"))
         scene, parts = _Scene(path, 10**6 + 4 * _UNPACKED * len(data)), dict[str, ElementTree.Element]()
 
         def part(name: str) -> ElementTree.Element:
             key = "/" + name.lower().lstrip("/")
             if key not in parts:
-                parts[key] = _parsed(archive.read(names[key]))
+                parts[key] = _parse(archive.read(names[key]))
             return parts[key]
 
         def show(name: str, number: str, matrix: np.ndarray, depth: int) -> None:

@@ -22,12 +22,12 @@ class SurfaceGraph:
 
     def distances(self, sources: np.ndarray | int, limit: float = np.inf) -> np.ndarray:
         """Distances (S, N), metres, from each source vertex, or (N,) from one; infinite beyond `limit` or any path."""
-        return dijkstra(self._graph, directed=False, indices=_checked(self.mesh, sources), limit=limit)
+        return dijkstra(self._graph, directed=False, indices=_check(self.mesh, sources), limit=limit)
 
     def nearest(self, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (N,) of each vertex to its nearest source, and its place (N,) in `sources`; infinite and -1 without.
         """
-        sources = np.atleast_1d(_checked(self.mesh, sources))
+        sources = np.atleast_1d(_check(self.mesh, sources))
         distance, _, origin = dijkstra(self._graph, directed=False, indices=sources, min_only=True,
                                        return_predecessors=True)
         place = np.full(len(self.mesh.vertices), -1)
@@ -39,11 +39,11 @@ class SurfaceGraph:
         """(count,) vertices spread over the surface, pieces that no path reaches yet first: see `farthest_points`."""
         if not 1 <= count <= len(self.mesh.vertices):
             raise ValueError(f"count: expected 1..{len(self.mesh.vertices)}, got {count}")
-        return farthest_points(self.mesh.vertices, count, int(_checked(self.mesh, first)),
+        return farthest_points(self.mesh.vertices, count, int(_check(self.mesh, first)),
                                lambda i, limit: self.distances(i, limit=limit or np.inf), least=-0.5)
 
 
-def _checked(mesh: Mesh, sources: np.ndarray | int) -> np.ndarray:
+def _check(mesh: Mesh, sources: np.ndarray | int) -> np.ndarray:
     vertices = np.asarray(sources)
     whole = vertices.size and np.issubdtype(vertices.dtype, np.integer)
     if not whole or vertices.min() < 0 or vertices.max() >= len(mesh.vertices):

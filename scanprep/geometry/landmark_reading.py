@@ -39,7 +39,7 @@ def entries_of(path: Path, data: bytes, unit: str | None) -> Found:
         if suffix == ".fcsv":
             return _fiducials(path, data)
         if suffix == ".pp":
-            return Found([*_picked_points(path, data)])
+            return Found([*_meshlab(path, data)])
         if suffix == ".xml":
             return Found([*_marker_set(path, data)], "m")
         if suffix == ".csv":
@@ -47,8 +47,8 @@ def entries_of(path: Path, data: bytes, unit: str | None) -> Found:
         if suffix == ".lnd":
             # number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`
             expected = "a line of a CAESAR .lnd file, seven numbers and a name"
-            return Found(_named_rows(Lines(path, data), 7, expected, "latin-1", b"="), "mm")
-        return Found(_named_rows(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8"))
+            return Found(_rows_with_names(Lines(path, data), 7, expected, "latin-1", b"="), "mm")
+        return Found(_rows_with_names(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8"))
 
 
 def _json(path: Path, data: bytes, unit: str | None) -> Found:
@@ -115,7 +115,6 @@ def _slicer(path: Path, markups: list[Any], unit: str | None) -> Found:
 
 _FIDUCIALS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID".split(",")
 _FIDUCIALS_OLD = "label,x,y,z,sel,vis".split(",")            # of 3D Slicer 3
-_DEFINED = "2"                       # what 3D Slicer 5 writes behind these columns of a point that was placed
 
 
 def _fiducials(path: Path, data: bytes) -> Found:
@@ -131,13 +130,14 @@ def _fiducials(path: Path, data: bytes) -> Found:
     for row in range(len(lines)):
         words = _cells(lines, row, ",")
         columns = named[0] if named else _FIDUCIALS if len(words) > len(_FIDUCIALS_OLD) else _FIDUCIALS_OLD
-        if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != _DEFINED:
+        # what 3D Slicer 5 writes behind these columns of a point that was placed
+        if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != "2":
             continue
-        pairs.append(_named_point(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
+        pairs.append(_point_of_row(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
     return Found([(name, point * signs) for name, point in pairs], "mm", flipped=True)
 
 
-def _picked_points(path: Path, data: bytes) -> _Points:
+def _meshlab(path: Path, data: bytes) -> _Points:
     """Points of MeshLab's PickPoints; those of a template that were not picked are inactive and left out."""
     pairs = []
     with storage.taking_apart(path, "picked points of MeshLab with x, y, z and name", MeshFileError):
@@ -191,7 +191,7 @@ def _table(lines: Lines) -> _Points:
     name = next((word for word in ("name", "label", "landmark", "id") if word in columns), None)
     if name is None or not {"x", "y", "z"} <= {*columns}:
         raise lines.fail(0, "a heading with name, x, y, z")
-    return [_named_point(lines, row, dict(zip(columns, _cells(lines, row, mark), strict=False)), name,
+    return [_point_of_row(lines, row, dict(zip(columns, _cells(lines, row, mark), strict=False)), name,
                          mark.join(columns)) for row in range(1, len(lines))]
 
 
@@ -203,14 +203,14 @@ def _cells(lines: Lines, row: int, mark: str) -> list[str]:
         raise lines.fail(row, f"text in columns, parted by {mark!r}") from None
 
 
-def _named_point(lines: Lines, row: int, cells: dict[str, str], name: str, expected: str) -> tuple[str, np.ndarray]:
+def _point_of_row(lines: Lines, row: int, cells: dict[str, str], name: str, expected: str) -> tuple[str, np.ndarray]:
     point = _numbers([cells.get(axis) for axis in "xyz"])
     if point is None or not cells.get(name) or not np.isfinite(point).all():
         raise lines.fail(row, expected)
     return cells[name], point
 
 
-def _named_rows(lines: Lines, count: int, expected: str, encoding: str, heading: bytes | None = None
+def _rows_with_names(lines: Lines, count: int, expected: str, encoding: str, heading: bytes | None = None
                 ) -> list[tuple[str, Entry]]:
     """Lines of so many numbers, the last three of them x, y, z, and a name; those with `heading` in them left out."""
     pairs: list[tuple[str, Entry]] = []

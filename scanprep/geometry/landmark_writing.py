@@ -26,17 +26,17 @@ def as_bytes(name: str, points: Points, unit: str | None) -> bytes | None:
     return _WRITERS[ending](points, unit).encode("latin-1" if ending == ".lnd" else "utf-8")
 
 
-def _picked_points(points: Points, unit: str | None) -> str:
+def _meshlab(points: Points, unit: str | None) -> str:
     """MeshLab's PickPoints."""
     rows = "".join(f' <point x="{x:.12g}" y="{y:.12g}" z="{z:.12g}" active="1" name={quoteattr(name)}/>\n'
-                   for name, (x, y, z) in _scaled(points, unit or "m"))
+                   for name, (x, y, z) in _in_unit(points, unit or "m"))
     return f"<!DOCTYPE PickedPoints>\n<PickedPoints>\n{rows}</PickedPoints>\n"
 
 
 def _slicer(points: Points, unit: str | None) -> str:
     """A markups file of 3D Slicer, in its LPS frame."""
     controls = [{"id": str(i + 1), "label": name, "position": point.tolist(), "positionStatus": "defined"}
-                for i, (name, point) in enumerate(_scaled(points, unit or "mm"))]
+                for i, (name, point) in enumerate(_in_unit(points, unit or "mm"))]
     return json.dumps({"markups": [{"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": unit or "mm",
                                     "controlPoints": controls}]}, indent=1)
 
@@ -50,7 +50,7 @@ def _fiducials(points: Points, unit: str | None) -> str:
 
 
 def _scalismo(points: Points, unit: str | None) -> str:
-    return json.dumps([{"id": name, "coordinates": point.tolist()} for name, point in _scaled(points, unit or "m")],
+    return json.dumps([{"id": name, "coordinates": point.tolist()} for name, point in _in_unit(points, unit or "m")],
                       indent=1)
 
 
@@ -60,7 +60,7 @@ def _table(points: Points, unit: str | None) -> str:
 
 def _marker_set(points: Points, unit: str | None) -> str:
     """A marker set of OpenSim 4, all in the frame of the ground."""
-    return marker_set({name: ("/ground", point) for name, point in _scaled(points, unit or "m")})
+    return marker_set({name: ("/ground", point) for name, point in _in_unit(points, unit or "m")})
 
 
 def marker_set(markers: Mapping[str, tuple[str, np.ndarray]]) -> str:
@@ -85,23 +85,23 @@ def _as_text(points: Points, unit: str) -> list[tuple[str, list[str]]]:
     wrong = next((name for name in points if name.splitlines() != [name] or name.strip() != name or "#" in name), None)
     if wrong is not None:
         raise ValueError(f"landmarks: '{wrong}' cannot be the name of a landmark in a file of lines; write JSON")
-    return [(name, [repr(float(value)) for value in point]) for name, point in _scaled(points, unit)]
+    return [(name, [repr(float(value)) for value in point]) for name, point in _in_unit(points, unit)]
 
 
 def _caesar(points: Points, unit: str | None) -> str:
     """CAESAR's .lnd: number, two codes, distance from the axis, x, y, z, name."""
     rows = [f"{i + 1} 0 0 {np.hypot(x, y):.6f} {x:.6f} {y:.6f} {z:.6f} {_one_line(name)}"
-            for i, (name, (x, y, z)) in enumerate(_scaled(points, unit or "mm"))]
+            for i, (name, (x, y, z)) in enumerate(_in_unit(points, unit or "mm"))]
     return "AUX =\n" + "\n".join(rows) + "\nEND =\n"
 
 
 def _rows(points: Points, unit: str | None) -> str:
     """Lines of x, y, z and name."""
     return "".join(f"{x:.12g} {y:.12g} {z:.12g} {_one_line(name)}\n"
-                   for name, (x, y, z) in _scaled(points, unit or "m"))
+                   for name, (x, y, z) in _in_unit(points, unit or "m"))
 
 
-def _scaled(points: Points, unit: str) -> list[tuple[str, np.ndarray]]:
+def _in_unit(points: Points, unit: str) -> list[tuple[str, np.ndarray]]:
     return [(name, np.asarray(point, dtype=float) / UNITS[unit]) for name, point in points.items()]
 
 
@@ -113,4 +113,4 @@ def _one_line(name: str) -> str:
 
 _WRITERS: dict[str, Callable[[Points, str | None], str]] = {
     ".mrk.json": _slicer, ".fcsv": _fiducials, ".scalismo.json": _scalismo, ".csv": _table, ".xml": _marker_set,
-    ".pp": _picked_points, ".lnd": _caesar, ".txt": _rows}
+    ".pp": _meshlab, ".lnd": _caesar, ".txt": _rows}

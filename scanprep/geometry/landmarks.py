@@ -19,9 +19,6 @@ from .landmark_writing import as_bytes
 from .mesh import Mesh
 from .surface import Surface
 
-ON_SURFACE = 0.03                    # of its size: clicks lie so near to a scan, those in another unit do not
-AXES = 2.0                           # times as near the points must lie in other axes than those that the file tells
-SPREAD = 0.2                         # of its size: landmarks of a person, who has hands, feet and a head, spread wider
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt",
                     ".landmarks.csv", ".fcsv", ".scalismo.json")
 
@@ -247,11 +244,14 @@ def _metres_on_surface(path: Path, points: np.ndarray, scan: Mesh | np.ndarray, 
                                else surface.query(places)[0]))
 
     def misfit(scale: np.ndarray) -> float:
-        return away(scale) * (1.0 if scale[0] > 0 else AXES)
+        # times as near the points must lie in other axes than those that the file tells
+        return away(scale) * (1.0 if scale[0] > 0 else 2.0)
 
     def fits(scale: np.ndarray) -> bool:
         spread = float(np.linalg.norm(np.ptp(points * scale, axis=0)))      # on one spot of it anything lies on it
-        return spread > SPREAD * size and away(scale) <= ON_SURFACE * size
+        # of its size: clicks lie so near to a scan, those in another unit do not
+        # of its size: landmarks of a person, who has hands, feet and a head, spread wider
+        return spread > 0.2 * size and away(scale) <= 0.03 * size
 
     best = min((told * sign for sign in signs), key=misfit)
     if len(points) < 3 or fits(best):

@@ -240,7 +240,7 @@ def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: St
         # a step that failed settles nothing unless there was nothing to gain: it may have been too long
         settled = (better & (now.energy - tried.energy <= least)) | (gain <= least)
         converged |= settled | (factor > 1e8)        # so much damping: no step lowers the energy any more
-        x, now = _taken(better, x, ahead), _taken(better, now, tried)
+        x, now = _take(better, x, ahead), _take(better, now, tried)
         factor = np.where(better, np.maximum(factor / 5, 1e-9), factor * 8)
     return Minimum(x, now, converged, done)
 
@@ -250,13 +250,13 @@ def _gain(gradient: np.ndarray, step: np.ndarray, ridge: np.ndarray) -> np.ndarr
     return np.einsum("...p,...p->...", ridge * step - gradient, step)
 
 
-def _taken(better: np.ndarray, old: Any, new: Any) -> Any:
+def _take(better: np.ndarray, old: Any, new: Any) -> Any:
     """The new rows where they are better; a single problem is taken or left whole."""
     if better.all():
         return new
     if not better.any():
         return old
     if isinstance(old, Dense):
-        return Dense(*(_taken(better, a, b) for a, b in zip(old, new, strict=True)))
+        return Dense(*(_take(better, a, b) for a, b in zip(old, new, strict=True)))
     rows = better.reshape(-1, *(1,) * (np.ndim(old) - 1))
     return np.where(rows, new, old)                                                 

@@ -9,6 +9,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ..words import number_of
+from .sparse import connected_pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +172,7 @@ class Mesh:
         row = row[np.argsort(row[:, 0], kind="stable")]
         same = row[1:, 0] == row[:-1, 0]
         a, b = np.r_[row[:-1, 1][same], row[:-1, 2][same]], np.r_[row[1:, 1][same], row[1:, 2][same]]
-        n = self.faces.size
-        fan = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)[1]
-        return fan.reshape(-1, 3)
+        return connected_pieces(a, b, self.faces.size).reshape(-1, 3)
 
     @cached_property
     def is_vertex_manifold(self) -> bool:

@@ -7,11 +7,6 @@ from scipy.spatial import cKDTree
 from ..threads import search_threads
 from .farthest_points import thin
 
-AROUND = 8               # neighbours that tell how dense the points are
-SAME = 0.1               # of the distance to the last of them, within which two points are one place
-CELLS = 80               # along the longest side: one point of each cell is asked, so that no dense part rules
-INNER = 0.05, 0.95       # nine points in ten; a depth camera puts those that it did not see 65 m away, a cell for each
-
 
 def distinct_rows(rows: np.ndarray) -> np.ndarray | None:
     """The first row that each row (n, 3) is equal to, (n,) int; None where all rows are distinct."""
@@ -62,9 +57,13 @@ def spacing(points: np.ndarray) -> float:
     if len(points) < 2:
         return 0.0
     extent = float(np.ptp(points, axis=0).max())
-    inner = float(np.ptp(np.quantile(points, INNER, axis=0), axis=0).max())
+    # nine points in ten; a depth camera puts those that it did not see 65 m away, a cell for each
+    inner = float(np.ptp(np.quantile(points, (0.05, 0.95), axis=0), axis=0).max())
     extent = inner if 0 < inner < extent / 2 else extent                # a few points lie far off the rest
-    some = points[thin(points, extent / CELLS)]
-    apart = cKDTree(points).query(some, min(AROUND + 1, len(points)), workers=search_threads(len(some)))[0][:, 1:]
-    other = apart > SAME * apart[:, -1:]
+    # along the longest side: one point of each cell is asked, so that no dense part rules
+    some = points[thin(points, extent / 80)]
+    # neighbours that tell how dense the points are
+    apart = cKDTree(points).query(some, min(9, len(points)), workers=search_threads(len(some)))[0][:, 1:]
+    # of the distance to the last of them, within which two points are one place
+    other = apart > 0.1 * apart[:, -1:]
     return float(np.median(apart[np.arange(len(apart)), other.argmax(axis=1)]))

@@ -13,8 +13,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-MANY = 100                           # matrices from which on arithmetic on all at once is faster than LAPACK on each
-
 
 def exp(twist: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians."""
@@ -59,7 +57,8 @@ def _quaternion(twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def project(M: np.ndarray) -> np.ndarray:
     """The proper rotation nearest to each matrix (..., 3, 3) in the Frobenius norm, never a reflection."""
-    if M.size < 9 * MANY:
+    # matrices from which on arithmetic on all at once is faster than LAPACK on each
+    if M.size < 9 * 100:
         return _project_by_svd(M)
     flat = M.reshape(-1, 3, 3)
     R, found = _project_by_newton(flat)

@@ -8,25 +8,17 @@ import itertools
 import warnings
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..threads import search_threads
 from ..words import number_of
 from .mesh import Mesh
 from .places import distinct_rows
+from .sparse import connected_pieces
 from .surface import Rays
 
-FLAT = 1e-9              # area over squared longest side: float32 files leave no flatter triangle that has a normal
 SAMPLES = 400            # triangles of each patch that look for what is in front of them and behind
-WAYS = 4                 # rays of each, to either side
 REACH = 0.15             # of the diagonal, that a ray goes: through a trunk, but not across a room
-HIDDEN = 0.05            # share of the rays by which the front must be hidden more often than the back
-SURE = 5.0               # standard deviations by which that must differ from chance
-LIFT = 2e-3              # of the diagonal, above a triangle: farther than the noise of a depth camera
-IN_SIGHT = 0.8           # of a scan from one side: one view has 0.89 and more, a whole body a half
-ONE_WAY = 0.6            # share by which areas must face one way rather than the other; half views have 0.75 and more
 
 
 def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
@@ -83,7 +75,8 @@ def _surface_triangles(mesh: Mesh) -> tuple[np.ndarray, list[str]]:
     """Which triangles (F,) bool are surface, and what the others are."""
     sides = mesh.corners - np.roll(mesh.corners, -1, axis=1)
     longest = np.einsum("fsd,fsd->fs", sides, sides).max(axis=1)
-    flat = mesh.face_areas <= FLAT * longest
+    # area over squared longest side: float32 files leave no flatter triangle that has a normal
+    flat = mesh.face_areas <= 1e-9 * longest
     notes = [f"{number_of(flat.sum(), 'triangle')} without area dropped"] if flat.any() else []
     group = distinct_rows(np.sort(mesh.faces, axis=1))
     if group is None:
@@ -120,14 +113,12 @@ def invert_against_neighbours(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     first, second = mesh.side_pairs.T
     a, b = first // 3, second // 3
     if mesh.is_edge_manifold:
-        links = coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
-        return np.zeros(count, dtype=bool), connected_components(links, directed=False)[1]
+        return np.zeros(count, dtype=bool), connected_pieces(a, b, count)
     forward = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).ravel()
     agree = forward[first] != forward[second]
     # Every triangle is there twice, as it is and inverted; what faces the same way hangs together.
     rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
-    _, patch = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count)),
-                                    directed=False)
+    patch = connected_pieces(rows, columns, 2 * count)
     as_is, turned = patch[:count], patch[count:]
     area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
     invert = area[turned] > area[as_is]
@@ -146,7 +137,8 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     order = order[np.argsort(patch[order], kind="stable")]
     size = np.bincount(patch)
     rank = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
-    some = np.repeat(order[rank < SAMPLES], WAYS)
+    # rays of each, to either side
+    some = np.repeat(order[rank < SAMPLES], 4)
     around, reach = _directions(mesh.face_normals[some], rng), REACH * float(np.linalg.norm(np.ptp(
         mesh.vertices, axis=0)))
     start, off = mesh.corners[some].mean(axis=1), 1e-4 * reach * mesh.face_normals[some]
@@ -157,7 +149,9 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     total = np.bincount(patch[some], vote, len(size))
     spread = np.sqrt(np.bincount(patch[some], vote**2, len(size)))
     share = total / np.maximum(np.bincount(patch[some], mesh.face_areas[some], len(size)), 1e-300)
-    known = (np.abs(share) > HIDDEN) & (np.abs(total) > SURE * spread)
+    # share of the rays by which the front must be hidden more often than the back
+    # standard deviations by which that must differ from chance
+    known = (np.abs(share) > 0.05) & (np.abs(total) > 5.0 * spread)
     turn = known & (total > 0)
     if turn.any() and not known.all():
         turn |= ~known & _against_nearest(mesh, patch, known, turn)
@@ -178,13 +172,16 @@ def _agree_with_camera(mesh: Mesh, rays: Rays, patch: np.ndarray, turn: np.ndarr
     some = np.random.default_rng(0).permutation(len(patch))[:SAMPLES]
     middle, area = mesh.corners[some].mean(axis=1), mesh.face_areas[some]
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    sights = [np.average(~rays.occluded(middle + LIFT * size * way, np.tile(way, (len(some), 1)), size), weights=area)
+    # of the diagonal, above a triangle: farther than the noise of a depth camera
+    sights = [np.average(~rays.occluded(middle + 2e-3 * size * way, np.tile(way, (len(some), 1)), size), weights=area)
               for way in ways]
-    if max(sights) < IN_SIGHT:
+    # of a scan from one side: one view has 0.89 and more, a whole body a half
+    if max(sights) < 0.8:
         return turn
     along = mesh.face_areas * (mesh.face_normals @ ways[int(np.argmax(sights))])
     facing = np.where(turn[patch], -along, along)
-    if abs(facing.sum()) > ONE_WAY * np.abs(facing).sum():
+    # share by which areas must face one way rather than the other; half views have 0.75 and more
+    if abs(facing.sum()) > 0.6 * np.abs(facing).sum():
         return turn
     return np.bincount(patch, along * np.sign(along.sum())) < 0
 

@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from .sparse import connected_pieces
 
 
 def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
@@ -27,7 +27,7 @@ def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     if not len(again):
         return None
     a, b = ends[order[again]].ravel(), ends[order[again + 1]].ravel()
-    _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(vertices),) * 2), directed=False)
+    label = connected_pieces(a, b, len(vertices))
     first = np.unique(label, return_index=True)[1]
     return np.argsort(np.argsort(first))[label]
 
@@ -41,7 +41,7 @@ def _border(faces: np.ndarray, count: int) -> np.ndarray:
     return half[order[new[1:] & new[:-1]]]
 
 
-def merged_mean(values: np.ndarray, vertex_of: np.ndarray) -> np.ndarray:
+def mean_of_merged(values: np.ndarray, vertex_of: np.ndarray) -> np.ndarray:
     """(n, k) the mean over the vertices that became one; `values` (N, k), `vertex_of` (N,) as of `seams_closed`."""
     total = np.zeros((vertex_of.max() + 1, values.shape[1]))
     np.add.at(total, vertex_of, values)

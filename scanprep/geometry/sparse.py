@@ -1,6 +1,7 @@
-"""Symmetric positive definite systems, factored once and solved many times."""
+"""Sums over groups, and symmetric positive definite systems, factored once and solved many times."""
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -8,6 +9,29 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import splu
+
+
+def gatherer(index: np.ndarray, count: int) -> csr_array:
+    """The matrix (count, n) that sums the values of each index (n,)."""
+    n = len(index)
+    return csr_array(coo_array((np.ones(n), (index, np.arange(n))), shape=(count, n)))
+
+
+def sum_groups(gather: csr_array, values: np.ndarray) -> np.ndarray:
+    """(count, ...) what a `gatherer` makes of values (n, ...)."""
+    return (gather @ values.reshape(len(values), math.prod(values.shape[1:]))).reshape(-1, *values.shape[1:])
+
+
+def connected_pieces(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    """The number (count,) of the piece that each of so many things is in, which links from a (n,) to b (n,) join.
+
+    Examples
+    --------
+    >>> connected_pieces(np.array([0, 3]), np.array([1, 1]), 4).tolist()
+    [0, 0, 1, 0]
+    """
+    links = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1])
 
 
 def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:

@@ -13,8 +13,6 @@ from .places import distinct_places
 from .sanitise import sanitise
 from .surface import OrientedPoints, checked_points
 
-NEIGHBOURS = 16                  # points of a scan over which its normals are averaged
-
 
 @dataclass(frozen=True, eq=False)
 class Target:
@@ -50,13 +48,14 @@ def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
     if len(index) < 4:
         raise ValueError(f"{name}: expected at least 4 distinct points, got {len(index)}")
     points = points[index]
-    near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)), workers=search_threads(len(points)))[1]
+    # points of a scan over which its normals are averaged
+    near = cKDTree(points).query(points, min(16, len(points)), workers=search_threads(len(points)))[1]
     if normals is not None:
-        return Target(points, _averaged_normals(points, normals, near), _one_sided(points, near), True, index=index)
+        return Target(points, _average_normals(points, normals, near), _one_sided(points, near), True, index=index)
     return Target(points, _spread_normals(points[near]), _one_sided(points, near), False, index=index)
 
 
-def _averaged_normals(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _average_normals(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Unit normals (n, 3), each the mean over the neighbours (n, k) that face the same way.
 
     Where the triangles around a point cancel, as where they lie back to back, it is that of its neighbours' plane.

@@ -4,12 +4,11 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .mesh import Mesh
 from .places import distinct_rows
+from .sparse import connected_pieces
 
 MOST = 1_000_000         # triangles of a person about 1.8 mm long; what has less than twice as many is left as it is
 
@@ -76,7 +75,7 @@ def _cut_up(new: np.ndarray, scan: Mesh, most: int) -> tuple[np.ndarray, np.ndar
         if not bad.any() or len(faces) > most:              # cuts end: vertices of the scan cannot be cut
             return new, faces
         members = np.flatnonzero(bad[new])
-        piece = _joined(new, members, scan.faces) if first else np.arange(len(members))
+        piece = _join(new, members, scan.faces) if first else np.arange(len(members))
         touched = np.unique(corners[bad[corners].any(axis=1)])
         old = np.r_[np.flatnonzero(~bad), np.full(piece.max() + 1, -1)]     # numbers before, of what is left, then cut
         new[members] = len(bad) + piece
@@ -84,15 +83,13 @@ def _cut_up(new: np.ndarray, scan: Mesh, most: int) -> tuple[np.ndarray, np.ndar
         asked, first = (old < 0) | np.isin(old, touched), False
 
 
-def _joined(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _join(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(M,) the piece of each of the vertices `members` (M,): edges join those that have become the same one."""
     row = np.full(len(new), -1)
     row[members] = np.arange(len(members))
     a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     inner = (row[a] >= 0) & (new[a] == new[b])
-    links = coo_array((np.ones(np.count_nonzero(inner), dtype=bool), (row[a[inner]], row[b[inner]])),
-                      shape=(len(members), len(members)))
-    return np.asarray(connected_components(links, directed=False)[1])
+    return connected_pieces(row[a[inner]], row[b[inner]], len(members))
 
 
 def _without_pleats(faces: np.ndarray) -> np.ndarray:

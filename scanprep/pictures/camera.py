@@ -10,8 +10,6 @@ import numpy as np
 from ..geometry.format_glb import tallest
 from ..geometry.mesh import Mesh
 
-LEANING = 0.6                        # cosine: a body that leans no further is not laid over
-
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -167,7 +165,8 @@ def stance(body: Mesh, turned: np.ndarray | None = None, vertical: np.ndarray | 
     if vertical is None:
         now = mean @ own
         nearest = np.sign(now[np.abs(now).argmax()]) * np.eye(3)[np.abs(now).argmax()]
-        vertical = own if now @ own > LEANING else nearest
+        # cosine: a body that leans no further is not laid over
+        vertical = own if now @ own > 0.6 else nearest
     ways = [way - (way @ vertical) * vertical for way in (mean @ ahead, turned[0] @ ahead, turned[0] @ own)]
     ahead = next(way for way in ways if np.linalg.norm(way) > 0.1)     # the mean of a turn on the spot says nothing
     return vertical, ahead / np.linalg.norm(ahead)

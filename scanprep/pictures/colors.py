@@ -9,7 +9,6 @@ import numpy as np
 from ..geometry.format_common import as_seen
 
 HEAT = "magma_r"      # light where the value is low, so that a good result looks like a body
-HEAT_END = 0.86       # the darkest end of the map would swallow the shading
 NO_VALUE = (0.72, 0.74, 0.76)
 
 
@@ -19,7 +18,8 @@ def heat(values: np.ndarray, low: float, high: float, colormap: str = HEAT) -> n
 
     values = np.asarray(values, dtype=float)
     place = np.clip((values - low) / max(high - low, 1e-30), 0, 1)
-    colors = colormaps[colormap](np.nan_to_num(place) * (HEAT_END if colormap == HEAT else 1.0))[..., :3]
+    # the darkest end of the map would swallow the shading
+    colors = colormaps[colormap](np.nan_to_num(place) * (0.86 if colormap == HEAT else 1.0))[..., :3]
     colors[np.isnan(values)] = NO_VALUE
     return colors
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.format_glb import Glb, turn_up
+from ..geometry.format_glb import Glb, one_mesh, turn_up
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
 
@@ -38,10 +38,8 @@ def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.
     first = Mesh(frames[0] @ U, faces, colors)
     mesh: dict[str, Any] = {"name": "body", "primitives": [
         glb.add_surface(first, targets=[frame @ U - first.vertices for frame in frames[1:]])]}
-    document: dict[str, Any] = {
-        "scene": 0, "scenes": [{"nodes": [0]}], "meshes": [mesh],
-        "nodes": [{"name": "body", "mesh": 0}],
-        "materials": [skin_material((1, 1, 1)) if colors is not None else skin_material()]}
+    material = skin_material((1, 1, 1)) if colors is not None else skin_material()
+    document = one_mesh(mesh, material, {"name": "body"})
     if count:
         mesh["weights"] = [0] * count
         mesh["extras"] = {"targetNames": [f"frame {t}" for t in range(1, count + 1)]}

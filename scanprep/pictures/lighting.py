@@ -71,13 +71,8 @@ class Scene:
         hit = self._tree.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         rays = np.flatnonzero(hit["primID"] >= 0)
         face = hit["primID"][rays]
-        self._light_vertices(np.unique(face))
-        u, v = hit["u"][rays], hit["v"][rays]
-        bary = np.stack([1 - u - v, u, v], axis=1)
-        return Seen(rays, *self._shade(face, bary, directions[rays]), hit["tfar"][rays])
-
-    def _light_vertices(self, faces: np.ndarray) -> None:
-        """Fill in the visibility at the corners of the triangles in sight."""
+        # fill in the visibility at the corners of the triangles in sight
+        faces = np.unique(face)
         sky = sphere_directions(80)
         key = cone_directions(_unit(np.array(KEY[0])) @ self.axes, 0.16, 14)
         for shape, start, end in zip(self._shapes, self._starts[:-1], self._starts[1:], strict=True):
@@ -91,6 +86,9 @@ class Scene:
             light[vertices, 0] = self._open(points, normals, sky, 0.30 * self.size)
             light[vertices, 1] = self._open(points, normals, key, 4 * self.size)
             self.attributes[start + mine, :, 6:] = light[shape.faces[mine]]
+        u, v = hit["u"][rays], hit["v"][rays]
+        bary = np.stack([1 - u - v, u, v], axis=1)
+        return Seen(rays, *self._shade(face, bary, directions[rays]), hit["tfar"][rays])
 
     def _open(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
         """Cosine-weighted share of directions (k, 3) in which points (n, 3) look into the open."""

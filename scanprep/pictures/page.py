@@ -21,7 +21,6 @@ from .scene import Pane, framed_alike, pack_scene, picture_panes
 from .sheets import png_bytes, webp_bytes
 
 VIEWER = Path(__file__).parents[1] / "viewer"
-PICTURE, WIDEST = 300, 1400          # pixels: height and width of pictures that stand for bodies
 # The viewer travels compressed: a browser that cannot take it apart, or has no WebGL, goes on showing the pictures.
 START = """(async () => {
 const raw = atob(document.getElementById("viewer").textContent), bytes = Uint8Array.from(raw, (c) => c.charCodeAt(0));
@@ -31,9 +30,7 @@ script.textContent = text;
 document.head.append(script);
 scapekit.start();
 })().catch((error) => { document.body.classList.add("sk-pictures-only"); throw error; });"""
-CODE = re.compile(r"`([^`\n]+)`")
 NUMBER = re.compile(r"[-+]?[\d,]*\.?\d+(e[-+]?\d+)?")
-BETWEEN_FOLDERS = re.compile(r"(?<=\w)/(?=\w)")     # a long path may break here on a narrow page
 
 
 class Page:
@@ -85,8 +82,8 @@ class Page:
         """
         panes = framed_alike(panes)
         if picture is None:
-            low, camera = min(height, PICTURE), panes[0].camera
-            columns = max(1, int(WIDEST / max(110, low * camera.width / camera.height + 18)))
+            low, camera = min(height, 300), panes[0].camera            # at most 300 pixels high, and 1,400 wide
+            columns = max(1, int(1400 / max(110, low * camera.width / camera.height + 18)))
             picture = picture_panes(panes, low, columns)
         self._parts.append(self.turning(pack_scene(panes), picture, caption, height))
         return self
@@ -134,18 +131,16 @@ class Page:
         lead = f'<p class="lead">{_with_code(self.lead)}</p>' if self.lead else ""
         links = "".join(f'<a href="#s{i + 1}">{escape(s)}</a>' for i, s in enumerate(self._sections))
         nav = f'<nav aria-label="Contents">{links}</nav>' if len(self._sections) > 2 else ""
+        # what makes bodies turn: the scenes, the viewer, and its start; nothing on a page of pictures alone
+        carried = {f"scene{i + 1}": scene for i, scene in enumerate(self._scenes)}
+        carried |= {"viewer": _viewer_code()} if carried else {}
+        viewer = "".join(f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n'
+                         for name, data in carried.items()) + (f"<script>{START}</script>\n" if carried else "")
         return (f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
                 f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
                 f"<title>{escape(self.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
                 f"<header><h1>{escape(self.title)}</h1>{lead}{self._verdict}{nav}</header>\n"
-                + "\n".join(self._parts) + "\n</main>\n" + self._viewer() + "</body>\n</html>\n")
-
-    def _viewer(self) -> str:
-        """What makes bodies turn: the scenes, the viewer, and its start; nothing on a page of pictures alone."""
-        if not self._scenes:
-            return ""
-        scenes = "".join(_carried(f"scene{i + 1}", scene) for i, scene in enumerate(self._scenes))
-        return f"{scenes}{_carried('viewer', _viewer_code())}<script>{START}</script>\n"
+                + "\n".join(self._parts) + "\n</main>\n" + viewer + "</body>\n</html>\n")
 
     def write(self, path: str | Path) -> None:
         """Write the page, whole or not at all."""
@@ -159,11 +154,7 @@ def link_to(name: str) -> str:
 
 def _with_code(text: str) -> str:
     """A sentence as HTML, commands and names of files between backticks set as code."""
-    return CODE.sub(r"<code>\1</code>", escape(text))
-
-
-def _carried(name: str, data: bytes) -> str:
-    return f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n'
+    return re.sub(r"`([^`\n]+)`", r"<code>\1</code>", escape(text))
 
 
 @functools.cache
@@ -179,7 +170,8 @@ def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:
     return f'<figure><img src="{source}" alt="{escape(alt or caption or "picture")}"{size}>{below}</figure>'
 
 
-def _image_kind(data: bytes) -> str:
+def data_uri(data: bytes) -> str:
+    """The bytes of a picture as the address of an `img`."""
     signatures = {b"\x89PNG": "image/png", b"GIF8": "image/gif", b"\xff\xd8\xff": "image/jpeg",
                   b"RIFF": "image/webp"}
     kind = next((kind for start, kind in signatures.items() if data.startswith(start)), None)
@@ -187,12 +179,7 @@ def _image_kind(data: bytes) -> str:
         kind = "image/svg+xml"
     if kind is None:
         raise ValueError(f"image: expected an array or a PNG, GIF, JPEG, WebP or SVG file, got {data[:8]!r}...")
-    return kind
-
-
-def data_uri(data: bytes) -> str:
-    """The bytes of a picture as the address of an `img`."""
-    return f"data:{_image_kind(data)};base64,{base64.b64encode(data).decode()}"
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def _cell(value: Any) -> str:
@@ -204,4 +191,5 @@ def _cell(value: Any) -> str:
         shown = "–" if np.isnan(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
         return f'<td class="number">{shown}</td>'
     number = ' class="number"' if NUMBER.fullmatch(str(value)) else ""
-    return f"<td{number}>{BETWEEN_FOLDERS.sub('/<wbr>', _with_code(str(value)))}</td>"
+    breaking = re.sub(r"(?<=\w)/(?=\w)", "/<wbr>", _with_code(str(value)))      # a long path, on a narrow page
+    return f"<td{number}>{breaking}</td>"

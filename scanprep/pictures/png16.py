@@ -34,7 +34,7 @@ def decode(data: bytes) -> np.ndarray:
     if len(raw) < row * height:
         raise ValueError("it is cut short")
     lines = np.frombuffer(raw, np.uint8, row * height).reshape(height, row)
-    pixels = _unfiltered(lines[:, 1:].reshape(height, width, 2 * channels), lines[:, 0])
+    pixels = _unfilter(lines[:, 1:].reshape(height, width, 2 * channels), lines[:, 0])
     return pixels.reshape(height, width, channels, 2) @ np.array([256, 1], dtype=np.uint16)
 
 
@@ -48,7 +48,7 @@ def _chunks(data: bytes, wanted: bytes) -> list[bytes]:
     return found
 
 
-def _unfiltered(stored: np.ndarray, kinds: np.ndarray) -> np.ndarray:
+def _unfilter(stored: np.ndarray, kinds: np.ndarray) -> np.ndarray:
     """Bytes (H, W, B) from how they differ from those to the left, above and above left, as each row's filter says.
 
     A pixel needs only pixels of earlier diagonals, so a diagonal is done at once.

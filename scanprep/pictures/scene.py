@@ -27,7 +27,6 @@ FORMAT = 1
 SCENE = "picture.scene"              # beside a picture, for the page of many
 SMALL = 8000                         # triangles of a shape in it
 MOST_TURN, MOST_BYTES = 20, 4_000_000        # figures that turn on a page of many
-FINE = 2e-5                          # metres: step of what one column adds to a motion
 NO_INDEX = 255                       # place in a palette of vertices without a value; it has as many colours before
 
 
@@ -108,7 +107,10 @@ class _Columns:
         values = np.ascontiguousarray(values.reshape(len(values), -1))
         rows, width = values.shape
         if differences:
-            values = _zigzag(np.diff(values, axis=0, prepend=np.zeros_like(values[:1])))
+            # unsigned steps that may have wrapped around, as 0, -1, 1, -2, ... -> 0, 1, 2, 3,
+            steps = np.diff(values, axis=0, prepend=np.zeros_like(values[:1]))
+            signed = steps.view(steps.dtype.str.replace("u", "i"))
+            values = ((signed << 1) ^ (signed >> (8 * signed.itemsize - 1))).view(steps.dtype)
         kind = values.dtype.str[1:]
         planes = values.astype(values.dtype.newbyteorder("<")).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
         key = kind.encode() + planes
@@ -118,12 +120,6 @@ class _Columns:
                                    "differences": differences})
             self.data += planes
         return self._known[key]
-
-
-def _zigzag(steps: np.ndarray) -> np.ndarray:
-    """Unsigned steps that may have wrapped around, as 0, -1, 1, -2, ... -> 0, 1, 2, 3, ..."""
-    signed = steps.view(steps.dtype.str.replace("u", "i"))
-    return ((signed << 1) ^ (signed >> (8 * signed.itemsize - 1))).view(steps.dtype)
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
@@ -196,7 +192,8 @@ def _hex(colors: np.ndarray) -> str:
 
 def _steps(values: np.ndarray, axes: int | tuple[int, ...], factor: np.ndarray | float) -> np.ndarray:
     """Steps that 16 bits can count, no smaller than is seen when the values are taken so many times."""
-    return np.maximum(np.abs(values).max(axis=axes, initial=1e-12) / 32767, FINE / np.maximum(factor, 1e-9))
+    # metres: step of what one column adds to a motion
+    return np.maximum(np.abs(values).max(axis=axes, initial=1e-12) / 32767, 2e-5 / np.maximum(factor, 1e-9))
 
 
 def _motion(moving: Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:

@@ -21,7 +21,6 @@ __all__ = ["Bones", "Camera", "Dots", "Heat", "Moving", "Solid", "color_bar", "h
            "png_bytes", "render", "save_png", "side_by_side"]
 
 CLAY = (0.79, 0.76, 0.725)
-ROUND = 4000, 400                    # up to so many balls are cut in finer triangles, and finer again
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +175,8 @@ def balls(points: np.ndarray, radius: float, divisions: int | None = None
 
     How round, as for `sphere`, goes by their number when it is not given.
     """
-    vertices, faces = sphere(divisions if divisions is not None else sum(len(points) <= few for few in ROUND))
+    # up to so many balls are cut in finer triangles, and finer again
+    vertices, faces = sphere(divisions if divisions is not None else sum(len(points) <= few for few in (4000, 400)))
     normals = vertices[faces]
     corners = points[:, None, None, None, :].swapaxes(1, 2) + radius * normals
     count = len(points)

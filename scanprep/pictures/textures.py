@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from ..geometry.format_common import load_bytes, metres_per_unit
-from ..geometry.format_glb import Glb, chunks_of, file_beside, some_normal, tallest, turn_up, up_of
+from ..geometry.format_glb import Glb, chunks_of, file_beside, one_mesh, some_normal, tallest, turn_up, up_of
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
 from ..geometry.surface import Rays, barycentric
 from .gltf import skin_material
 from .sheets import png_bytes
 
-LARGEST_PICTURE = 8192**2            # pixels; the largest that scanners write, 1.6 GB when it is worked with
 # colours and weights of places with normals
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -58,7 +57,8 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 def check_pixels(size: Sequence[int]) -> None:
     """ValueError for a picture of more pixels than are read: a small file may unpack to one that fills the memory."""
-    if math.prod(size) > LARGEST_PICTURE:
+    # pixels; the largest that scanners write, 1.6 GB when it is worked with
+    if math.prod(size) > (8192**2):
         raise ValueError(f"{' x '.join(map(str, size))} pixels, expected at most 8192 x 8192")
 
 
@@ -80,7 +80,10 @@ def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
         raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
     lost = "; ".join(beside.problems.values())
     visual = loaded.visual
-    image = _picture(getattr(visual, "material", None))
+    # (H, W, 3) of a material of trimesh, or None
+    found = (getattr(getattr(visual, "material", None), name, None) for name in ("image", "baseColorTexture"))
+    image = next((image for image in found if image is not None), None)
+    image = None if image is None else np.asarray(image.convert("RGB"), dtype=np.float64) / 255
     uv = getattr(visual, "uv", None)
     if image is None or uv is None or len(uv) != len(loaded.vertices):
         warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
@@ -140,13 +143,6 @@ def _names_a_picture(path: Path) -> bool:
     return b"mtllib" in data if ending == ".obj" else b'"images"' in data
 
 
-def _picture(material: Any) -> np.ndarray | None:
-    """(H, W, 3) of a material of trimesh, or None."""
-    found = (getattr(material, name, None) for name in ("image", "baseColorTexture"))
-    image = next((image for image in found if image is not None), None)
-    return None if image is None else np.asarray(image.convert("RGB"), dtype=np.float64) / 255
-
-
 def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:
     """A texture of a body: what `look` says of its pixels, where its weight is zero `unseen` (N, 3) of the vertices."""
     kept, faces, uv = unwrap(body)
@@ -194,9 +190,8 @@ def write_textured(path: str | Path, texture: Texture) -> None:
     material = skin_material((1, 1, 1))
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
-    write(path, glb.pack({
-        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
-        "meshes": [{"primitives": [surface]}], "images": [image], "textures": [{"source": 0}]}, up))
+    document = one_mesh({"primitives": [surface]}, material, {"name": "body"})
+    write(path, glb.pack({**document, "images": [image], "textures": [{"source": 0}]}, up))
 
 
 def _normals(mesh: Mesh) -> np.ndarray:

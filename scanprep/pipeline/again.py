@@ -1,7 +1,7 @@
 """What `scape prep run` was called with, kept in the set, so that the same can be done again from elsewhere."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -11,7 +11,6 @@ from ..geometry.files import read_mesh
 from ..geometry.landmarks import landmarks_beside, read_template_landmarks
 from ..geometry.mesh import Mesh
 from .prepare import PrepareConfig
-from .scan import Init
 from .scans import ScanTask, find_scans
 
 LISTED = 5                    # scans that a line names
@@ -35,23 +34,18 @@ class Call(KeptCall):
 
     def inputs(self, tell: Callable[[str], None]) -> tuple[list[ScanTask], Mesh, dict[str, int]]:
         """Scans, template and its landmarks, as their files are now; told of scans without landmarks."""
-        body, tasks = read_mesh(self.template), self.tasks()
-        marks, note = _template_marks(self.template, self.template_landmarks, body, tasks, self.config.scan.init)
-        if note:
-            tell(f"note: {note}")
+        body, tasks, init = read_mesh(self.template), self.tasks(), self.config.scan.init
+        without = [task.name for task in tasks if task.landmarks is None]
+        # the set keeps those of the template in any case: what is learned from it is measured by them
+        named = self.template_landmarks or landmarks_beside(self.template)
+        marks = read_template_landmarks(self.template, body, self.template_landmarks) if named else {}
+        if init == "pose":
+            tell("note: no landmarks are used; all scans must be near the template's pose")
+        elif init == "automatic" or (init == "best" and len(without) == len(tasks)):
+            tell("note: no landmarks are used; look at the page for scans turned round or mirrored")
+        else:                                          # some scan is led by landmarks
+            marks = marks or read_template_landmarks(self.template, body, self.template_landmarks)
+            if without and init == "best":
+                tell(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
+                     "look at the page for those turned round or mirrored")
         return tasks, body, marks
-
-
-def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], init: Init
-                    ) -> tuple[dict[str, int], str]:
-    """The landmarks of the template, where any scan is led by landmarks; and what is to be told."""
-    without = [task.name for task in tasks if task.landmarks is None]
-    # the set keeps those of the template in any case: what is learned from it is measured by them
-    kept = read_template_landmarks(template, body, given) if given or landmarks_beside(template) else {}
-    if init == "pose":
-        return kept, "no landmarks are used; all scans must be near the template's pose"
-    if init == "automatic" or (init == "best" and len(without) == len(tasks)):
-        return kept, "no landmarks are used; look at the page for scans turned round or mirrored"
-    note = (f"no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
-            "look at the page for those turned round or mirrored") if without and init == "best" else ""
-    return kept or read_template_landmarks(template, body, given), note

@@ -20,7 +20,7 @@ from ..geometry.mesh import Mesh
 from ..registration.figures import Limits, Verdict
 from .again import LISTED, Call
 from .page import PAGE, judge_set, judge_whole, write_set_page
-from .prepare import PrepareConfig, Prepared, Progress, prepare
+from .prepare import PrepareConfig, Progress, prepare
 from .scans import ScanTask
 
 ScansArg = Annotated[Path, Place("SCANS")]
@@ -28,7 +28,7 @@ ScansArg = Annotated[Path, Place("SCANS")]
 
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
             template_landmarks: Path | None = None, clean: bool = False, subject: Annotated[str, Person] = "",
-            config: PrepareConfig = PrepareConfig(), *, space: Workspace) -> Outcome:                # noqa: B008
+            config: PrepareConfig = PrepareConfig(), *, space: Workspace) -> Outcome:
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 
     Killed and started again it goes on where it was; scans whose files have changed are registered anew.
@@ -50,10 +50,10 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
     given = call.inputs(say)
     with bar("finding the parts of a person") as naming, bar("registering scans") as registering, \
             bar("finding the skeleton") as finding:
-        return carried_out(call, given, space, registering, finding, naming)
+        return carry_out(call, given, space, registering, finding, naming)
 
 
-def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], space: Workspace,
+def carry_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], space: Workspace,
                 *tell: Progress) -> Outcome:
     """Register what has changed of a folder in a set that is open, and keep there what was asked for.
 
@@ -63,16 +63,22 @@ def carried_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], 
     done = prepare(tasks, body, marks, space.folder, call.config, *tell)
     with space.staging("run") as staged:
         call.write(staged.folder)
-    verdicts = judge_set(space.folder)
-    return Outcome(space.folder, [*_progress_made(done, tasks), *_quality(verdicts),
-                                  Metric("unit assumed", call.config.scan.unit or "m")],
-                   {"prepare": call.config}, list(done.failures),
-                   judgement=judge_whole(verdicts, done.registered.skeleton),
+    verdicts, tree = judge_set(space.folder), done.registered.skeleton
+    seconds = [f.seconds for f in done.figures if np.isfinite(f.seconds)]
+    ways = Counter(f.init.lstrip("0123456789 ") for f in done.figures)        # without the number of landmarks
+    rows = [Metric("scans registered", f"{len(tasks) - len(done.failures)} of {len(tasks)}"),
+            Metric("of them in this run", done.fresh),
+            *(Metric(f"led by {way}", count) for way, count in sorted(ways.items())),
+            Metric("time a scan, mean", float(np.mean(seconds)) if seconds else "", "s"),
+            Metric("parts of the skeleton", len(tree.parents) if tree else "none sought"),
+            *_quality(verdicts), Metric("unit assumed", call.config.scan.unit or "m")]
+    return Outcome(space.folder, rows, {"prepare": call.config}, list(done.failures),
+                   judgement=judge_whole(verdicts, tree),
                    following=f"open {space.folder / 'report.html'}, then "
                              f"scape learn --poses {space.folder} --shapes {space.folder} -o model.npz")
 
 
-def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B008
+def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:
     """Write the page of a registered set again, with other limits for what needs a look.
 
     Example: scape prep page set --config limits.toml
@@ -86,17 +92,6 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B00
     verdicts = judge_set(registered, limits)
     return Outcome(None, _quality(verdicts), {"limits": limits},
                    judgement=judge_whole(verdicts, RegisteredSet.load(registered).skeleton, limits))
-
-
-def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:
-    tree = done.registered.skeleton
-    seconds = [f.seconds for f in done.figures if np.isfinite(f.seconds)]
-    ways = Counter(f.init.lstrip("0123456789 ") for f in done.figures)        # without the number of landmarks
-    return [Metric("scans registered", f"{len(tasks) - len(done.failures)} of {len(tasks)}"),
-            Metric("of them in this run", done.fresh),
-            *(Metric(f"led by {way}", count) for way, count in sorted(ways.items())),
-            Metric("time a scan, mean", float(np.mean(seconds)) if seconds else "", "s"),
-            Metric("parts of the skeleton", len(tree.parents) if tree else "none sought")]
 
 
 def _quality(verdicts: Sequence[Verdict]) -> list[Metric]:

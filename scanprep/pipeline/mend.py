@@ -20,11 +20,10 @@ from ..viewer.clicked import Clicked
 from ..viewer.messages import Message
 from ..viewer.results import ResultsApp
 from .again import Call
-from .cli import carried_out
+from .cli import carry_out
 from .page import PICTURES, judge_set
 from .scans import ScanTask
 
-LEDS = ("best", "landmarks")             # ways to begin that landmarks lead
 WORK = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
 
 
@@ -43,7 +42,7 @@ class MendApp(ResultsApp):
 
     def __init__(self, folder: Path, ending: str = ".landmarks.json", names: tuple[str, ...] = ()) -> None:
         self.folder, self.call = folder, Call.read(folder)
-        if self.call.config.scan.init not in LEDS:
+        if self.call.config.scan.init not in ("best", "landmarks"):
             raise ValueError(f"{folder}: it was made with --init {self.call.config.scan.init}, which uses none: "
                              "there are no landmarks to mend")
         self.verdicts = self.read_results()
@@ -102,7 +101,7 @@ class MendApp(ResultsApp):
 
         def do(space: Workspace, _: Progress) -> tuple[Outcome, str]:
             given = self.call.inputs(lambda line: None)
-            outcome = carried_out(self.call, given, space, *map(telling, WORK))
+            outcome = carry_out(self.call, given, space, *map(telling, WORK))
             fresh = next(metric.value for metric in outcome.metrics if metric.name == "of them in this run")
             return outcome, f"{fresh} of {len(given[0])} scans registered again; the page of the set is new"
 

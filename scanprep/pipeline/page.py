@@ -24,7 +24,6 @@ from ..pictures.sheets import webp_bytes
 from ..registration.figures import (
     UNSEEN,
     Limits,
-    ScanFigures,
     Verdict,
     read_doubts,
     read_failures,
@@ -37,12 +36,11 @@ from ..skeleton.tree import Skeleton
 from ..words import number_of
 
 PICTURES, PAGE = "pictures", "report.html"
-WIDTH, HEIGHT, TALL = 150, 216, 300
+WIDTH, HEIGHT = 150, 216
 FEW = 6                     # scans that turn where fewer need a look
 MOST_CARRIED = 4_000_000    # bytes of pictures in the page itself, of the worst scans; the others stay files beside it
 FAR = 0.005                 # of the template's size: the dark end of the distances
 TURN = 20.0                 # degrees from the front
-BALL = 0.013                # of the template's size: radius of the balls that stand for points
 
 PANELS = ("the scan", "the template on it", "distance, front", "distance, back", "dark: not sure")
 
@@ -53,14 +51,18 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     whole, verdicts = RegisteredSet.load(folder), judge_set(folder, limits)
     size = size_of(whole.template)
     entries = {entry.name: entry for entry in whole.entries}
-    page = Page(f"Scans of {folder.absolute().name}", _lead(verdicts))
+    failed = sum(v.failed for v in verdicts)
+    suspect = sum(v.suspect and not v.failed for v in verdicts)
+    parts = [f"{failed} could not be registered"] * bool(failed) + [f"{suspect} need a look"] * bool(suspect)
+    page = Page(f"Scans of {folder.absolute().name}",
+                f"{number_of(len(verdicts), 'scan')}: {', '.join(parts) or 'all within their limits'}.")
     page.verdict(judge_whole(verdicts, whole.skeleton, limits))
     page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
     page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
     page.markup(_index(verdicts, entries))
     page.section("Worst first", _explanation(limits, size))
-    page.picture(_legend(size))
+    page.picture(color_bar(0, FAR * size, "distance to the scan; grey: no data there"))
     scenes = worst_that_turn([folder / PICTURES / f"{verdict.name}.scene" for verdict in verdicts])
     pictures = carried((folder / PICTURES / f"{verdict.name}.webp" for verdict in verdicts), MOST_CARRIED)
     look = max(FEW, sum(verdict.suspect or verdict.failed for verdict in verdicts))
@@ -69,8 +71,8 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
         page.markup(_card(verdict, entries.get(verdict.name), shown))
     if whole.skeleton is not None:
         page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
-        parts = Solid(whole.template, part_colors(whole.skeleton.part_of_face))
-        page.bodies([Pane([parts], look_around(whole.template, turns=(TURN,))[0])], "parts")
+        page.bodies([Pane([Solid(whole.template, part_colors(whole.skeleton.part_of_face))],
+                          look_around(whole.template, turns=(TURN,))[0])], "parts")
     page.write((to or folder) / PAGE)
     return (to or folder) / PAGE
 
@@ -96,13 +98,6 @@ def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: 
         else []
     doubts += skeleton_doubts(skeleton) if skeleton is not None else []
     return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).joined(Judgement.of(check=doubts))
-
-
-def _lead(verdicts: Sequence[Verdict]) -> str:
-    failed = sum(v.failed for v in verdicts)
-    suspect = sum(v.suspect and not v.failed for v in verdicts)
-    parts = [f"{failed} could not be registered"] * bool(failed) + [f"{suspect} need a look"] * bool(suspect)
-    return f"{number_of(len(verdicts), 'scan')}: {', '.join(parts) or 'all within their limits'}."
 
 
 def _summary(verdicts: Sequence[Verdict]) -> list[tuple[str, float, float, str]]:
@@ -152,13 +147,22 @@ def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
 
 
 def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
+    f, table = verdict.figures, ""
     about = " · ".join(filter(None, [entry.subject if entry and entry.subject != verdict.name else "",
-                                     entry.pose if entry else "", verdict.figures.init if verdict.figures else ""]))
+                                     entry.pose if entry else "", f.init if f else ""]))
     badness = "failed" if verdict.failed else f"{verdict.badness:.1f}"
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
-    if verdict.figures and verdict.figures.removed:
-        about += f" · {100 * verdict.figures.removed:.0f}% of the points cleaned off"
-    table = _figure_table(verdict.figures) if verdict.figures else ""
+    if f:
+        about += f" · {100 * f.removed:.0f}% of the points cleaned off" if f.removed else ""
+        rows = (("distance, mean", f"{1000 * f.distance:.2f} mm"), ("distance, RMS", f"{1000 * f.rms:.2f} mm"),
+                ("with data", f"{100 * f.seen:.0f}%"), ("confidence, mean", f"{f.confidence:.2f}"),
+                ("scan off the template", f"{100 * f.missed:.1f}%"),
+                ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("inverted triangles", f"{f.inverted}"),
+                *([("limbs rolled otherwise", "yes")] if f.rolled else []),
+                ("landmarks off, RMS", "–" if np.isnan(f.landmarks) else f"{1000 * f.landmarks:.1f} mm"),
+                ("converged", "yes" if f.converged else "no"))
+        table = "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'
+                                    for name, value in rows) + "</table>"
     return (f'<section class="scan {_mark(verdict)}" id="{_anchor(verdict)}"><h3><span class="dot"></span>'
             f"{escape(verdict.name)} <small>{badness}</small><small>{escape(about)}</small></h3>"
             f"<ul>{reasons}</ul>{shown}{table}</section>")
@@ -167,7 +171,7 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
 def _shown(page: Page, folder: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
     """A scan that turns, or its picture: the page carries that, or finds it in the folder when it is scrolled to."""
     if picture is not None and scene is not None:
-        return page.turning(scene, picture, height=TALL)
+        return page.turning(scene, picture, height=300)
     if picture is None and not (folder / PICTURES / f"{name}.webp").exists():
         return ""
     source = data_uri(picture) if picture is not None else f"{PICTURES}/{quote(name)}.webp"
@@ -177,28 +181,12 @@ def _shown(page: Page, folder: Path, name: str, picture: bytes | None, scene: by
             f'<div class="panels">{labels}</div></div>')
 
 
-def _figure_table(f: ScanFigures) -> str:
-    rows = (("distance, mean", f"{1000 * f.distance:.2f} mm"), ("distance, RMS", f"{1000 * f.rms:.2f} mm"),
-            ("with data", f"{100 * f.seen:.0f}%"), ("confidence, mean", f"{f.confidence:.2f}"),
-            ("scan off the template", f"{100 * f.missed:.1f}%"),
-            ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("inverted triangles", f"{f.inverted}"),
-            *([("limbs rolled otherwise", "yes")] if f.rolled else []),
-            ("landmarks off, RMS", "–" if np.isnan(f.landmarks) else f"{1000 * f.landmarks:.1f} mm"),
-            ("converged", "yes" if f.converged else "no"))
-    return "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'
-                               for name, value in rows) + "</table>"
-
-
 def _mark(verdict: Verdict) -> str:
     return "failed" if verdict.failed else "look" if verdict.suspect else "fine"
 
 
 def _anchor(verdict: Verdict) -> str:
     return "scan-" + escape(verdict.name.replace(" ", "_"))
-
-
-def _legend(size: float) -> np.ndarray:
-    return color_bar(0, FAR * size, "distance to the scan; grey: no data there")
 
 
 def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> tuple[bytes, bytes]:
@@ -211,8 +199,15 @@ def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> t
     body = fit.mesh.with_vertices((fit.mesh.vertices - middle) @ R.T)
     near, back = (replace(c, width=1.06 * c.width, height=1.06 * c.height)
                   for c in look_around(template, body.vertices, (TURN, TURN + 180)))
-    size = size_of(template)
-    given = _scan(scan, R, middle, size)
+    # the scan in the frame of the picture, with no more detail than a small picture can show
+    size, ball = size_of(template), 0.013 * size_of(template)
+    given: Solid | Dots
+    if isinstance(scan, Mesh) and len(scan.faces):
+        coarse = coarsened(scan, 0.007 * size)
+        given = Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
+    else:
+        points = scan.vertices if isinstance(scan, Mesh) else scan
+        given = Dots((points[thin(points, 1.25 * ball)] - middle) @ R.T, CLAY, ball)
     far = Heat(evened(body, fit.distances), 0, FAR * size, "distance to the scan")
     sure = Heat(1 - fit.confidence, -0.35, 1, colormap="Blues")                     # unlike the distances
     shown: list[tuple[Shape, Camera]] = [
@@ -223,15 +218,6 @@ def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> t
         "confidence": Heat(fit.confidence, 0, 1, "confidence", "%", "Blues_r"), "plain": np.array(CLAY)})
     over = replace(given, name="scan over it", visible=False)
     return strip, small_scene([Pane([given], near, "scan"), Pane([registered, over], near, "the template on it")])
-
-
-def _scan(scan: Mesh | np.ndarray, R: np.ndarray, middle: np.ndarray, size: float) -> Solid | Dots:
-    """The scan in the frame of the picture, with no more detail than a small picture can show."""
-    if isinstance(scan, Mesh) and len(scan.faces):
-        coarse = coarsened(scan, 0.007 * size)
-        return Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
-    points = scan.vertices if isinstance(scan, Mesh) else scan
-    return Dots((points[thin(points, 1.25 * BALL * size)] - middle) @ R.T, CLAY, BALL * size)
 
 
 def evened(mesh: Mesh, values: np.ndarray) -> np.ndarray:

@@ -91,23 +91,21 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         bare = Mesh(template.vertices, template.faces, template.colors)
         parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
         work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan, parts)
-        tables = _Tables(space, work, tasks)
         if not space.results(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
-        tables.write({})
         failures: dict[str, str] = {}
         fresh: tuple[str, ...] = ()
+        _write_tables(space, work, tasks, failures)
         try:
             done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress,
                              scan_progress)
             failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
-            registered = tables.write(failures)
-            _with_skeleton(space, registered, config, skeleton_progress)
+            _write_tables(space, work, tasks, failures)
+            _write_skeleton(space, config, skeleton_progress)
         finally:
-            tables.write(failures)
+            figures = _write_tables(space, work, tasks, failures)
             with space.staging("page") as staged:
                 write_set_page(space.folder, to=staged.folder)
-    figures = tables.figures()
     return Prepared(RegisteredSet.load(space.folder), tuple(figures[name] for name in sorted(figures)),
                     tuple(failures[name] for name in sorted(failures)), len(fresh))
 
@@ -137,53 +135,33 @@ def mesh_file(name: str) -> str:
     return f"meshes/{name}.ply"
 
 
-@dataclass(frozen=True, eq=False)
-class _Tables:
-    """The tables of a set, made of the results that are there."""
-
-    space: Workspace
-    work: RegisterScan
-    tasks: Sequence[ScanTask]
-
-    def figures(self) -> dict[str, ScanFigures]:
-        """Of every scan that the set holds, by name."""
-        return {name.removeprefix(SCANS): found for name, found in self.space.results(self.work).items()
-                if name.startswith(SCANS)}
-
-    def write(self, failures: Mapping[str, str]) -> RegisteredSet:
-        """Everything in the set but meshes, pictures, skeleton and page."""
-        figures = self.figures()
-        entries = {entry.name: entry for entry in self._before() if entry.name in figures}
-        entries.update({t.name: SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name))
-                        for t in self.tasks if t.name in figures})
-        with self.space.staging("tables") as staged:
-            write_set(staged.folder, self.work.template, [entries[name] for name in sorted(entries)],
-                      {"settings": asdict(self.work.settings)})
-            write_landmarks(staged.folder / "landmarks.json", dict(self.work.landmarks))
-            write_figures(staged.folder, figures.values())
-            if self.work.parts is not None:
-                write_doubts(staged.folder, {name: each.doubts for name, each in figures.items()})
-            write_failures(staged.folder, failures)
-        return RegisteredSet.load(self.space.folder)
-
-    def _before(self) -> Sequence[SetEntry]:
-        """What the set holds of scans that are not among the tasks, if all was made in the same way."""
-        if not (self.space.folder / "set.json").exists():
-            return ()
-        names = {task.name for task in self.tasks}
-        others = [entry for entry in RegisteredSet.load(self.space.folder).entries if entry.name not in names]
-        known = self.space.results(self.work)
-        lost = [entry.name for entry in others if SCANS + entry.name not in known]
-        if lost:
-            raise ValueError(f"{self.space.folder}: holds {len(lost)} other scans that were registered with "
-                             f"another template, settings or scapekit ({', '.join(lost[:5])}); name another folder")
-        return others
+def _write_tables(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str]
+                  ) -> dict[str, ScanFigures]:
+    """Everything in the set but meshes, pictures, skeleton and page, of the results that are there: their figures."""
+    figures = {name.removeprefix(SCANS): found for name, found in space.results(work).items()
+               if name.startswith(SCANS)}
+    # scans of earlier calls stay, if all were registered in the same way
+    entries = {entry.name: entry for entry in RegisteredSet.load(space.folder).entries} \
+        if (space.folder / "set.json").exists() else {}
+    lost = [name for name in entries if name not in figures and name not in {task.name for task in tasks}]
+    if lost:
+        raise ValueError(f"{space.folder}: holds {len(lost)} other scans that were registered with "
+                         f"another template, settings or scapekit ({', '.join(lost[:5])}); name another folder")
+    entries |= {t.name: SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name)) for t in tasks}
+    with space.staging("tables") as staged:
+        write_set(staged.folder, work.template, [entries[name] for name in sorted(entries) if name in figures],
+                  {"settings": asdict(work.settings)})
+        write_landmarks(staged.folder / "landmarks.json", dict(work.landmarks))
+        write_figures(staged.folder, figures.values())
+        if work.parts is not None:
+            write_doubts(staged.folder, {name: each.doubts for name, each in figures.items()})
+        write_failures(staged.folder, failures)
+    return figures
 
 
-def _with_skeleton(space: Workspace, registered: RegisteredSet, config: PrepareConfig, progress: Progress | None
-                   ) -> None:
+def _write_skeleton(space: Workspace, config: PrepareConfig, progress: Progress | None) -> None:
     """The skeleton of the subject with the most meshes, found anew when one of them has changed."""
-    path = space.folder / "skeleton.json"
+    registered, path = RegisteredSet.load(space.folder), space.folder / "skeleton.json"
     if path.exists() and not space.is_ours(path.name):
         return                                                  # edited by hand: it is the user's now
     subjects = [entry.subject for entry in registered.entries]

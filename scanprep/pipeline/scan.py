@@ -30,7 +30,6 @@ from .scans import ScanTask
 
 Init = Literal["best", "landmarks", "automatic", "pose"]
 
-OTHER_UNIT = 30                # times larger or smaller than the template: a scan in inches, centimetres, millimetres
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
@@ -73,19 +72,23 @@ class RegisteredScan:
     scene: bytes = b""              # the same for the browser
 
 
-def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
-                  settings: ScanSettings, parts: PersonParts | None = None,
-                  progress: Progress | None = None) -> RegisteredScan:
+def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], settings: ScanSettings,
+                  parts: PersonParts | None = None, progress: Progress | None = None) -> RegisteredScan:
     """Read and register one scan, and try other rolls of limbs where the template has the parts of a person.
 
     ValueError for files that cannot be read, or a registration that means nothing.
     """
     start = time.perf_counter()
     with one_thread():
-        scan = read_scan(task.scan, settings.unit)
-        _check_unit(task, scan, template)
+        scan, removed = read_scan(task.scan, settings.unit), 0.0
+        # another unit is refused before minutes of work; a room around the body, or a hand alone, is none
+        found = extent(scan.vertices if isinstance(scan, Mesh) else scan) / extent(template.vertices)
+        if not 1 / 30 < found < 30:
+            raise ValueError(f"{task.scan}: it is {found:.3g} times as large as the template: the wrong unit? (--unit)")
         landmarks = _landmarks(task, scan, template_landmarks, settings)
-        scan, removed = _cleaned(scan, landmarks, settings.clean)
+        if settings.clean is not None:
+            cleaned = clean_scan(scan, settings.clean, None if landmarks is None else landmarks[1])
+            scan, removed = cleaned.scan, 1 - float(cleaned.kept.mean())
         fit, pairs, init = _registered(template, scan, landmarks, settings, progress)
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
@@ -110,13 +113,6 @@ def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tup
     """What is unlikely in the size of a person on whom the template's vertices (N, 3), metres, lie."""
     sized = beyond_people(stature(template, parts, vertices))
     return tuple(Doubt(2.0 if sized.problems else 1.0, reason) for reason in sized.reasons)
-
-
-def _check_unit(task: ScanTask, scan: Mesh | np.ndarray, template: Mesh) -> None:
-    """Refuse a scan in another unit before minutes of work; a room around the body, or a hand alone, is none."""
-    found = extent(scan.vertices if isinstance(scan, Mesh) else scan) / extent(template.vertices)
-    if not 1 / OTHER_UNIT < found < OTHER_UNIT:
-        raise ValueError(f"{task.scan}: it is {found:.3g} times as large as the template: the wrong unit? (--unit)")
 
 
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
@@ -145,12 +141,3 @@ def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | 
         return fit, pairs, number_of(len(pairs), "correspondence")
     except ValueError as error:
         raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
-
-
-def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: CleanScanConfig | None
-             ) -> tuple[Mesh | np.ndarray, float]:
-    """The body alone, and the share of points that were taken off."""
-    if config is None:
-        return scan, 0.0
-    found = clean_scan(scan, config, None if landmarks is None else landmarks[1])
-    return found.scan, 1 - float(found.kept.mean())

@@ -33,7 +33,20 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     scan it is, it is of `subject`, or of a person of its own. ValueError for no scans, or two of one name.
     """
     folder = Path(folder)
-    paths = _list_scans(folder)
+    paths: dict[str, Path] = {}
+    for path in list_files(folder, is_scan):
+        name = name_of(path)
+        if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
+            raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
+                             "rename it")
+        if name in paths:
+            raise ValueError(f"{folder}: expected one file a scan, found {paths[name].name} and {path.name}, both "
+                             f"of the name '{name}'; rename one, or merge them where they are views of one scan")
+        paths[name] = path
+    if not paths:
+        inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir() and list_files(place, is_scan)]
+        hint = f"; there are some in its folders {', '.join(inner[:5])}: name one of them" if inner else ""
+        raise MeshFileError(f"{folder}: expected scans ({', '.join(SCAN_ENDINGS)}), found none{hint}")
     about = _read_table(folder / TABLE)
     unknown = sorted(set(about) - set(paths))
     if unknown:
@@ -48,25 +61,6 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
         tasks.append(ScanTask(name, path, next(filter(None, beside), None),
                               row.get("subject") or subject or name, row.get("pose") or "", row.get("sex") or ""))
     return tasks
-
-
-def _list_scans(folder: Path) -> dict[str, Path]:
-    """Name -> file."""
-    found: dict[str, Path] = {}
-    for path in list_files(folder, is_scan):
-        name = name_of(path)
-        if visible(name) != name or "\n" in name:            # it will stand in tables, pages and messages
-            raise ValueError(f"{folder}: expected names without control characters, found {path.name!a}; "
-                             "rename it")
-        if name in found:
-            raise ValueError(f"{folder}: expected one file a scan, found {found[name].name} and {path.name}, both "
-                             f"of the name '{name}'; rename one, or merge them where they are views of one scan")
-        found[name] = path
-    if not found:
-        inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir() and list_files(place, is_scan)]
-        hint = f"; there are some in its folders {', '.join(inner[:5])}: name one of them" if inner else ""
-        raise MeshFileError(f"{folder}: expected scans ({', '.join(SCAN_ENDINGS)}), found none{hint}")
-    return found
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:

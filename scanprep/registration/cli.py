@@ -36,11 +36,9 @@ from .person import PersonParts, person_parts, stature
 from .repair import repaired
 from .schedule import RegistrationConfig
 
-TargetArg = Annotated[Path, Place("TARGET")]
 
-
-def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,
-          unit: Unit | None = None, config: RigidConfig = RigidConfig()) -> Outcome:  # noqa: B008
+def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
+          unit: Unit | None = None, config: RigidConfig = RigidConfig()) -> Outcome:
     """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
 
     Example: scape prep align front.ply back.ply -o front_aligned.ply
@@ -72,19 +70,23 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
             f"it did not converge, at {MM * found.rms:.0f} mm RMS: a start far from the target?"]))
 
 
-NO_LANDMARKS = Path("none")          # as `--landmarks none`
+def _read_landmarks(template: Path, body: Mesh, scan: Path, data: Mesh | np.ndarray, landmarks: Path | None,
+                    template_landmarks: Path | None, unit: Unit | None) -> tuple[Landmarks | None, list[Metric]]:
+    """Vertices of the template and points of the scan that carry the same names, and the rows that say so.
 
-
-def _given(scan: Path, landmarks: Path | None) -> Path | None:
-    """The landmark file of a scan: the one named, else the one beside it; `none` is none."""
-    if landmarks == NO_LANDMARKS and not landmarks.exists():
-        return None
-    return landmarks or landmarks_beside(scan)
+    They are in the file named, else in the one beside the scan; the word none is none.
+    """
+    file = None if landmarks == Path("none") and not landmarks.exists() else landmarks or landmarks_beside(scan)
+    if file is None:
+        return None, [Metric("landmarks", 0)]
+    known = read_landmarks(file, data, unit)
+    pairs = shared_landmarks(file, read_template_landmarks(template, body, template_landmarks), known)
+    return pairs, [Metric("landmarks", len(pairs[0]) if pairs else 0), Metric("landmark file", file.name)]
 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
                template_landmarks: Path | None = None, unit: Unit | None = None,
-               config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:  # noqa: B008
+               config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:
     """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
     Example: scape prep correspond scan.ply --template template.ply --landmarks scan.json -o pairs.json
@@ -99,22 +101,20 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    given = _given(scan, landmarks)
-    pairs = _pairs(body, data, template, given, template_landmarks, unit)
+    pairs, led_by = _read_landmarks(template, body, scan, data, landmarks, template_landmarks, unit)
     with bar("finding correspondences") as progress:
         found = find_correspondences(body, data, pairs, config, progress)
     write_correspondences(output, found)
     return Outcome(output, [
-        Metric("method", found.method), *_led_by(given, pairs), Metric("correspondences", len(found)),
+        Metric("method", found.method), *led_by, Metric("correspondences", len(found)),
         Metric("confidence, median", float(np.median(found.confidence))),
         Metric("converged", str(found.converged))], {"correspond": config},
         judgement=Judgement.of(correspondences_problem(found), correspondences_doubts(found)))
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-                 template_landmarks: Path | None = None,
-                 correspondences: Path | None = None, unit: Unit | None = None,
-                 config: RegistrationConfig = RegistrationConfig()) -> Outcome:  # noqa: B008
+                 template_landmarks: Path | None = None, correspondences: Path | None = None, unit: Unit | None = None,
+                 config: RegistrationConfig = RegistrationConfig()) -> Outcome:
     """Bend the template onto one scan.
 
     Example: scape prep register scan.ply --template template.ply --landmarks scan.json -o registered.ply
@@ -130,8 +130,8 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    given = landmarks if correspondences and landmarks is None else _given(scan, landmarks)
-    pairs = _pairs(body, data, template, given, template_landmarks, unit)
+    pairs, led_by = (None, [Metric("landmarks", 0)]) if correspondences and landmarks is None else _read_landmarks(
+        template, body, scan, data, landmarks, template_landmarks, unit)
     hints = read_correspondences(correspondences) if correspondences else None
     with bar("registering") as progress:
         fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
@@ -142,8 +142,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     fit = with_soles(body, data, fit, parts)
     write_mesh(output, fit.mesh)
     return Outcome(output, [
-        *_led_by(given, pairs),
-        Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
+        *led_by, Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
         Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
         Metric("confidence, mean", float(fit.confidence.mean())),
         Metric("scan off the template", 100 * fit.uncovered, "%"),
@@ -169,18 +168,3 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
         return verdict.judgement
     # of a body that is too large or too small the size is the cause, limbs out of shape are what comes of it
     return beyond_people(stature(template, parts, fit.mesh.vertices)).joined(verdict.judgement)
-
-
-def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path | None,
-           template_landmarks: Path | None, unit: Unit | None) -> Landmarks | None:
-    """Vertices of the template and points of the scan that carry the same names."""
-    if landmarks is None:
-        return None
-    found = read_landmarks(landmarks, data, unit)
-    return shared_landmarks(landmarks, read_template_landmarks(template, body, template_landmarks), found)
-
-
-def _led_by(landmarks: Path | None, pairs: Landmarks | None) -> list[Metric]:
-    """The rows that say what led the template to the scan."""
-    used = [] if landmarks is None else [Metric("landmark file", landmarks.name)]
-    return [Metric("landmarks", len(pairs[0]) if pairs else 0), *used]

@@ -1,14 +1,19 @@
-"""A graph of rotating and scaling nodes that carries a surface: the coarse degrees of freedom of a registration."""
+"""A graph of rotating and scaling nodes that carries a surface: the coarse degrees of freedom of a registration.
+
+A node has seven unknowns: a left rotation (radians), a change of log-scale and a translation (metres).
+"""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from ..geometry import rotations
 from ..geometry.farthest_points import farthest_points
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays
@@ -56,9 +61,10 @@ def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.
     """
     nodes = farthest_points(template.vertices, min(count, len(template.vertices)))
     carrying, weights = _carriers(template, nodes, min(carriers, len(nodes) - 1))
-    surface = _surface_links(carrying)
+    # on the surface, nodes that carry a vertex together
+    pairs = np.concatenate([carrying[:, pair] for pair in combinations(range(carrying.shape[1]), 2)])
     inner = _inner_links(template, nodes, reach * np.sqrt(template.face_areas.sum()))
-    links = np.unique(np.sort(np.concatenate([surface, inner]), axis=1), axis=0)
+    links = np.unique(np.sort(np.concatenate([pairs[pairs[:, 0] != pairs[:, 1]], inner]), axis=1), axis=0)
     edges = np.concatenate([links, links[:, ::-1]])
     area = np.bincount(carrying.ravel(), (weights * template.vertex_areas[:, None]).ravel(), len(nodes))
     degree = np.bincount(edges[:, 0], minlength=len(nodes))
@@ -94,13 +100,6 @@ def _carriers(template: Mesh, nodes: np.ndarray, K: int) -> tuple[np.ndarray, np
     return index[:, :K], share / share.sum(axis=1, keepdims=True)
 
 
-def _surface_links(carriers: np.ndarray) -> np.ndarray:
-    """(L, 2) pairs of nodes that carry a vertex together."""
-    K = carriers.shape[1]
-    pairs = np.concatenate([carriers[:, [i, j]] for i in range(K) for j in range(i + 1, K)])
-    return np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
-
-
 def _inner_links(template: Mesh, nodes: np.ndarray, reach: float, most: int = 8) -> np.ndarray:
     """(L, 2) pairs of nodes that see each other through the inside, for each node the `most` nearest."""
     points, normals = template.vertices[nodes], template.vertex_normals[nodes]
@@ -119,3 +118,46 @@ def _inner_links(template: Mesh, nodes: np.ndarray, reach: float, most: int = 8)
     i, j = i[order], j[order]
     rank = np.arange(len(i)) - np.searchsorted(i, i)
     return np.stack([i, j], axis=1)[rank < most]
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMotion:
+    """How every node has rotated, R (M, 3, 3), grown, log_scale (M,), and moved: positions (M, 3), metres."""
+
+    R: np.ndarray
+    log_scale: np.ndarray
+    positions: np.ndarray
+
+    @property
+    def linear(self) -> np.ndarray:
+        """(M, 3, 3) rotation and growth together."""
+        return np.exp(self.log_scale)[:, None, None] * self.R
+
+    def advance(self, step: np.ndarray) -> NodeMotion:
+        """After a step (M, 7): left rotation (radians), change of log-scale, translation (metres)."""
+        return replace(self, R=rotations.exp(step[:, :3]) @ self.R, log_scale=self.log_scale + step[:, 3],
+                       positions=self.positions + step[:, 4:])
+
+
+def arms(graph: DeformationGraph, motion: NodeMotion, vertices: np.ndarray) -> np.ndarray:
+    """(n, K, 3) from each carrying node to each of the vertices (n,), as the node sees it, metres."""
+    carriers = graph.carriers[vertices]
+    local = graph.rest[vertices, None] - graph.nodes[carriers]
+    return np.matmul(motion.linear[carriers], local[..., None])[..., 0]
+
+
+def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
+    """The template's vertices (N, 3) after the motion, metres."""
+    linear = motion.linear
+    offset = motion.positions - np.matmul(linear, graph.nodes[..., None])[..., 0]
+    affine = np.concatenate([linear, offset[..., None]], axis=2).reshape(-1, 12)
+    blended = np.einsum("nk,nkc->nc", graph.weights, affine[graph.carriers]).reshape(-1, 3, 4)
+    return np.matmul(blended[..., :3], graph.rest[..., None])[..., 0] + blended[..., 3]
+
+
+def refine_motion(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:
+    """The motion of a finer graph of the same template that repeats the motion of a coarser one."""
+    at = new.node_vertices
+    w, carriers = old.weights[at], old.carriers[at]
+    R = rotations.project(np.einsum("mk,mkij->mij", w, motion.R[carriers]))
+    return NodeMotion(R, np.einsum("mk,mk->m", w, motion.log_scale[carriers]), deform(old, motion)[at])

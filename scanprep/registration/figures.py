@@ -14,10 +14,9 @@ from ..judgement import Judgement
 from ..ranges import Settings
 from ..words import number_of
 from .limbs import Doubt
-from .nonrigid import Registration, stretched_share
+from .nonrigid import Registration, share_stretched
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
-CROWDED = 0.3                  # share of a scan off the template that may be a second person, who is half of it
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
 FIGURES, TIMES, FAILURES, LIMBS = "registration.csv", "times.csv", "failures.csv", "limbs.csv"
@@ -49,7 +48,7 @@ def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanF
     return ScanFigures(
         name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)
+        share_stretched(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)
 
 
 _TABLED = [f for f in fields(ScanFigures) if f.name not in ("seconds", "doubts")]
@@ -74,10 +73,10 @@ def write_figures(folder: Path, figures: Iterable[ScanFigures]) -> None:
     rows = sorted(figures, key=lambda f: f.name)
     names = [f.name for f in _TABLED]
     tables.write_table(folder / TIMES, ["name", "seconds"], [(f.name, f"{f.seconds:.2f}") for f in rows])
-    tables.write_table(folder / FIGURES, names, [[_tabled(getattr(row, name)) for name in names] for row in rows])
+    tables.write_table(folder / FIGURES, names, [[_as_cell(getattr(row, name)) for name in names] for row in rows])
 
 
-def _tabled(value: Any) -> Any:
+def _as_cell(value: Any) -> Any:
     return NONE if isinstance(value, float) and np.isnan(value) else value
 
 
@@ -199,9 +198,10 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
 
 
 def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt]) -> Verdict:
+    # share of a scan off the template that may be a second person, who is half of it
     over = {
         f"{100 * f.missed:.1f}% of the scan lies off the template: "
-        + ("a second person, or clutter?" if f.missed > CROWDED else "an uncovered limb, or clutter"):
+        + ("a second person, or clutter?" if f.missed > 0.3 else "an uncovered limb, or clutter"):
             f.missed / limits.missed,
         f"{1000 * f.distance:.1f} mm from the scan on average": f.distance / (limits.distance * size),
         f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here: a part of the body, or one view?":

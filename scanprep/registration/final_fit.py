@@ -8,7 +8,6 @@ are as welcome as other poses, and where there are no data the template continue
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
@@ -19,11 +18,9 @@ from ..geometry.sparse import Factored, conjugate_gradients
 from ..geometry.surface import OrientedPoints
 from ..geometry.target import Target, orient
 from ..threads import search_threads
-from .matches import NORMALS, Pull, pull
+from .matches import NORMALS, Pull, pull, tukey
 from .schedule import FinalFitConfig, FinalFitRound
-from .stretches import Field, Triangles, triangles_of
-
-AT_ONCE = 2000                # points around which surfaces are fitted at once: their neighbours fit into the cache
+from .stretches import Field, triangles_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +41,30 @@ class FinalFit:
 def final_fit(template: Mesh, start: np.ndarray, target: Target,
               landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: FinalFitConfig | None = None) -> FinalFit:
     """A template whose vertices (N, 3) lie near a scan, on it; landmarks are vertices (L,) and places (L, 3)."""
-    given = _prepared(template, start, target, landmarks, config or FinalFitConfig())
+    config = config or FinalFitConfig()
+    surface = _SurfaceFit(template, start, target, landmarks, config)
     x, before, stiff = start, start, np.ones(len(template.faces))
-    for stage in given.config.rounds:
-        x, before = _laid_out(given, x, _fields(given, x, stage), stage, stiff), x
-    repairs, fields = 0, _fields(given, x, stage)
-    quality = _quality(given, fields)
-    while repairs < 12 and (bad := quality.inverted | quality.needles).any():
+    for stage in config.rounds:
+        x, before = surface.lay_out(x, surface.fields(x, stage)[1], stage, stiff), x
+    # repairs: triangles around folds and needles resist more and more
+    for repairs in range(13):
+        measured, smooth = surface.fields(x, stage)
+        n = template.face_normals[..., None]
+        inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
+        relative = measured.gradient @ np.linalg.inv(smooth.gradient)
+        stretches = np.maximum(np.linalg.eigvalsh(relative.transpose(0, 2, 1) @ relative), 1e-12)       # their squares
+        needles = (stretches[:, 2] > 4**2) | (stretches[:, 0] < 1 / 4**2)
+        if repairs == 12 or not (inverted | needles).any():
+            break
         near = np.zeros(len(x))
-        near[template.faces[bad]] = 1
+        near[template.faces[inverted | needles]] = 1
         stiff = np.where(near[template.faces].any(axis=1), 4 * stiff, stiff)
-        x, before = _laid_out(given, x, fields, stage, stiff), x
-        repairs, fields = repairs + 1, _fields(given, x, stage)
-        quality = _quality(given, fields)
-    return FinalFit(x, _data(given, x, stage.reach)[1], given.scan.noise, quality.strain, quality.roughness,
-                    int(quality.inverted.sum()), int(quality.needles.sum()), len(given.config.rounds) + repairs,
-                    float(np.linalg.norm(x - before, axis=1).mean()))
+        x, before = surface.lay_out(x, smooth, stage, stiff), x
+    strain, roughness = (float(np.sqrt(np.average(square, weights=surface.triangles.areas)))
+                         for square in ((measured.log_S**2).sum(axis=(1, 2)) / 3,
+                                        (0.25 * np.log(stretches)**2).mean(axis=1)))
+    return FinalFit(x, surface.data(x, stage.reach)[1], surface.scan.noise, strain, roughness, int(inverted.sum()),
+                    int(needles.sum()), len(config.rounds) + repairs, float(np.linalg.norm(x - before, axis=1).mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +82,19 @@ class SmoothedScan:
     spacing: float
 
 
-def smoothed_scan(target: Target, width: float, neighbours: int = 40) -> SmoothedScan:
+def smooth_scan(target: Target, width: float, neighbours: int = 40) -> SmoothedScan:
     """A scan with a quadratic surface fitted around every point; others count by a Gaussian of `width` metres."""
     P, n = target.points, target.normals
     apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=search_threads(len(P)))
-    some = (slice(first, first + AT_ONCE) for first in range(0, len(P), AT_ONCE))
-    fitted = [_fitted_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in some]
+    # two thousand points at once: their neighbours fit into the cache
+    some = (slice(first, first + 2000) for first in range(0, len(P), 2000))
+    fitted = [_fit_surfaces(P[at], n[at], P[near[at]], n[near[at]], apart[at], width) for at in some]
     points, normals, rest = (np.concatenate(part) for part in zip(*fitted, strict=True))
     spacing = np.median(apart[:, min(4, apart.shape[1] - 1)])
     return SmoothedScan(points, normals, target.border, float(np.sqrt(np.median(rest))), float(spacing))
 
 
-def _fitted_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.ndarray, apart: np.ndarray,
+def _fit_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.ndarray, apart: np.ndarray,
                      width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points and normals (m, 3) moved to the quadratic surface through their neighbours (m, k, 3).
 
@@ -112,88 +118,52 @@ def _fitted_surfaces(P: np.ndarray, n: np.ndarray, near: np.ndarray, near_n: np.
     return P + width * np.clip(fit[:, 0], -1, 1) * n, normals, square
 
 
-@dataclass(frozen=True, eq=False)
-class _Given:
-    """What does not change: the template, where it began, the scan, what holds it everywhere."""
+class _SurfaceFit:
+    """The template, where it began, the scan, and what holds it everywhere."""
 
-    template: Mesh
-    start: np.ndarray
-    config: FinalFitConfig
-    size: float
-    triangles: Triangles
-    areas: np.ndarray
-    scan: SmoothedScan
-    held: Pull
+    def __init__(self, template: Mesh, start: np.ndarray, target: Target,
+                 landmarks: tuple[np.ndarray, np.ndarray] | None, config: FinalFitConfig) -> None:
+        size, N = float(np.sqrt(template.face_areas.sum())), len(start)
+        self.template, self.start, self.config, self.size = template, start, config, size
+        self.triangles = triangles_of(template)
+        self.areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
+        target = orient(target, template.with_vertices(start), NORMALS * size)
+        self.scan = smooth_scan(target, config.noise_width * size)
+        self.held = pull(N, np.arange(N), start, 1e-9 * self.areas)
+        if landmarks is not None:
+            self.held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))
 
+    def fields(self, x: np.ndarray, stage: FinalFitRound) -> tuple[Field, Field]:
+        """The field of rotations and stretches measured, and the smooth one, in which what disagrees counts little."""
+        measured = self.triangles.measure(x)
+        weights = np.ones(len(self.template.faces))
+        for _ in range(2):
+            smooth = self.triangles.smooth(measured, stage.field * self.size, weights)
+            off = np.linalg.norm(measured.gradient - smooth.gradient, axis=(1, 2))
+            weights = 1 / (1 + (off / 0.5) ** 2) ** 2
+        return measured, smooth
 
-def _prepared(template: Mesh, start: np.ndarray, target: Target, landmarks: tuple[np.ndarray, np.ndarray] | None,
-              config: FinalFitConfig) -> _Given:
-    size, N = float(np.sqrt(template.face_areas.sum())), len(start)
-    areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
-    target = orient(target, template.with_vertices(start), NORMALS * size)
-    scan = smoothed_scan(target, config.noise_width * size)
-    held = pull(N, np.arange(N), start, 1e-9 * areas)
-    if landmarks is not None:
-        held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))
-    return _Given(template, start, config, size, triangles_of(template), areas, scan, held)
+    def data(self, x: np.ndarray, reach: float) -> tuple[Pull, np.ndarray]:
+        """Vertices drawn to the tangent planes of the nearest smoothed points with like normals, and which (N,) are."""
+        reach, scan, body = reach * self.size, self.scan, self.template.with_vertices(x)
+        found = OrientedPoints(scan.points, scan.normals, NORMALS * self.size).match(x, body.vertex_normals, reach)
+        # At the edge of a hole a point speaks for its own neighbourhood, not for what lies beyond the edge.
+        beside = np.linalg.norm(np.cross(scan.normals[found.index], x - scan.points[found.index]), axis=1)
+        seen = found.valid & (~scan.border[found.index] | (beside <= scan.spacing))
+        v = np.flatnonzero(seen)
+        p = found.index[v]
+        weights = self.areas[v] * tukey(found.distances[v], reach)
+        return pull(len(x), v, scan.points[p], weights, scan.normals[p], self.config.slide), seen
 
-
-def _fields(given: _Given, x: np.ndarray, stage: FinalFitRound) -> tuple[Field, Field]:
-    """The field of rotations and stretches measured, and the smooth one, in which what disagrees counts little."""
-    measured = given.triangles.measured(x)
-    weights = np.ones(len(given.template.faces))
-    for _ in range(2):
-        smooth = given.triangles.smoothed(measured, stage.field * given.size, weights)
-        off = np.linalg.norm(measured.gradient - smooth.gradient, axis=(1, 2))
-        weights = 1 / (1 + (off / 0.5) ** 2) ** 2
-    return measured, smooth
-
-
-def _data(given: _Given, x: np.ndarray, reach: float) -> tuple[Pull, np.ndarray]:
-    """Vertices drawn to the tangent planes of the nearest smoothed points with like normals, and which (N,) are."""
-    reach, scan, body = reach * given.size, given.scan, given.template.with_vertices(x)
-    found = OrientedPoints(scan.points, scan.normals, NORMALS * given.size).match(x, body.vertex_normals, reach)
-    # At the edge of a hole a point speaks for its own neighbourhood, not for what lies beyond the edge.
-    beside = np.linalg.norm(np.cross(scan.normals[found.index], x - scan.points[found.index]), axis=1)
-    seen = found.valid & (~scan.border[found.index] | (beside <= scan.spacing))
-    v = np.flatnonzero(seen)
-    p = found.index[v]
-    weights = given.areas[v] * np.maximum(1 - (found.distances[v] / reach) ** 2, 0) ** 2
-    return pull(len(x), v, scan.points[p], weights, scan.normals[p], given.config.slide), seen
-
-
-def _laid_out(given: _Given, x: np.ndarray, fields: tuple[Field, Field], stage: FinalFitRound, stiff: np.ndarray
-              ) -> np.ndarray:
-    """Vertices that come nearest to the smooth field of gradients and to what the data want of them."""
-    wanted, seen = _data(given, x, stage.reach)
-    # Rounds of smoothing would straighten a limb that nothing holds: there the start is all that is known.
-    wanted = wanted + given.held + pull(len(x), np.arange(len(x)), given.start,
-                                        given.config.stay * ~seen * given.areas)
-    weights = (stage.tension * given.size)**2 * given.triangles.areas * stiff
-    K = given.triangles.stiffness(weights)
-    across = np.linalg.eigvalsh(wanted.A)[:, 2]
-    nearly = Factored(csc_array(K + diags_array(across)))
-    force = given.triangles.force(weights, fields[1].gradient) + wanted.b
-    force -= K @ x + np.einsum("nij,nj->ni", wanted.A, x)
-    return x + conjugate_gradients(lambda d: K @ d + np.einsum("nij,nj->ni", wanted.A, d), force, nearly.solve)
-
-
-class _Quality(NamedTuple):
-    """Triangles (F,) bool that face against their surroundings and needles, and the strains of `FinalFit`."""
-
-    inverted: np.ndarray
-    needles: np.ndarray
-    strain: float
-    roughness: float
-
-
-def _quality(given: _Given, fields: tuple[Field, Field]) -> _Quality:
-    measured, smooth = fields
-    n = given.template.face_normals[..., None]
-    inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
-    relative = measured.gradient @ np.linalg.inv(smooth.gradient)
-    squared = np.maximum(np.linalg.eigvalsh(relative.transpose(0, 2, 1) @ relative), 1e-12)    # of the stretches
-    strain, roughness = (float(np.sqrt(np.average(square, weights=given.triangles.areas)))
-                         for square in ((measured.log_S**2).sum(axis=(1, 2)) / 3,
-                                        (0.25 * np.log(squared)**2).mean(axis=1)))
-    return _Quality(inverted, (squared[:, 2] > 4**2) | (squared[:, 0] < 1 / 4**2), strain, roughness)
+    def lay_out(self, x: np.ndarray, smooth: Field, stage: FinalFitRound, stiff: np.ndarray) -> np.ndarray:
+        """Vertices that come nearest to the smooth field of gradients and to what the data want of them."""
+        wanted, seen = self.data(x, stage.reach)
+        # Rounds of smoothing would straighten a limb that nothing holds: there the start is all that is known.
+        wanted = wanted + self.held + pull(len(x), np.arange(len(x)), self.start, self.config.stay * ~seen * self.areas)
+        weights = (stage.tension * self.size)**2 * self.triangles.areas * stiff
+        K = self.triangles.stiffness(weights)
+        across = np.linalg.eigvalsh(wanted.A)[:, 2]
+        nearly = Factored(csc_array(K + diags_array(across)))
+        force = self.triangles.force(weights, smooth.gradient) + wanted.b
+        force -= K @ x + np.einsum("nij,nj->ni", wanted.A, x)
+        return x + conjugate_gradients(lambda d: K @ d + np.einsum("nij,nj->ni", wanted.A, d), force, nearly.solve)

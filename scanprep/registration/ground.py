@@ -25,25 +25,11 @@ from .person import PersonParts
 
 NEAR = 0.04                  # metres from the skin of the feet within which points are of them
 FLAT = 0.002                 # metres from the plane within which a scan that ends flat ends
-# Metres, standard deviation there: of cuts 0 to 0.35 mm, of scans that end where scanners lose the rim of a sole, 3 to
-# 9 mm above the floor, 0.5 to 0.7 mm.
-EVEN = 0.00045
 REACH = 0.015                # metres along the floor between the outline of a foot and where the scan ends
-AROUND = 0.7                 # share of the outline of the feet along which the scan ends there; seen from in front 0.67
-DEEPEST = 0.04               # metres beyond the plane: what is longer is a shin or a hand, not a sole
-BEHIND = 0.005               # share of the points at the feet that may lie behind the floor: specks
 WALL = 0.006                 # metres above the floor where feet have an outline, wherever their soles came to lie
 FACING = 0.7                 # cosine to the vertical of what is sole, and no wall
 LEVEL = 0.7                  # cosine between the normal of a floor and the way from the feet to the rest of the body
 TRIED, ENDS = 500, 12        # planes through three points, and points that a plane is fitted to at least
-SCANNED = 0.5                # share of the soles with data, above which they were scanned themselves
-# Metres, RMS, that feet are bent from which on they say less of their soles than the end of the scan: synthetic feet
-# are bent by 0.9 to 1.9 mm on other synthetic people and know the soles to 3 mm; by 4 to 9 mm on real men, to 13 mm; by
-# 3.5 and 8 mm on two scans of a booth whose floor is known, to 12 and 18 mm.
-UNLIKE = 0.003
-# Metres above the floor that scanners cut at, lest it shows: usually, and hardly ever; deeper soles are doubted more.
-CUT, HIGHEST = 0.0015, 0.012
-UNSEEN = 0.05                # metres that a foot counts as bent of which nothing was seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,18 +102,23 @@ def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, 
         return None
     height = floor.height(body.vertices)
     shown = (height > 0) & (cKDTree(points).query(body.vertices)[0] < REACH)
-    bent = max(_bent(reference, body, shown & (foot == number)) for number in np.unique(foot[foot > 0]))
+    bent = max(_bending(reference, body, shown & (foot == number)) for number in np.unique(foot[foot > 0]))
     below = np.maximum(-height, 0)
-    against = (bent / UNLIKE) ** 4 * (1 + (below.max() / HIGHEST) ** 2)
-    pressed = (1 + against * min(CUT / below.max(), 1.0)) / (1 + against)
+    # Metres, RMS, that feet are bent from which on they say less of their soles than the end of the scan: synthetic
+    # feet are bent by 0.9 to 1.9 mm on other synthetic people and know the soles to 3 mm; by 4 to 9 mm on real men,
+    # to 13 mm; by 3.5 and 8 mm on two scans of a booth whose floor is known, to 12 and 18 mm.
+    # millimetres above the floor that scanners cut at, lest it shows: usually 1.5, and hardly ever 12; deeper soles are
+    # doubted more
+    against = (bent / 0.003) ** 4 * (1 + (below.max() / 0.012) ** 2)
+    pressed = (1 + against * min(0.0015 / below.max(), 1.0)) / (1 + against)
     return Grounded(body.vertices + ((1 - pressed) * below)[:, None] * floor.normal, floor,
                     (float(below.max()), float(pressed * below.max())))
 
 
-def _bent(reference: Mesh, body: Mesh, shown: np.ndarray) -> float:
+def _bending(reference: Mesh, body: Mesh, shown: np.ndarray) -> float:
     """By how much a foot had to change its shape where it was shown, (N,) bool, metres; far if it was not."""
     if shown.sum() < 20:
-        return UNSEEN
+        return 0.05                  # of which nothing was seen
     return bending(reference.vertices[shown], body.vertices[shown], body.vertex_areas[shown])[0]
 
 
@@ -142,20 +133,24 @@ def find_floor(body: Mesh, feet: np.ndarray, points: np.ndarray, normals: np.nda
     at_feet = cKDTree(x[feet]).query(points, distance_upper_bound=NEAR)[0] < NEAR
     near, normals = points[at_feet], normals[at_feet]
     floor = _supporting(near, x[feet].mean(axis=0), x[~feet].mean(axis=0))
-    if floor is None or np.mean(floor.height(near) < -2 * FLAT) > BEHIND:
+    # share of the points at the feet that may lie behind the floor: specks
+    if floor is None or np.mean(floor.height(near) < -2 * FLAT) > 0.005:
         return None
     height = floor.height(x)
-    if (height[~feet] < 0).any() or not -DEEPEST < height.min() < 0:
+    # metres beyond the plane: what is longer is a shin or a hand, not a sole
+    if (height[~feet] < 0).any() or not -0.04 < height.min() < 0:
         return None
     ends = near[np.abs(floor.height(near)) < 2 * FLAT]
     outline, length = _outline(body, height - WALL)
     apart = cKDTree(floor.flat(ends)).query(floor.flat(outline))[0]
-    if not len(outline) or length @ (apart < REACH) < AROUND * length.sum():
+    # share of the outline of the feet along which the scan ends there; seen from in front 0.67
+    if not len(outline) or length @ (apart < REACH) < 0.7 * length.sum():
         return None
     flat = near[(normals @ floor.normal < -FACING) & (np.abs(floor.height(near)) < WALL)]
     soles = x[feet & (body.vertex_normals @ floor.normal < -FACING)]
     scanned = cKDTree(floor.flat(flat)).query(floor.flat(soles))[0] < REACH / 2 if len(flat) else np.zeros(len(soles))
-    return None if np.mean(scanned) > SCANNED else floor
+    # share of the soles with data, above which they were scanned themselves
+    return None if np.mean(scanned) > 0.5 else floor
 
 
 def _supporting(points: np.ndarray, feet: np.ndarray, rest: np.ndarray) -> Plane | None:
@@ -199,7 +194,9 @@ def _supporting(points: np.ndarray, feet: np.ndarray, rest: np.ndarray) -> Plane
         normal *= np.sign(normal @ up)
         height = (low - centre) @ normal
     noise = float(np.sqrt(np.average(height**2, weights=tukey(height, FLAT))))
-    return Plane(normal, float(normal @ centre), noise) if normal @ up > LEVEL and noise < EVEN else None
+    # of cuts it is 0 to 0.35 mm, of scans that end where scanners lose the rim of a sole, 3 to 9 mm above the floor,
+    # 0.5 to 0.7 mm
+    return Plane(normal, float(normal @ centre), noise) if normal @ up > LEVEL and noise < 0.00045 else None
 
 
 def _outline(body: Mesh, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,9 +17,6 @@ from ..geometry.mesh import Mesh
 from ..geometry.target import Target
 from .matches import NORMALS
 
-SWING = 0.8                            # radians by which an end is tried bent at its base, to four sides
-BASE = 0.5                             # what its base, moved from where it is, weighs against all its other points
-
 
 @dataclass(frozen=True, eq=False)
 class End:
@@ -28,18 +25,6 @@ class End:
     vertices: np.ndarray
     base: np.ndarray
     axis: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Hung:
-    """What holds a rigid piece: a point (3,) of it that should stay at a place (3,), both in metres.
-
-    `weight` is what that weighs against all its other points together.
-    """
-
-    local: np.ndarray
-    place: np.ndarray
-    weight: float
 
 
 @lru_cache(maxsize=4)
@@ -57,7 +42,7 @@ def find_ends(template: Mesh, count: int, radius: float) -> tuple[End, ...]:
     return tuple(ends)
 
 
-def rotated_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01) -> list[np.ndarray]:
+def rotate_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01) -> list[np.ndarray]:
     """Places (n, 3) of the vertices of an end after rotations that fit well as a rigid piece, two at most.
 
     One may slide along the rest of the body, the other hangs on its base: where much of a bent hand is hidden, it is
@@ -70,13 +55,14 @@ def rotated_ends(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved:
     local, normals = rest - rest.mean(axis=0), template.vertex_normals[end.vertices]
     base, local_base = x[end.base].mean(axis=0), template.vertices[end.base].mean(axis=0) - rest.mean(axis=0)
     kept = [x[end.vertices]]
-    for weight in (0.0, BASE):
+    # what its base, moved from where it is, weighs against all its other points
+    for weight in (0.0, 0.5):
         found = []
         for turn, pivot in _starts(R @ end.axis, middle, base):
             start = rotations.exp(turn)
             place = pivot + start @ (middle - pivot)
-            hung = Hung(local_base, base, weight)
-            rotation, place, error = scan.fitted(local[sample], normals[sample], start @ R, place, hung)
+            rotation, place, error = scan.fit(local[sample], normals[sample], start @ R, place, local_base, base,
+                                              weight)
             found.append((error, local @ rotation.T + place))
         best = found[int(np.argmin([error for error, _ in found]))][1]
         if all(np.linalg.norm(best - other, axis=1).mean() > moved * scan.size for other in kept):
@@ -93,7 +79,8 @@ def _starts(axis: np.ndarray, middle: np.ndarray, base: np.ndarray) -> list[tupl
     across /= np.linalg.norm(across)
     around = [np.cos(angle) * across + np.sin(angle) * np.cross(axis, across) for angle in np.arange(4) * np.pi / 2]
     rolls = [(angle * axis, middle) for angle in (0.0, 0.5, 1.0, -0.5, -1.0)]
-    return [*rolls, *((SWING * way, base) for way in around)]
+    # radians by which an end is tried bent at its base, to four sides
+    return [*rolls, *((0.8 * way, base) for way in around)]
 
 
 def bending(rest: np.ndarray, now: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
@@ -128,21 +115,24 @@ class RigidFit:
         off = np.einsum("nd,nd->n", m, x - y) ** 2 + self.scale**2 * ((n - m) ** 2).sum(axis=1)
         return np.where(good, np.minimum(off, self.cap**2), self.cap**2)
 
-    def fitted(self, local: np.ndarray, normals: np.ndarray, R: np.ndarray, place: np.ndarray,
-               hung: Hung) -> tuple[np.ndarray, np.ndarray, float]:
-        """A rigid piece after some rounds of nearest points: its rotation, its place, its mean error."""
-        held = np.sqrt(hung.weight * len(local))
+    def fit(self, local: np.ndarray, normals: np.ndarray, R: np.ndarray, place: np.ndarray, local_base: np.ndarray,
+            base: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """A rigid piece after some rounds of nearest points: its rotation, its place, its mean error.
+
+        It hangs on a point, `local_base` (3,) of its own, that should stay at `base` (3,), metres; `weight` is what
+        that weighs against all its other points together.
+        """
+        held = np.sqrt(weight * len(local))
         for _ in range(8):
             x, n = local @ R.T + place, normals @ R.T
             y, m, good = self.nearest(x, n)
             if good.sum() < 6:
                 break
-            arm = x - place
-            J = np.vstack([np.hstack([np.cross(arm, m), m])[good],
-                           held * np.hstack([np.cross(R @ hung.local, np.eye(3)), np.eye(3)])])
-            off = np.append(np.einsum("nd,nd->n", m, x - y)[good], held * (R @ hung.local + place - hung.place))
+            J = np.vstack([np.hstack([np.cross(x - place, m), m])[good],
+                           held * np.hstack([np.cross(R @ local_base, np.eye(3)), np.eye(3)])])
+            off = np.append(np.einsum("nd,nd->n", m, x - y)[good], held * (R @ local_base + place - base))
             H = J.T @ J
             step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6), J.T @ off)
             R, place = rotations.exp(step[:3]) @ R, place + step[3:]
-        slid = hung.weight * ((R @ hung.local + place - hung.place) ** 2).sum()
+        slid = weight * ((R @ local_base + place - base) ** 2).sum()
         return R, place, float(self.error(local @ R.T + place, normals @ R.T).mean() + slid)

@@ -7,7 +7,7 @@ rotation that best carries the whole skin of a part, so that skin that lags behi
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -22,7 +22,6 @@ from ..synthetic.people import NAMED_POSES, PARENTS, PARTS, named_pose, random_p
 from .limb_ends import bending
 from .person import PersonParts, average_person
 
-DRAWN = 60                             # random poses beside the named ones that show what people do
 ROLL, BEND, SIDE = range(3)
 MOVED = ("rolled", "bent", "bent sideways")
 # Degrees by which joints of real people go beyond those of the synthetic ones (roll, bend, side), found on 57 scans
@@ -36,17 +35,15 @@ SHAPE = {"pelvis": 0.01, "abdomen": 0.01, "chest": 0.01, "head": 0.006, "upper_a
 LIMBS = range(3, len(PARTS))           # head, arms and legs; a trunk tells of the build
 SCALE = 0.18                           # logarithm: how much one limb may grow against the whole body
 GRAVE = 30                             # degrees beyond what people do that double a doubt
-# Degrees of roll beyond what people do, of a limb and of the same on the other side: with left and right exchanged the
-# shins have 85 and 77, 71 poses and 46 men have none; a limb that came to lie rolled has none on the other side.
-EXCHANGED = 45
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Something that no person can do: how grave, 1 where it begins, and in words."""
+    """Something that no person can do: how grave, 1 where it begins, in words, and with which part."""
 
     excess: float
     words: str
+    part: int = field(default=-1, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,31 +64,24 @@ class LimbMeasures:
 
     def doubts(self, skeleton: Skeleton) -> tuple[Doubt, ...]:
         """What is unlikely, the gravest first."""
-        return tuple(doubt for doubt, _ in self._found(skeleton))
-
-    def doubted(self, skeleton: Skeleton) -> list[int]:
-        """The parts that are, the gravest first."""
-        return list(dict.fromkeys(part for _, part in self._found(skeleton)))
-
-    def _found(self, skeleton: Skeleton) -> list[tuple[Doubt, int]]:
-        """Every doubt with its part, the gravest first."""
-        found: list[tuple[Doubt, int]] = []
+        found: list[Doubt] = []
         for part in range(1, len(PARTS)):
             name, parent = (in_words(skeleton.names[k]) for k in (part, skeleton.parents[part]))
             kind = int(self.beyond[part].argmax())
             if self.beyond[part, kind] > 0:
-                found.append((Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
-                                    f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
-                                    f"against the {parent}"), part))
+                # 30 degrees beyond what people do double a doubt
+                found.append(Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
+                                   f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
+                                   f"against the {parent}", part))
             if part in LIMBS and self.bending[part] > self.most[part]:
-                found.append((Doubt(float(self.bending[part] / self.most[part]),
-                                    f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
-                                    "rolled, or slid"), part))
+                found.append(Doubt(float(self.bending[part] / self.most[part]),
+                                   f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
+                                   "rolled, or slid", part))
             if part in LIMBS and abs(self.growth[part]) > SCALE:
-                found.append((Doubt(abs(float(self.growth[part])) / SCALE,
-                                    f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
-                                    f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template"), part))
-        return sorted(found, key=lambda pair: -pair[0].excess)
+                found.append(Doubt(abs(float(self.growth[part])) / SCALE,
+                                   f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
+                                   f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template", part))
+        return tuple(sorted(found, key=lambda doubt: -doubt.excess))
 
 
 def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:
@@ -105,7 +95,10 @@ def exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarray) ->
     beyond = measures.beyond[:, ROLL]
     both = np.where(MIRROR_PART == np.arange(len(PARTS)), 0.0, np.minimum(beyond, beyond[MIRROR_PART]))
     limb = int(both.argmax())
-    if both[limb] <= EXCHANGED:
+    # Degrees of roll beyond what people do, of a limb and of the same on the other side: with left and right
+    # exchanged the shins have 85 and 77, 71 poses and 46 men have none; a limb that came to lie rolled has none on
+    # the other side.
+    if both[limb] <= 45:
         return None
     told = " and ".join(f"the {in_words(names[p])} by {abs(measures.angles[p, ROLL]):.0f}"
                         for p in (limb, int(MIRROR_PART[limb])))
@@ -123,11 +116,11 @@ def limb_measures(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> L
 
 def beyond_people(angles: np.ndarray) -> np.ndarray:
     """By how much joint angles (..., 16, 3), degrees, are beyond what any person does."""
-    low, high = allowed()
+    low, high = angle_limits()
     return np.maximum(np.maximum(low - angles, angles - high), 0)
 
 
-def allowed() -> tuple[np.ndarray, np.ndarray]:
+def angle_limits() -> tuple[np.ndarray, np.ndarray]:
     """The lowest and the highest joint angles (16, 3), degrees, that are not doubted."""
     low, high, _ = people_do()
     slack = np.array([SLACK[part_kind(part)] for part in PARTS])
@@ -200,7 +193,8 @@ def people_do() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Measured on the skin of the average synthetic person in its named poses and some random ones, left and right alike.
     """
     person, rng = average_person(), np.random.default_rng(0)
-    poses = [*map(named_pose, NAMED_POSES), *(random_pose(rng) for _ in range(DRAWN))]
+    # random poses beside the named ones that show what people do
+    poses = [*map(named_pose, NAMED_POSES), *(random_pose(rng) for _ in range(60))]
     bodies = np.stack([person.posed(pose) for pose in poses])
     angles = joint_angles(person.skeleton.fit_rotations(person.mesh, bodies))
     bent = np.stack([part_bending(person.mesh, person.skeleton, body)[0] for body in bodies])

@@ -4,19 +4,19 @@ Where a point lies is told by its paths to the landmarks: the same in every pose
 """
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from ..alignment.icp import align_rigid, landmark_motion
 from ..correspondence.correspondences import Correspondences, checked_pairs
 from ..geometry.farthest_points import farthest_points, thin
 from ..geometry.mesh import Mesh, check_template
+from ..geometry.sparse import gatherer, sum_groups
 from ..geometry.target import Target, orient, target_of
 from ..threads import search_threads
+from .paths import descriptors, path_lengths
 from .schedule import GraphStage
 
 NORMALS = 0.04                # of the template's size: what a difference of normals of one is worth when matching
@@ -38,6 +38,16 @@ class Inputs:
     descriptors: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where a template came to lie: vertices x (N, 3), metres; `moved` is how far the mean one went last, metres."""
+
+    x: np.ndarray
+    energies: dict[str, float] = field(default_factory=dict)
+    iterations: int = 0
+    moved: float = np.inf
+
+
 def prepare(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
             hints: Correspondences | None = None) -> Inputs:
     """Everything checked, and the surfaces described by their paths to landmarks, or else to the surest hints."""
@@ -46,21 +56,20 @@ def prepare(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None
         landmarks = checked_pairs(template, *landmarks, "landmarks")
     if hints is not None:
         vertices, points = checked_pairs(template, hints.template_vertices, hints.scan_points, "correspondences", 0)
-        hints = Correspondences(vertices, points, _checked_confidence(hints))
+        confidence = np.asarray(hints.confidence, dtype=np.float64)
+        if confidence.shape != (len(hints),) or not (np.isfinite(confidence) & (confidence >= 0)).all():
+            raise ValueError(f"correspondences: expected {len(hints)} confidences of at least 0")
+        hints = Correspondences(vertices, points, confidence)
     target, size = target_of(scan), float(np.sqrt(template.face_areas.sum()))
     cell = 0.012 * size                                     # spacing of the points that paths run over
     anchors = path_anchors(landmarks, hints, target, 3 * cell)
     if anchors is None:
         return Inputs(template, target, size, landmarks, hints)
-    mine, theirs = describe_both(template, target, anchors, cell, size)
-    return Inputs(template, replace(target, descriptors=theirs), size, landmarks, hints, mine)
-
-
-def _checked_confidence(hints: Correspondences) -> np.ndarray:
-    confidence = np.asarray(hints.confidence, dtype=np.float64)
-    if confidence.shape != (len(hints),) or not (np.isfinite(confidence) & (confidence >= 0)).all():
-        raise ValueError(f"correspondences: expected {len(hints)} confidences of at least 0")
-    return confidence
+    # both thinned to the same spacing and linked by the same rule: a path is longer than the true one alike on both
+    mine = path_lengths(template.vertices, template.vertex_normals, template.vertices[anchors[0]], cell)
+    theirs = path_lengths(target.points, target.normals, anchors[1], cell, target.oriented)
+    return Inputs(template, replace(target, descriptors=descriptors(theirs, size)), size, landmarks, hints,
+                  descriptors(mine, size))
 
 
 def path_anchors(landmarks: Landmarks | None, hints: Correspondences | None, target: Target, near: float, most: int = 8
@@ -81,108 +90,26 @@ def path_anchors(landmarks: Landmarks | None, hints: Correspondences | None, tar
     return hints.template_vertices[chosen], hints.scan_points[chosen]
 
 
-def placed(given: Inputs) -> np.ndarray:
+def initial_transform(inputs: Inputs) -> np.ndarray:
     """The rigid transform (4, 4) to begin with: by descriptors, else by landmarks, else by the surfaces as a whole."""
-    template, target = given.template, given.target
-    if given.descriptors is not None:
-        coarse = 0.03 * given.size
-        vertices, points = described_alike(template, given.descriptors, target.thinned(coarse),
-                                           thin(template.vertices, coarse))
-    elif given.landmarks is not None:
-        vertices, points = given.landmarks
-    else:
-        # From where it lies, or where both are far apart from the same middle: ICP finds what is near.
-        T = np.eye(4)
-        apart = (target.points.max(axis=0) + target.points.min(axis=0)
-                 - template.vertices.max(axis=0) - template.vertices.min(axis=0)) / 2
-        if np.linalg.norm(apart) > given.size / 2:
-            T[:3, 3] = apart
-        return align_rigid(template, target.points, start=T).T_target_source
-    return landmark_motion(template.vertices[vertices], points)
-
-
-def described_alike(template: Mesh, descriptors: np.ndarray, target: Target, sample: np.ndarray) -> Landmarks:
-    """Some vertices (n,) of a template and the points (n, 3) that are described like them.
-
-    Front and back of a trunk are described nearly alike; a motion to such points flattens the body, but since right,
-    left, up and down are told apart, its rotation is the right one.
-    """
-    mine = Described(template.vertices, template.vertex_normals, descriptors).of(sample)
-    theirs = Described(target.points, target.normals, target.descriptors)
-    index, _ = mine.matched(theirs, np.inf, Likeness(positions=0.0, descriptors=1.0, limit=np.inf))
-    return sample[index >= 0], target.points[index[index >= 0]]
-
-
-def describe_both(template: Mesh, target: Target, anchors: tuple[np.ndarray, np.ndarray], cell: float, size: float
-                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Descriptors (N, L) of the template's vertices and (n, L) of the scan's points by their paths to the anchors.
-
-    Both surfaces are thinned to the same spacing, `cell` metres, and linked by the same rule, so that what a path along
-    links is longer than the true one is the same on both.
-    """
-    vertices, points = anchors
-    mine = path_lengths(template.vertices, template.vertex_normals, template.vertices[vertices], cell)
-    theirs = path_lengths(target.points, target.normals, points, cell, target.oriented)
-    return descriptors(mine, size), descriptors(theirs, size)
-
-
-def descriptors(lengths: np.ndarray, size: float) -> np.ndarray:
-    """Lengths (n, L) to compare: near landmarks tell more precisely than far ones, so logarithms.
-
-    Divided by the root of their number: the distance of two descriptors is the root mean square over landmarks.
-    """
-    return np.log(lengths / size + 0.1) / np.sqrt(lengths.shape[1])
-
-
-def path_lengths(points: np.ndarray, normals: np.ndarray, sources: np.ndarray, cell: float, oriented: bool = True
-                 ) -> np.ndarray:
-    """Lengths (n, L), metres, of the shortest paths from sources (L, 3) to all points of a surface, holes bridged.
-
-    Where the normals point outward, `oriented`, paths do not jump between skins that touch. Small pieces far from
-    everything take the way to the nearest point of the rest as the crow flies.
-    """
-    keep = thin(points, cell)
-    p, n = points[keep], normals[keep]
-    graph, joined = _bridged(p, _links(p, n, cell, oriented))
-    tree = cKDTree(p[joined])
-    near, at = tree.query(sources)
-    lengths = dijkstra(graph, directed=False, indices=joined[at]).T[joined] + near
-    apart, nearest = tree.query(points)
-    return lengths[nearest] + apart[:, None]
-
-
-def _links(p: np.ndarray, n: np.ndarray, cell: float, oriented: bool, neighbours: int = 10) -> csr_array:
-    """Links between near points whose normals agree."""
-    length, j = cKDTree(p).query(p, min(neighbours + 1, len(p)))
-    coarse = 3 * max(cell, float(np.median(length[:, 1])))         # the points may lie wider than the cells
-    i = np.repeat(np.arange(len(p)), j.shape[1])
-    j, length = j.ravel(), length.ravel()
-    good = (length <= coarse) & (j != i)
-    i, j, length = i[good], j[good], length[good]
-    agree = np.einsum("nd,nd->n", n[i], n[j])
-    good = (agree if oriented else np.abs(agree)) > 0
-    return csr_array(coo_array((length[good], (i[good], j[good])), shape=(len(p), len(p))))
-
-
-def _bridged(p: np.ndarray, graph: csr_array, smallest: float = 0.003) -> tuple[csr_array, np.ndarray]:
-    """The graph with its larger pieces joined to the largest where they are nearest; the points that belong to it."""
-    count, label = connected_components(graph, directed=False)
-    size = np.bincount(label, minlength=count)
-    joined = label == size.argmax()
-    extra: list[tuple[int, int, float]] = []
-    waiting = [k for k in np.argsort(-size) if size[k] >= smallest * len(p) and k != size.argmax()]
-    for k in waiting:
-        piece = np.flatnonzero(label == k)
-        inside = np.flatnonzero(joined)
-        length, to = cKDTree(p[inside]).query(p[piece])
-        for q in np.argsort(length)[:max(len(piece) // 50, 3)]:
-            extra.append((int(piece[q]), int(inside[to[q]]), float(length[q])))
-        joined[piece] = True
-    if not extra:
-        return graph, np.flatnonzero(joined)
-    i, j, length = (np.array(column) for column in zip(*extra, strict=True))
-    bridges = coo_array((length, (i.astype(int), j.astype(int))), shape=graph.shape)
-    return csr_array(graph + bridges), np.flatnonzero(joined)
+    template, target = inputs.template, inputs.target
+    if inputs.descriptors is not None:
+        # Front and back of a trunk are described nearly alike. A motion to such points flattens the body, but its
+        # rotation is right, since right, left, up and down are told apart.
+        sample, few = thin(template.vertices, 0.03 * inputs.size), target.thinned(0.03 * inputs.size)
+        mine = Described(template.vertices, template.vertex_normals, inputs.descriptors).of(sample)
+        index, _ = mine.matched(Described(few.points, few.normals, few.descriptors), np.inf,
+                                Likeness(positions=0.0, descriptors=1.0, limit=np.inf))
+        return landmark_motion(template.vertices[sample[index >= 0]], few.points[index[index >= 0]])
+    if inputs.landmarks is not None:
+        return landmark_motion(template.vertices[inputs.landmarks[0]], inputs.landmarks[1])
+    # From where it lies, or where both are far apart from the same middle: ICP finds what is near.
+    T = np.eye(4)
+    apart = (target.points.max(axis=0) + target.points.min(axis=0)
+             - template.vertices.max(axis=0) - template.vertices.min(axis=0)) / 2
+    if np.linalg.norm(apart) > inputs.size / 2:
+        T[:3, 3] = apart
+    return align_rigid(template, target.points, start=T).T_target_source
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,9 +143,8 @@ def pull(count: int, vertices: np.ndarray, targets: np.ndarray, weights: np.ndar
         A = slide * A + (1 - slide) * normals[:, :, None] * normals[:, None, :]
     A = weights[:, None, None] * A
     b = np.einsum("nij,nj->ni", A, targets)
-    gather = csr_array(coo_array((np.ones(len(vertices)), (vertices, np.arange(len(vertices)))),
-                                 shape=(count, len(vertices))))
-    return Pull((gather @ A.reshape(-1, 9)).reshape(-1, 3, 3), gather @ b, float(np.sum(b * targets)))
+    gather = gatherer(vertices, count)
+    return Pull(sum_groups(gather, A), gather @ b, float(np.sum(b * targets)))
 
 
 @dataclass(frozen=True)
@@ -312,14 +238,14 @@ def hint_pull(hints: Correspondences, x: np.ndarray, reach: float, area: float) 
     return pull(len(x), hints.template_vertices, hints.scan_points, area * weights)
 
 
-def wanted_by(given: Inputs, stage: GraphStage, x: np.ndarray, target: Target, sample: np.ndarray) -> Pull:
+def pull_of_stage(inputs: Inputs, stage: GraphStage, x: np.ndarray, target: Target, sample: np.ndarray) -> Pull:
     """What landmarks, matches and hints want of vertices (N, 3); those in the sample (n,) look for a match."""
-    size, template = given.size, given.template
-    wanted = landmark_pull(len(x), given.landmarks, stage.landmarks * size**2)
+    size, template = inputs.size, inputs.template
+    wanted = landmark_pull(len(x), inputs.landmarks, stage.landmarks * size**2)
     if stage.reach:
         like = Likeness(stage.positions, NORMALS * size, stage.paths * size)
         wanted += match_both_ways(template.with_vertices(x), sample, size**2, target, stage.reach * size, stage.slide,
-                                  like, given.descriptors)
-    if given.hints is not None and stage.hints:
-        wanted += hint_pull(given.hints, x, stage.reach * size, stage.hints * size**2)
+                                  like, inputs.descriptors)
+    if inputs.hints is not None and stage.hints:
+        wanted += hint_pull(inputs.hints, x, stage.reach * size, stage.hints * size**2)
     return wanted

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import wraps
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,11 +25,9 @@ from ..judgement import HAND, extent, size, unit_problem
 from ..threads import one_thread
 from .final_fit import final_fit
 from .folds import inverted_triangles, without_inverted
-from .graph_fit import GraphFit, graph_fit
-from .matches import NORMALS, Inputs, placed, prepare
+from .graph_fit import register_graph
+from .matches import NORMALS, Fit, Inputs, initial_transform, prepare
 from .schedule import RegistrationConfig
-
-FAR = 100.0                      # metres; at 3 m a registration is the same to 1e-14 m, at 5,000 km it was 15 mm off
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,20 +53,25 @@ class Registration:
     soles: tuple[float, float] | None = None    # metres beyond the floor where the scan ends: see `with_soles`
 
 
-def offset_of(scan: Mesh | np.ndarray) -> np.ndarray:
-    """(3,) metres: the middle of a scan that is so far from the origin that sums lose digits, as in UTM; else zero."""
-    points = checked_points(scan.vertices if isinstance(scan, Mesh) else scan, "scan")
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
-    return middle if np.abs(middle).max() > FAR else np.zeros(3)
+class Method(Protocol):
+    """A way to bring a template near a scan, of which `METHODS` holds those that can be chosen by name.
+
+    It takes the inputs, the rigid transform (4, 4) to begin with, the settings and a callback for (done, total), and
+    says where the template came to lie. The checks before, the last pass and the figures after are the same for all.
+    """
+
+    def __call__(self, inputs: Inputs, T: np.ndarray, config: RegistrationConfig,
+                 progress: Callable[[int, int], None]) -> Fit: ...
+
+
+METHODS: dict[str, Method] = {"graph": register_graph}
 
 
 def translate(what: Any, by: np.ndarray) -> Any:
-    """What registrations are made of, or one itself, at another place, `by` (3,) metres away; None stays None.
+    """What registrations are made of, or one itself, at another place, `by` (3,) metres away; all else stays.
 
-    A mesh, points (n, 3), landmarks as vertices and points, or correspondences.
+    A mesh, points (n, 3), a transform (4, 4), correspondences, and tuples of these, as landmarks are.
     """
-    if what is None:
-        return None
     if isinstance(what, Mesh):
         return what.with_vertices(what.vertices + by)
     if isinstance(what, Registration):
@@ -75,10 +79,36 @@ def translate(what: Any, by: np.ndarray) -> Any:
     if isinstance(what, Correspondences):
         return replace(what, scan_points=what.scan_points + by)
     if isinstance(what, tuple):
-        return what[0], translate(what[1], by)
-    return np.asarray(what, dtype=np.float64) + by
+        return tuple(translate(part, by) for part in what)
+    if np.ndim(what) != 2:
+        return what
+    moved = np.array(what, dtype=np.float64)
+    moved[:3, 3:] += by[:, None]                          # of a transform
+    return moved if moved.shape == (4, 4) else moved + by
 
 
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def near_origin(method: F) -> F:
+    """The same function of template and scan, where a scan is so far from the origin that sums lose digits, as in UTM.
+
+    Everything but the template is brought near, and what comes out is brought back.
+    """
+    @wraps(method)
+    def wrapper(template: Mesh, scan: Mesh | np.ndarray, *args: Any, **named: Any) -> Any:
+        points = checked_points(scan.vertices if isinstance(scan, Mesh) else scan, "scan")
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+        # within 100 m nothing changes: at 3 m a registration is the same to 1e-14 m, at 5,000 km it was 15 mm off
+        if np.abs(middle).max() <= 100:
+            return method(template, scan, *args, **named)
+        near = {name: translate(value, -middle) for name, value in named.items()}
+        return translate(method(template, *translate((scan, *args), -middle), **near), middle)
+
+    return cast(F, wrapper)
+
+
+@near_origin
 @one_thread()
 def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None,
@@ -109,46 +139,28 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     ------
     ValueError
         A template that is not one manifold component, an empty scan, values that are not finite, fewer than
-        three landmarks or landmarks that do not exist.
+        three landmarks or landmarks that do not exist, a method that is not known.
     """
-    away = offset_of(scan)
-    if away.any():
-        if start is not None:
-            start = np.array(start, dtype=np.float64)
-            start[:3, 3] -= away
-        there = register(template, translate(scan, -away), translate(landmarks, -away), config, progress,
-                         translate(correspondences, -away), start)
-        return translate(there, away)
-    config = config or RegistrationConfig()
-    given = prepare(template, scan, landmarks, correspondences)
-    stages = tuple(s for s in config.graph if s.positions == 1 or given.descriptors is not None)
-    tell = _counted(progress, sum(stage.rounds for stage in stages) + 1)
-    T = placed(given) if start is None else start
-    fit = finished(given, graph_fit(given, T, stages, config.ends, tell), config)
-    tell(1)
-    return measured(given, fit, scan)
+    config, tell = config or RegistrationConfig(), progress or (lambda done, total: None)
+    if config.method not in METHODS:
+        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {config.method!r}")
+    # what is known of both, and how every point is told from others: by place, normal, and paths to landmarks
+    inputs = prepare(template, scan, landmarks, correspondences)
+    T = initial_transform(inputs) if start is None else start
+    # near the scan, from stiff to soft; then onto it, below its noise
+    fit = METHODS[config.method](inputs, T, config, lambda done, total: tell(90 * done // total, 100))
+    fit = fit_surface(inputs, fit, config)
+    tell(100, 100)
+    return measure_fit(inputs, fit, scan)
 
 
-def finished(given: Inputs, fit: GraphFit, config: RegistrationConfig) -> GraphFit:
+def fit_surface(inputs: Inputs, fit: Fit, config: RegistrationConfig) -> Fit:
     """The surface at last: laid on the scan below its noise, without inverted triangles."""
     if config.final_fit is not None:
-        final = final_fit(given.template, fit.x, given.target, given.landmarks, config.final_fit)
-        fit = replace(fit, x=final.vertices, energies={**fit.energies, "strain": final.strain},
-                      iterations=fit.iterations + final.iterations, moved=final.moved)
-    return replace(fit, x=without_inverted(given.template, fit.x))
-
-
-def _counted(progress: Callable[[int, int], None] | None, total: int) -> Callable[[int], None]:
-    """A callback that takes the steps done since the last call."""
-    done = 0
-
-    def tell(steps: int) -> None:
-        nonlocal done
-        done += steps
-        if progress:
-            progress(done, total)
-
-    return tell
+        final = final_fit(inputs.template, fit.x, inputs.target, inputs.landmarks, config.final_fit)
+        fit = Fit(final.vertices, {**fit.energies, "strain": final.strain}, fit.iterations + final.iterations,
+                  final.moved)
+    return replace(fit, x=without_inverted(inputs.template, fit.x))
 
 
 def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, marked: bool) -> str | None:
@@ -157,7 +169,7 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
     `marked` is whether landmarks led it.
     """
     points = scan.vertices if isinstance(scan, Mesh) else scan
-    far, seen, stretch = fit.uncovered, float(fit.seen.mean()), stretched_share(template, fit.mesh)
+    far, seen, stretch = fit.uncovered, float(fit.seen.mean()), share_stretched(template, fit.mesh)
     off = fit.landmark_rms > HAND * size(template)
     # with left and right exchanged 0.13 are not covered and 0.10 stretched. A part alone, with which the rest of the
     # template is only invented: shins and feet give 0.15 of it data, one half 0.49, one view 0.26 to 0.46. The more of
@@ -175,21 +187,21 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
             f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")
 
 
-def measured(given: Inputs, fit: GraphFit, scan: Mesh | np.ndarray) -> Registration:
+def measure_fit(inputs: Inputs, fit: Fit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
-    body = given.template.with_vertices(fit.x)
-    inverted = int(inverted_triangles(given.template, fit.x).sum())
-    found = evidence(body, given.target, 0.015 * given.size, NORMALS * given.size)
+    body, size = inputs.template.with_vertices(fit.x), inputs.size
+    found = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
     seen = found.confidence >= 0.5
-    distances = np.where(seen, found.distances, np.nan)
     landmark_rms = np.nan
-    if given.landmarks is not None:
-        apart = np.linalg.norm(fit.x[given.landmarks[0]] - given.landmarks[1], axis=1)
+    if inputs.landmarks is not None:
+        apart = np.linalg.norm(fit.x[inputs.landmarks[0]] - inputs.landmarks[1], axis=1)
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
-    return Registration(body, distances, seen,
-                        float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
-                        bool(fit.moved <= 0.001 * given.size and seen.any()), fit.iterations, fit.energies,
-                        inverted, found.confidence, uncovered_share(scan, body, 0.01 * given.size))
+    return Registration(
+        mesh=body, distances=np.where(seen, found.distances, np.nan), seen=seen,
+        rms=float(np.sqrt(np.mean(found.distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms=landmark_rms,
+        converged=bool(fit.moved <= 0.001 * size and seen.any()), iterations=fit.iterations, energies=fit.energies,
+        inverted=int(inverted_triangles(inputs.template, fit.x).sum()), confidence=found.confidence,
+        uncovered=uncovered_share(scan, body, 0.01 * size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +222,9 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
 
     A difference of normals of one counts like a distance of `scale` metres.
     """
+    def ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
+        return np.clip((value - low) / (high - low), 0, 1)
+
     target = orient(target, deformed, scale)
     x, normals = deformed.vertices, deformed.vertex_normals
     found = OrientedPoints(target.points, target.normals, scale).match(x, normals, reach)
@@ -219,39 +234,25 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
     off = np.abs(np.einsum("nd,nd->n", target.normals[p], x[v] - target.points[p]))
     noise = 1.4826 * float(np.median(off)) if len(v) else 0.0
     near = np.exp(-0.5 * (np.maximum(off - 2 * noise, 0) / max(2 * noise, 0.05 * reach)) ** 2)
-    facing = _ramp(np.einsum("nd,nd->n", target.normals[p], normals[v]), 0.5, 0.8)
-    confidence = np.zeros(len(x))
-    confidence[v] = near * facing * (_within(target, x, normals)
-                                     * _chosen(deformed, back.index[back.valid]))[v]
-    distances = np.full(len(x), np.nan)
-    distances[v] = off
-    return Evidence(confidence, distances)
-
-
-def _within(target: Target, x: np.ndarray, normals: np.ndarray, neighbours: int = 8) -> np.ndarray:
-    """(N,) from 0 to 1: points that face the same way lie close by, and not at the edge of a hole."""
-    tree = cKDTree(target.points)
-    apart, near = tree.query(x, min(neighbours, len(target.points)))
-    # Close by is what the points around are to each other, but no less than usual: where views overlap they are dense.
-    nearest = tree.query(target.points, 2)[0][:, 1]
-    spacing = np.maximum(np.median(nearest), nearest[near].mean(axis=1))
-    alike = np.einsum("nkd,nd->nk", target.normals[near], normals) > 0.3
-    nearest = np.where(alike, apart, np.inf).min(axis=1)
-    edge = (alike * target.border[near]).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)
-    return np.exp(-0.5 * (np.maximum(nearest - 2 * spacing, 0) / (2 * spacing)) ** 2) * (1 - _ramp(edge, 0.3, 0.9))
-
-
-def _chosen(deformed: Mesh, chosen: np.ndarray) -> np.ndarray:
-    """(N,) from 0 to 1: the scan's points chose this vertex, or its neighbours, as theirs."""
-    hits = (np.bincount(chosen, minlength=len(deformed.vertices)) > 0).astype(float)
+    facing = ramp(np.einsum("nd,nd->n", target.normals[p], normals[v]), 0.5, 0.8)
+    # the scan's points chose this vertex, or its neighbours, as theirs
+    hits = (np.bincount(back.index[back.valid], minlength=len(x)) > 0).astype(float)
     A = deformed.vertex_adjacency
     degree = np.maximum(np.asarray(A.sum(axis=1)).ravel(), 1)
-    around = np.maximum(hits, (A @ hits) / degree)
-    return _ramp(around, 0.1, 0.4)
-
-
-def _ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
-    return np.clip((value - low) / (high - low), 0, 1)
+    chosen = ramp(np.maximum(hits, (A @ hits) / degree), 0.1, 0.4)
+    # Points that face the same way lie close by, and not at the edge of a hole. Close by is what the points around
+    # are to each other, but no less than usual: where views overlap they are dense.
+    tree = cKDTree(target.points)
+    apart, around = tree.query(x, min(8, len(target.points)))
+    nearest = tree.query(target.points, 2)[0][:, 1]
+    spacing = np.maximum(np.median(nearest), nearest[around].mean(axis=1))
+    alike = np.einsum("nkd,nd->nk", target.normals[around], normals) > 0.3
+    nearest = np.where(alike, apart, np.inf).min(axis=1)
+    edge = (alike * target.border[around]).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)
+    inside = np.exp(-0.5 * (np.maximum(nearest - 2 * spacing, 0) / (2 * spacing)) ** 2) * (1 - ramp(edge, 0.3, 0.9))
+    confidence, distances = np.zeros(len(x)), np.full(len(x), np.nan)
+    confidence[v], distances[v] = near * facing * (inside * chosen)[v], off
+    return Evidence(confidence, distances)
 
 
 def uncovered_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
@@ -261,7 +262,7 @@ def uncovered_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, sampl
     return float((Surface(registered).closest(points).distances > far).mean())
 
 
-def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
+def share_stretched(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
     """Share of the template's area that is longer by `factor`, or shorter, in some direction than most of the body is.
 
     Somebody smaller or slimmer than the template is nowhere stretched: one right registration had 0.058 that were half

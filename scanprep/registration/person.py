@@ -22,13 +22,10 @@ from ..geometry.surface import Surface
 from ..skeleton.tree import Skeleton
 from ..synthetic.landmarks import landmarks
 from ..synthetic.people import PARENTS, PARTS, Person
-from .nonrigid import Registration, register, stretched_share
+from .nonrigid import Registration, register, share_stretched
 from .schedule import RegistrationConfig
 
-UNCOVERED, STRETCHED = 0.02, 0.05      # shares of a template and of the person on it beyond which it is no person
 MATCHING = 30                          # per cent of the time, before the person is registered
-ENOUGH = 4                             # landmarks from which the average person finds the others
-ENDS = 5                               # of limbs: head, hands and feet
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +45,7 @@ def person_parts(template: Mesh, progress: Callable[[int, int], None] | None = N
     `progress` is called as progress(done, total). What was found is remembered as long as the template lives.
     """
     if template not in _known:
-        _known[template] = _found(template, progress or (lambda done, total: None))
+        _known[template] = _find_parts(template, progress or (lambda done, total: None))
     return _known[template]
 
 
@@ -70,7 +67,7 @@ def stature(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> float:
     return height * bones(vertices) / bones(template.vertices)
 
 
-def _found(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
+def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
     """The parts of a template that was not seen before."""
     person, fit = average_person(), _person_on(template, None, RegistrationConfig(), tell)
     if fit is None:
@@ -95,13 +92,15 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
             seeds = find_seeds(person, template)
         except ValueError:             # it has too few ends of limbs
             return None
-        if len(seeds) < ENDS:
+        # of limbs: head, hands and feet
+        if len(seeds) < 5:
             return None
         pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
                                      progress=lambda done, total: tell(round(MATCHING * done / total), 100))
         fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(
             round(MATCHING + (100 - MATCHING) * done / total), 100))
-    return None if fit.uncovered > UNCOVERED or stretched_share(person, fit.mesh) > STRETCHED else fit
+    # shares of a template and of the person on it beyond which it is no person
+    return None if fit.uncovered > 0.02 or share_stretched(person, fit.mesh) > 0.05 else fit
 
 
 def find_landmarks(template: Mesh, known: Mapping[str, int],
@@ -129,7 +128,8 @@ def find_landmarks(template: Mesh, known: Mapping[str, int],
     """
     marks, given = landmarks(), known_landmarks(known)
     names, vertices, places = match_landmarks(marks, given, minimum=0)
-    led = (vertices, template.vertices[places]) if len(names) >= ENOUGH else None
+    # landmarks from which the average person finds the others
+    led = (vertices, template.vertices[places]) if len(names) >= 4 else None
     fit = _person_on(template, led, RegistrationConfig.quick(), progress or (lambda done, total: None))
     if fit is None:
         return given

@@ -6,7 +6,7 @@ lies on the scan and stretches no more than what was there.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
@@ -14,23 +14,23 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from ..correspondence.correspondences import Correspondences
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..geometry.sparse import gatherer, sum_groups
 from ..judgement import size
 from ..threads import one_thread
-from .deformation_graph import DeformationGraph, build_graph
-from .graph_fit import GraphFit, NodeMotion, deform, followed
-from .limbs import Doubt, frames, limb_doubts, limb_measures
-from .matches import Inputs, Landmarks, prepare
-from .nonrigid import Registration, finished, measured, offset_of, principal_stretches, translate, uncovered_share
+from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform
+from .graph_fit import GraphFit, fit_stages
+from .limbs import Doubt, frames, limb_doubts
+from .matches import Landmarks, prepare
+from .nonrigid import Registration, fit_surface, measure_fit, near_origin, principal_stretches, uncovered_share
 from .person import PersonParts
 from .rolls import other_rolls
-from .schedule import GraphStage, RegistrationConfig
+from .schedule import RegistrationConfig
 
 LESS_DOUBTED = 0.1                     # 1 is a doubt where it begins
 LESS_COVERED = 0.001                   # share of the scan
-EASED = 1                              # links over which a roll sets in at a joint
-GLANCE = 3                             # rounds of a stage that show what becomes of a roll
 
 
+@near_origin
 @one_thread()
 def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: PersonParts | None,
              landmarks: Landmarks | None = None, config: RegistrationConfig | None = None,
@@ -52,62 +52,39 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     -------
     Registration
     """
-    away = offset_of(scan)
-    if away.any():
-        there = repaired(template, translate(scan, -away), translate(fit, -away), parts, translate(landmarks, -away),
-                         config, progress, translate(correspondences, -away))
-        return translate(there, away)
     config = config or RegistrationConfig()
-    stages = tuple(stage for stage in config.graph if stage.positions == 1 and not stage.paths and stage.reach)
+    stages = [stage for stage in config.graph if stage.positions == 1 and not stage.paths and stage.reach]
     x = fit.mesh.vertices
     if parts is None or not config.rolls or not stages:
         return fit
-    doubted = limb_measures(template, parts, x).doubted(parts.skeleton)
+    doubted = list(dict.fromkeys(doubt.part for doubt in limb_doubts(template, parts, x)))
     if not doubted:
         return fit
     # the last stages match by positions alone: no path to landmarks or hints is needed
-    given = replace(prepare(template, scan), landmarks=landmarks, hints=correspondences)
-    coarse = tuple(stage for stage in stages if stage.nodes == stages[0].nodes)
-    graph, told = build_graph(template, coarse[0].nodes), progress or _silent
+    inputs = replace(prepare(template, scan), landmarks=landmarks, hints=correspondences)
+    coarse = [stage for stage in stages if stage.nodes == stages[0].nodes]
+    graph, tell = build_graph(template, coarse[0].nodes), progress or (lambda done, total: None)
     tries = other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)
-    start, looks = motion_of(graph, x), list[_Look]()
-    # with as little detail as the rolls are looked at with
+    start, looks = motion_of(graph, x), list[tuple[float, float, GraphFit]]()
+    # what becomes of each in the coarse stages, cut short to three rounds: how much is to be doubted, and the share of
+    # the scan off it; with as little detail as the rolls are looked at with
+    short = [replace(stage, rounds=min(stage.rounds, 3), ends=0) for stage in coarse]
     now = gravity(limb_doubts(template, parts, deform(graph, start)))
     for number, angles in enumerate(tries):
         motion = rolled(graph, start, template, parts, x, angles)
-        begun = GraphFit(deform(graph, motion), graph, motion, iterations=fit.iterations)
-        looks.append(_look(given, parts, begun, coarse, scan))
-        told(number + 1, len(tries) + 1)
-    best = min(looks, key=lambda look: (look.gravity, look.uncovered), default=None)
-    if best is not None and best.gravity + LESS_DOUBTED < now:
-        end = followed(given, best.fit, stages[len(coarse) - 1:], config.ends, lambda steps: None)
-        trial = measured(given, finished(given, end, config), scan)
-        if better(template, parts, trial, fit):
-            fit = replace(trial, rolled=True)
-    told(len(tries) + 1, len(tries) + 1)
+        begun = GraphFit(deform(graph, motion), graph=graph, motion=motion, iterations=fit.iterations)
+        trial = fit_stages(inputs, begun, short)
+        looks.append((gravity(limb_doubts(template, parts, trial.x)),
+                      uncovered_share(scan, template.with_vertices(trial.x), 0.01 * inputs.size), trial))
+        tell(number + 1, len(tries) + 1)
+    best = min(looks, key=lambda look: look[:2], default=None)
+    if best is not None and best[0] + LESS_DOUBTED < now:
+        end = fit_surface(inputs, fit_stages(inputs, best[2], stages[len(coarse) - 1:]), config)
+        found = measure_fit(inputs, end, scan)
+        if better(template, parts, found, fit):
+            fit = replace(found, rolled=True)
+    tell(len(tries) + 1, len(tries) + 1)
     return fit
-
-
-def _silent(done: int, total: int) -> None:
-    """Nobody wants to know."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """What becomes of some rolls in a few rounds: how much is to be doubted, and the share of the scan off them."""
-
-    fit: GraphFit
-    gravity: float
-    uncovered: float
-
-
-def _look(given: Inputs, parts: PersonParts, begun: GraphFit, stages: tuple[GraphStage, ...],
-          scan: Mesh | np.ndarray) -> _Look:
-    """A beginning after some stages, each cut short."""
-    short = tuple(replace(stage, rounds=min(stage.rounds, GLANCE)) for stage in stages)
-    fit = followed(given, begun, short, 0, lambda steps: None)
-    return _Look(fit, gravity(limb_doubts(given.template, parts, fit.x)),
-                 uncovered_share(scan, given.template.with_vertices(fit.x), 0.01 * given.size))
 
 
 def better(template: Mesh, parts: PersonParts, trial: Registration, fit: Registration) -> bool:
@@ -135,8 +112,8 @@ def motion_of(graph: DeformationGraph, x: np.ndarray) -> NodeMotion:
     i, j = graph.edges.T
     at = x[graph.node_vertices]
     now, rest = at[j] - at[i], graph.edge_vectors
-    gather = csr_array(coo_array((np.ones(len(i)), (i, np.arange(len(i)))), shape=(len(at), len(i))))
-    R = rotations.project((gather @ np.einsum("ei,ej->eij", now, rest).reshape(-1, 9)).reshape(-1, 3, 3))
+    gather = gatherer(i, len(at))
+    R = rotations.project(sum_groups(gather, np.einsum("ei,ej->eij", now, rest)))
     grown = gather @ (now**2).sum(axis=1) / (gather @ (rest**2).sum(axis=1))
     return NodeMotion(R, 0.5 * np.log(grown), at)
 
@@ -156,8 +133,7 @@ def rolled(graph: DeformationGraph, motion: NodeMotion, template: Mesh, parts: P
     i, j = graph.edges.T
     links = csr_array(coo_array((np.ones(len(i)), (i, j)), shape=(len(weights), len(weights))))
     mean = diags_array(1 / np.asarray(links.sum(axis=1)).ravel()) @ links
-    for _ in range(EASED):
-        weights = 0.5 * (weights + mean @ weights)
+    weights = 0.5 * (weights + mean @ weights)                    # a roll sets in over one link at a joint
     turned = middles + np.einsum("pij,npj->npi", turns, motion.positions[:, None] - middles)
     return replace(motion, R=rotations.project(np.einsum("np,pij->nij", weights, turns)) @ motion.R,
                    positions=np.einsum("np,npi->ni", weights, turned))

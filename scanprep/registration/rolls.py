@@ -10,12 +10,11 @@ import numpy as np
 
 from ..geometry import rotations
 from ..synthetic.people import PARENTS, PARTS
-from .limbs import GRAVE, LIMBS, ROLL, allowed, angles_of_joint, frames
+from .limbs import GRAVE, LIMBS, ROLL, angle_limits, angles_of_joint, frames
 from .person import PersonParts
 
 STEPS = 24                             # rolls that are tried, all round
 CHANGE = 0.5                           # what a roll by half a turn costs; a doubt costs one and more
-CENTRE = 0.5                           # what a joint costs that is rolled as far as people can
 FORCED = tuple(np.radians((90, -90, 180)))      # of a doubted limb, where no joint tells by how much
 
 
@@ -50,14 +49,15 @@ def joint_costs(R: np.ndarray) -> np.ndarray:
     World rotations R (16, 3, 3) are against the rest of the synthetic people.
     """
     turns = 2 * np.pi / STEPS * np.arange(STEPS)
-    low, high = allowed()
+    low, high = angle_limits()
     costs = np.zeros((len(PARTS), STEPS, STEPS))
     for part in range(1, len(PARTS)):
         above, own = (R[p] @ rotations.exp(turns[:, None] * frames()[p, 0]) for p in (PARENTS[part], part))
         angles = angles_of_joint(part, above[:, None], own[None])
         beyond = np.maximum(low[part] - angles, angles - high[part]).max(axis=-1)
         middle, half = (high[part, ROLL] + low[part, ROLL]) / 2, (high[part, ROLL] - low[part, ROLL]) / 2
-        costs[part] = (CENTRE * np.minimum(((angles[..., ROLL] - middle) / half) ** 2, 1)
+        # what a joint costs that is rolled as far as people can
+        costs[part] = (0.5 * np.minimum(((angles[..., ROLL] - middle) / half) ** 2, 1)
                        + np.where(beyond > 0, 1 + beyond / GRAVE, 0))
     return costs
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from ..ranges import Cell, Count, Positive, Settings
 
@@ -42,12 +43,9 @@ class FinalFitConfig(Settings):
         The share of the surface that one landmark weighs as much as.
     """
 
-    rounds: tuple[FinalFitRound, ...] = (
-        FinalFitRound(0.02, 0.007, 0.02),
-        FinalFitRound(0.015, 0.004, 0.015),
-        FinalFitRound(0.015, 0.004, 0.015),
-        FinalFitRound(0.015, 0.004, 0.015),
-    )
+    # wide at first, so that folds and slides of the coarse registration vanish; then as fine as the noise allows
+    rounds: tuple[FinalFitRound, ...] = (FinalFitRound(field=0.02, tension=0.007, reach=0.02),
+                                         *3 * (FinalFitRound(field=0.015, tension=0.004, reach=0.015),))
     noise_width: Positive = 0.007
     slide: float = 0.05
     stay: float = 0.003
@@ -62,9 +60,9 @@ class GraphStage(Settings):
     ----------
     nodes : int
         Nodes of the graph.
-    stretch, bend, growth : float
-        Resistance of the nodes, as the distance to the data that a strain, a rotation by a radian between
-        neighbours, or a growth by e between them is worth; with a growth of 0 nodes keep their size.
+    stretch, growth : float
+        Resistance of the nodes, as the distance to the data that a strain, or a growth by e between neighbours, is
+        worth; with a growth of 0 nodes keep their size. A rotation by a radian is worth a tenth of a strain.
     landmarks : float
         The share of the surface that one landmark weighs as much as.
     reach : float
@@ -81,13 +79,12 @@ class GraphStage(Settings):
         Distance that a difference by e between path lengths to the landmarks is worth when matching.
     hints : float
         The share of the surface that all given correspondences together weigh as much as.
-    ends : bool
-        Afterwards, see whether ends of the body are rotated about themselves.
+    ends : int
+        How many ends of the body are tried afterwards in other rotations about themselves.
     """
 
     nodes: Count
     stretch: Positive
-    bend: Positive
     growth: float
     landmarks: float
     reach: float
@@ -97,7 +94,44 @@ class GraphStage(Settings):
     positions: float = 1.0
     paths: float = 0.0
     hints: float = 0.0
-    ends: bool = False
+    ends: int = 0
+
+    @property
+    def bend(self) -> float:
+        """What a rotation by a radian between neighbours is worth; as a decimal number, so that 0.7 gives 0.07."""
+        return round(0.1 * self.stretch, 9)
+
+
+def stages(table: str) -> tuple[GraphStage, ...]:
+    """The stages of a table: a line with the names of the columns, then one for each stage, its reason behind a bar.
+
+    A dash stands for what is usual.
+
+    Examples
+    --------
+    >>> stages("nodes stretch growth landmarks reach rounds | why\\n 80 0.1 0.7 0.01 0.08 - | arms")[0].rounds
+    2
+    """
+    names, *rows = (line.partition("|")[0].split() for line in table.strip().splitlines())
+    number: dict[str, Any] = {"nodes": int, "rounds": int, "ends": int}
+    return tuple(GraphStage(**{name: number.get(name, float)(value)
+                               for name, value in zip(names, row, strict=True) if value != "-"}) for row in rows)
+
+
+# By paths alone first, which need no start; then stiffness and reach fall together, as matches become right.
+USUAL = stages("""
+nodes stretch growth landmarks reach slide rounds detail positions paths hints ends | why
+150   0.7     2.0    0.1       1.0   1.0   4      -      0.0       0.3   1.0   -    | limbs bend to where paths say
+150   0.5     2.0    0.1       0.3   0.3   5      -      0.3       0.3   1.0   -    | places begin to tell skins apart
+150   0.3     0.7    0.05      0.2   0.1   4      -      -         0.2   0.5   -    | growth evens out, as in a person
+150   0.2     0.7    0.01      0.15  0.05  5      -      -         0.1   0.2   -    | landmarks are clicks, with errors
+150   0.13    0.7    0.01      0.11  0.0   4      -      -         0.05  0.1   -    | hints fade: some are wrong
+300   0.09    0.7    0.01      0.08  0.0   4      -      -         -     -     -    | forearms and shins follow
+300   0.06    0.7    0.01      0.06  0.0   4      -      -         -     -     -    | hands and feet follow
+300   0.02    0.7    0.01      0.05  0.0   5      0.014  -         -     -     5    | ends lie near: rolled otherwise?
+1000  0.02    0.35   0.01      0.037 -     -      0.008  -         -     -     -    | fingers, muscles
+1000  0.015   0.35   0.005     0.028 -     -      0.008  -         -     -     -    | the surface decides, not clicks
+""")
 
 
 @dataclass(frozen=True)
@@ -106,30 +140,19 @@ class RegistrationConfig(Settings):
 
     Attributes
     ----------
-    graph : stages of the coarse registration by a deformation graph
-    ends : int
-        How many ends of the body are tried in other rotations about themselves; 0 leaves that out.
+    method : str
+        How the template is brought near the scan, before the last pass: a name in `METHODS`.
+    graph : stages of the deformation graph
     rolls : int
         How many other rolls of the limbs are tried where limbs lie as no person's do; 0 leaves that out.
     final_fit : FinalFitConfig or None
         The last pass: the surface follows the scan below its noise.
     """
 
-    graph: tuple[GraphStage, ...] = (
-        GraphStage(150, 0.7, 0.07, 2.0, 0.1, 1.0, 1.0, rounds=4, positions=0.0, paths=0.3, hints=1.0),
-        GraphStage(150, 0.5, 0.05, 2.0, 0.1, 0.3, 0.3, rounds=5, positions=0.3, paths=0.3, hints=1.0),
-        GraphStage(150, 0.3, 0.03, 0.7, 0.05, 0.2, 0.1, rounds=4, paths=0.2, hints=0.5),
-        GraphStage(150, 0.2, 0.02, 0.7, 0.01, 0.15, 0.05, rounds=5, paths=0.1, hints=0.2),
-        GraphStage(150, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=4, paths=0.05, hints=0.1),
-        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=4),
-        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06, 0.0, rounds=4),
-        GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=5, detail=0.014, ends=True),
-        GraphStage(1000, 0.02, 0.002, 0.35, 0.01, 0.037, detail=0.008),
-        GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
-    )
-    ends: int = 5
+    graph: tuple[GraphStage, ...] = USUAL
     rolls: int = 3
     final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
+    method: str = "graph"
 
     @classmethod
     def quick(cls) -> RegistrationConfig:
@@ -145,10 +168,16 @@ class RegistrationConfig(Settings):
         Not as in the paper: how soft they are and when, which it does not tell; triangles that end inverted are mended,
         and commands press soles to a scan that ends flat around the feet.
         """
-        def stage(nodes: int, length: float, landmarks: float, reach: float, rounds: int) -> GraphStage:
-            return GraphStage(nodes, length, round(0.1 * length, 6), 0.0, landmarks, reach, 1.0, rounds, detail=1e-4)
-
-        first = (stage(500, 0.7, landmarks, 0.0, 24) for landmarks in (0.001, 0.1, 10.0))
-        coarse = (stage(500, length, 0.01, 2 * length, 6) for length in (0.2, 0.1, 0.06, 0.04))
-        fine = (stage(2000, length, 0.005, 0.04, 6) for length in (0.04, 0.02))
-        return cls((*first, *coarse, *fine), 0, 0, None)
+        # landmarks first, ever heavier; then the scan, over ever softer links; each sought anew a few times
+        return cls(stages("""
+            nodes stretch growth landmarks reach slide rounds detail | why
+            500   0.7     0      0.001     0     1     24     0.0001 | the whole body turns
+            500   0.7     0      0.1       0     1     24     0.0001 | limbs swing
+            500   0.7     0      10.0      0     1     24     0.0001 | landmarks are met
+            500   0.2     0      0.01      0.4   1     6      0.0001 | the scan takes over, from afar
+            500   0.1     0      0.01      0.2   1     6      0.0001 | limbs
+            500   0.06    0      0.01      0.12  1     6      0.0001 | hands and feet
+            500   0.04    0      0.01      0.08  1     6      0.0001 | shape, coarsely
+            2000  0.04    0      0.005     0.04  1     6      0.0001 | the same, with more nodes
+            2000  0.02    0      0.005     0.04  1     6      0.0001 | shape
+            """), rolls=0, final_fit=None)

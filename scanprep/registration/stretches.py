@@ -51,7 +51,7 @@ class Triangles:
                                             shape=(len(template.vertices), len(faces))))
         self._smoothing: dict[float, Factored] = {}
 
-    def measured(self, x: np.ndarray) -> Field:
+    def measure(self, x: np.ndarray) -> Field:
         """The rotations and stretches of vertices (N, 3)."""
         flat = np.matmul(x[self.mesh.faces].transpose(0, 2, 1), self._hats_in_plane)
         C = np.matmul(flat.transpose(0, 2, 1), flat)
@@ -69,7 +69,7 @@ class Triangles:
         back = B.transpose(0, 2, 1)
         return Field(rotated @ B, back @ full @ B, back @ logarithm @ B)
 
-    def smoothed(self, field: Field, length: float, weights: np.ndarray) -> Field:
+    def smooth(self, field: Field, length: float, weights: np.ndarray) -> Field:
         """The field that varies little over `length` (metres), where triangles count by weights (F,).
 
         A mean over the surroundings: what the triangles say is spread, and so are the weights by which it is divided.

@@ -10,12 +10,11 @@ from ..correspondence.correlated import find_correspondences, find_seeds
 from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.mesh import Mesh
-from .nonrigid import Registration, offset_of, register, translate
+from .nonrigid import Registration, near_origin, register
 from .schedule import RegistrationConfig
 
-LOST = 0.005                           # share of a scan off the template from which on a limb may be lost
 
-
+@near_origin
 def register_unmarked(template: Mesh, scan: Mesh | np.ndarray, config: RegistrationConfig | None = None,
                       search: CorrelatedConfig | None = None, progress: Callable[[int, int], None] | None = None
                       ) -> tuple[Registration, Correspondences]:
@@ -25,15 +24,11 @@ def register_unmarked(template: Mesh, scan: Mesh | np.ndarray, config: Registrat
     A scan that is not all covered is registered again with the ends of its limbs as landmarks, and the registration
     that covers more is kept. ValueError as from `find_correspondences` and `register`.
     """
-    away = offset_of(scan)
-    if away.any():
-        fit, pairs = register_unmarked(template, translate(scan, -away), config, search, progress)
-        return translate(fit, away), translate(pairs, away)
     seeds = find_seeds(template, scan)
     ends = seeds.template_vertices, seeds.scan_points
     pairs = find_correspondences(template, scan, ends, search)
     fit = register(template, scan, None, config, progress, pairs)
-    if fit.uncovered > LOST:
+    if fit.uncovered > 0.005:                      # as a share of the scan: a limb may be lost
         again = register(template, scan, ends, config, progress, pairs)
         if again.uncovered < fit.uncovered:
             fit = replace(again, landmark_rms=np.nan)                # nobody clicked them

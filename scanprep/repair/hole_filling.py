@@ -13,15 +13,12 @@ from ..judgement import Judgement
 from ..ranges import Count, Positive, Range, Settings
 from .hole_patch import Patch
 from .intersections import intersecting_faces
-from .loops import group_loops, joined_polygon
+from .loops import group_loops, join_polygons
 from .manifold import repair, split_vertices
-from .volumetric_diffusion import EMPTY, diffused_surface
+from .volumetric_diffusion import EMPTY, diffuse_surface
 
 Method = Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"]
 MOST_EMPTY = 0.02                    # share of a good patch that may lie in space that was seen to be empty
-# pairs that run through each other, for each new triangle: merged views of people have 0.001 and 0.003, four views that
-# lie over each other 2.5, where patches are a cape from hand to hand
-TOUCHED, CROSSED = 0.05, 0.5
 
 
 @dataclass(frozen=True)
@@ -135,27 +132,32 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
         raise ValueError(f"config.method: {config.method} remeshes everything; there are no single holes to report")
     if not mesh.is_edge_manifold:
         raise ValueError("mesh: expected at most two triangles at an edge, facing the same way; repair it first")
+    # the holes: borders, and which of them one patch joins
     mesh = split_vertices(mesh, across_holes=True)
     loops = [loop for loop in mesh.boundary_loops if len(loop) <= (config.max_edges or len(mesh.vertices))]
     if not loops:
         return FillReport(split_vertices(mesh), ())
     groups = group_loops(mesh, loops) if config.join else [[loop] for loop in loops]
     work = _Filling(mesh, config, SeenSpace(views) if len(views) else None, Rays(mesh))
-    if config.method == "diffusion":
-        filled, made = mesh, list[FilledHole | None]([None] * len(groups))
-    else:
-        filled = work.patched(mesh, groups, progress=progress)
-        made = [*work.rated(filled, mesh, groups, "fair")]
+    # fair patches for all of them; holes with a bad one, or all where only diffusion is wanted, are left open
+    fair = list[FilledHole | None]([None] * len(groups))
+    filled = mesh
+    if config.method != "diffusion":
+        filled = work.fair_patches(mesh, groups, progress=progress)
+        fair = [*work.rate(filled, mesh, groups, "fair")]
     seen_in = config.method == "auto" and len(views) > 0
-    tried = [g for g, fair in enumerate(made) if fair is None or (seen_in and fair.is_bad)]
-    good = [group for g, group in enumerate(groups) if g not in tried]
-    if tried:
-        filled = work.patched(mesh, good) if good else mesh
-    for done, g in enumerate(tried, len(good) + 1):
-        filled, made[g] = work.in_volume(filled, groups[g], made[g])
-        if progress:
-            progress(done, len(groups))
-    return FillReport(split_vertices(filled), tuple(hole for hole in made if hole is not None))
+    made = {g: hole for g, hole in enumerate(fair) if hole is not None and not (seen_in and hole.is_bad)}
+    if 0 < len(made) < len(groups):
+        filled = work.fair_patches(mesh, [groups[g] for g in made])
+    elif not made:
+        filled = mesh
+    # volumetric diffusion, one hole after the other
+    for g, group in enumerate(groups):
+        if g not in made:
+            filled, made[g] = work.diffuse(filled, group, fair[g])
+            if progress:
+                progress(len(made), len(groups))
+    return FillReport(split_vertices(filled), tuple(made[g] for g in range(len(groups))))
 
 
 def filling_judgement(holes: Sequence[FilledHole], triangles: int) -> Judgement:
@@ -163,9 +165,11 @@ def filling_judgement(holes: Sequence[FilledHole], triangles: int) -> Judgement:
     crossing = sum(hole.intersections for hole in holes)
     reason = (f"the patches have {triangles} triangles and run through others {crossing} times: views that overlap "
               "are to be made one surface first (scape prep merge, scape prep template)")
-    if crossing > CROSSED * triangles:
+    # pairs that run through each other, for each new triangle: merged views of people have 0.001 and 0.003, four
+    # views that lie over each other 2.5, where patches are a cape from hand to hand
+    if crossing > 0.5 * triangles:
         return Judgement.of(reason)
-    return Judgement.of(check=[reason] if crossing > TOUCHED * triangles else [])
+    return Judgement.of(check=[reason] if crossing > 0.05 * triangles else [])
 
 
 def close(mesh: Mesh, config: FillConfig | None = None) -> Mesh:
@@ -197,8 +201,8 @@ class _Filling:
     seen: SeenSpace | None
     rays: Rays
 
-    def patched(self, mesh: Mesh, groups: list[list[np.ndarray]], guide: Mesh | None = None,
-                progress: Callable[[int, int], None] | None = None) -> Mesh:
+    def fair_patches(self, mesh: Mesh, groups: list[list[np.ndarray]], guide: Mesh | None = None,
+                     progress: Callable[[int, int], None] | None = None) -> Mesh:
         """The mesh with fair patches across some holes, drawn to a guide if there is one.
 
         [Liepa] triangulation, refinement, fairing
@@ -209,7 +213,7 @@ class _Filling:
         local = np.full(len(mesh.vertices), -1)
         local[used] = np.arange(len(used))
         patch = Patch(around, rim[used])
-        polygons = [joined_polygon(around.vertices, [local[loop] for loop in group]) for group in groups]
+        polygons = [join_polygons(around.vertices, [local[loop] for loop in group]) for group in groups]
         patch.triangulate(polygons, self.rays, progress)
         patch.refine(self.config.density)
         start = patch.mesh.vertices
@@ -223,20 +227,26 @@ class _Filling:
             patch.untangle(start)
         return patch.onto(mesh, used)
 
-    def in_volume(self, mesh: Mesh, group: list[np.ndarray], fair: FilledHole | None
-                  ) -> tuple[Mesh, FilledHole]:
+    def diffuse(self, mesh: Mesh, group: list[np.ndarray], fair: FilledHole | None
+                ) -> tuple[Mesh, FilledHole]:
         """The mesh with one hole filled by diffusion, unless the fair patch was better.
 
         [Davis] volumetric diffusion
         """
-        filled = self.patched(mesh, [group], diffused_surface(*_around(mesh, np.concatenate(group)), self.seen))
-        made = self.rated(filled, mesh, [group], "diffusion")[0]
+        # the part of the mesh within four radii of the hole, and the vertices of its border there
+        rim = np.concatenate(group)
+        middle = mesh.vertices[rim].mean(axis=0)
+        reach = 4 * np.linalg.norm(mesh.vertices[rim] - middle, axis=1).max()
+        near = np.linalg.norm(mesh.corners.mean(axis=1) - middle, axis=1) < reach
+        part, used = mesh.submesh(near | np.isin(mesh.faces, rim).any(axis=1))
+        guide = diffuse_surface(part, np.searchsorted(used, np.unique(rim)), self.seen)
+        filled = self.fair_patches(mesh, [group], guide)
+        made = self.rate(filled, mesh, [group], "diffusion")[0]
         if fair is None or made.faults < fair.faults:
             return filled, made
-        return self.patched(mesh, [group]), fair
+        return self.fair_patches(mesh, [group]), fair
 
-    def rated(self, filled: Mesh, before: Mesh, groups: list[list[np.ndarray]], method: str
-              ) -> list[FilledHole]:
+    def rate(self, filled: Mesh, before: Mesh, groups: list[list[np.ndarray]], method: str) -> list[FilledHole]:
         """What was done about every hole, and what is wrong with its patch."""
         old = len(before.faces)
         label = Mesh(filled.vertices, filled.faces[old:]).vertex_component
@@ -251,12 +261,3 @@ class _Filling:
         pieces = [(np.concatenate(group), len(group), label[group[0][0]]) for group in groups]
         return [FilledHole(before.vertices[rim].mean(axis=0), borders, len(rim), method, int(crossing[p]),
                            float(empty[p])) for rim, borders, p in pieces]
-
-
-def _around(mesh: Mesh, rim: np.ndarray) -> tuple[Mesh, np.ndarray]:
-    """The part of a mesh within four radii of a hole, and the vertices of its border there."""
-    middle = mesh.vertices[rim].mean(axis=0)
-    reach = 4 * np.linalg.norm(mesh.vertices[rim] - middle, axis=1).max()
-    near = np.linalg.norm(mesh.corners.mean(axis=1) - middle, axis=1) < reach
-    part, used = mesh.submesh(near | np.isin(mesh.faces, rim).any(axis=1))
-    return part, np.searchsorted(used, np.unique(rim))

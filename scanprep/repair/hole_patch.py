@@ -182,7 +182,7 @@ def _clear_triangles(around: Mesh, ring: np.ndarray, rim_normals: np.ndarray, jo
     """The triangles (n - 2, 3) across a ring, as far as possible without running through anything or each other."""
     points = around.vertices[ring]
     most = float(4 * np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())    # than all bends together
-    price = most * _pierced(points, joined, rays)
+    price = most * _pierces(points, joined, rays)
     best, fewest = None, np.inf
     corners = around.corners                    # what overlaps the box of the ring; the new triangles lie inside it
     near = around.faces[((corners.max(axis=1) >= points.min(axis=0))
@@ -204,7 +204,7 @@ def _clear_triangles(around: Mesh, ring: np.ndarray, rim_normals: np.ndarray, jo
     return best
 
 
-def _pierced(points: np.ndarray, joined: np.ndarray, rays: Rays) -> np.ndarray:
+def _pierces(points: np.ndarray, joined: np.ndarray, rays: Rays) -> np.ndarray:
     """(n, n) bool: the straight line between two points of a loop runs through the existing surface."""
     i, k = np.nonzero(np.triu(~joined, 2))
     out = np.zeros(joined.shape, dtype=bool)

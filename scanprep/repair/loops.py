@@ -4,10 +4,9 @@ from __future__ import annotations
 import heapq
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..geometry.mesh import Mesh
+from ..geometry.sparse import connected_pieces
 
 
 def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
@@ -21,14 +20,13 @@ def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
         facing = np.array([_met(points, owner, ahead, number, len(loops)) for number in large])
         both = np.zeros((len(loops), len(loops)), dtype=bool)
         both[large] = facing > 0.6
-        pairs = np.argwhere(both & both.T)
-        graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=both.shape)
-        label = connected_components(graph, directed=False)[1]
+        a, b = np.nonzero(both & both.T)
+        label = connected_pieces(a, b, len(loops))
     return [[loops[k] for k in np.flatnonzero(label == label[number])]
             for number in np.unique(label, return_index=True)[1]]
 
 
-def joined_polygon(vertices: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
+def join_polygons(vertices: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
     """One polygon (m,) from several loops, cut open along the shortest lines between them.
 
     The vertices at the ends of a cut are named twice. All loops run as the sides of the triangles at the border do.

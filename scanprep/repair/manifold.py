@@ -2,11 +2,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..geometry.mesh import Mesh
 from ..geometry.sanitise import invert_against_neighbours, inverted
+from ..geometry.sparse import connected_pieces
 from ..geometry.surface import Rays
 
 FLAT = 1e-12               # square metres: no area
@@ -110,7 +109,7 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     if mesh.is_vertex_manifold:
         return mesh
     fan = mesh.corner_fans
-    number = (_joined_by_holes(mesh, fan)[fan] if across_holes else fan).ravel()
+    number = (_join_across_holes(mesh, fan)[fan] if across_holes else fan).ravel()
     _, first, new = np.unique(number, return_index=True, return_inverse=True)
     owner = mesh.faces.ravel()[first]
     order = np.lexsort((first, owner))
@@ -122,7 +121,7 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     return Mesh(mesh.vertices[source], place[new.reshape(-1)].reshape(-1, 3), colors)
 
 
-def _joined_by_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
+def _join_across_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
     """A common number for the fans at a vertex between which a simple border loop passes."""
     face, side = np.nonzero(mesh.edge_use[mesh.face_edges] == 1)
     ends = mesh.faces[face, side], mesh.faces[face, (side + 1) % 3]
@@ -131,8 +130,7 @@ def _joined_by_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
     pairs = [(at[u, v][1], at[v, w][0]) for loop in mesh.boundary_loops
              for u, v, w in zip(np.roll(loop, 1).tolist(), loop.tolist(), np.roll(loop, -1).tolist(), strict=True)]
     a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    count = int(fan.max()) + 1
-    return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)[1]
+    return connected_pieces(a, b, int(fan.max()) + 1)
 
 
 def drop_small_components(mesh: Mesh, share: float) -> Mesh:
@@ -140,9 +138,7 @@ def drop_small_components(mesh: Mesh, share: float) -> Mesh:
     if not len(mesh.faces):
         return mesh
     a, b = mesh.faces[:, [0, 1]].T, mesh.faces[:, [1, 2]].T       # not mesh.edges: sorting them takes longer
-    count = len(mesh.vertices)
-    sides = coo_array((np.ones(a.size), (a.ravel(), b.ravel())), shape=(count, count))
-    _, label = connected_components(sides, directed=False)
+    label = connected_pieces(a.ravel(), b.ravel(), len(mesh.vertices))
     size = np.bincount(label)
     keep = size >= share * size.max()
     if share >= 1:

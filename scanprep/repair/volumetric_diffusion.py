@@ -11,7 +11,7 @@ from ..geometry.surface import SeenSpace, Surface
 EMPTY = 0.01                         # metres in front of what was seen from which on space counts as empty
 
 
-def diffused_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, voxels: int = 12) -> Mesh:
+def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, voxels: int = 12) -> Mesh:
     """The zero level of the signed distance, diffused from the existing surface into the space about holes.
 
     Near the surface the distance is known. Elsewhere it takes the steady state of diffusion; that of second order,

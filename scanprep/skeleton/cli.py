@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -14,18 +14,15 @@ from ..geometry.files import read_mesh
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from .edit import apply_edits, read_edits
-from .find import SkeletonSearch, search_skeleton, skeleton_problem
+from .find import search_skeleton, skeleton_problem
 from .names import skeleton_doubts
 from .parts import SkeletonConfig
 from .tree import Skeleton
 
-PosesArg = Annotated[Path, Place("POSES")]
-SkeletonArg = Annotated[Path, Place("SKELETON")]
 
-
-def skeleton(poses: PosesArg, output: Output, template: Path | None = None,
+def skeleton(poses: Annotated[Path, Place("POSES")], output: Output, template: Path | None = None,
              subject: Annotated[str | None, Person] = None, unit: Unit | None = None,
-             config: SkeletonConfig = SkeletonConfig()) -> Outcome:  # noqa: B008
+             config: SkeletonConfig = SkeletonConfig()) -> Outcome:
     """Rigid parts, joints and a tree from meshes of one person that share their triangles.
 
     Example: scape prep skeleton set -o skeleton.json
@@ -41,26 +38,22 @@ def skeleton(poses: PosesArg, output: Output, template: Path | None = None,
     body, vertices = read_poses(poses, template, subject, unit)
     with bar("finding the skeleton") as progress:
         search = search_skeleton(body, vertices, config, progress=progress)
-    search.skeleton.save(output)
-    return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(search.skeleton.parents)),
-                            *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config},
-                   judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(search.skeleton)))
+    found = search.skeleton
+    found.save(output)
+    return Outcome(output, [
+        Metric("poses", len(vertices)), Metric("parts", len(found.parents)),
+        Metric("left and right alike", "yes" if search.symmetric else "no"),
+        Metric("restarts that ended with as many parts",
+               f"{search.parts.count(len(found.parents))} of {len(search.parts)}"),
+        *(Metric(f"loop of {loop.length} links opened at",
+                 f"{' and '.join(loop.parts)}, {'joined' if loop.joined else 'no longer linked'}")
+          for loop in search.loops), *_shares(found, body)], {"skeleton": config},
+        judgement=Judgement.of(skeleton_problem(search, config.parts), skeleton_doubts(found)))
 
 
-def _facts(search: SkeletonSearch) -> list[Metric]:
-    """What was found on the way: sides, loops, restarts."""
-    facts = [Metric("left and right alike", "yes" if search.symmetric else "no"),
-             Metric("restarts that ended with as many parts",
-                    f"{search.parts.count(len(search.skeleton.parents))} of {len(search.parts)}")]
-    for loop in search.loops:
-        end = "joined" if loop.joined else "no longer linked"
-        facts.append(Metric(f"loop of {loop.length} links opened at", f"{' and '.join(loop.parts)}, {end}"))
-    return facts
-
-
-def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, edits: Path | None = None,
-         merge: tuple[str, str] | None = None, rename: tuple[str, str] | None = None, unit: Unit | None = None
-         ) -> Outcome:
+def edit(skeleton: Annotated[Path, Place("SKELETON")], output: Output, template: Path | None = None,
+         edits: Path | None = None, merge: tuple[str, str] | None = None, rename: tuple[str, str] | None = None,
+         unit: Unit | None = None) -> Outcome:
     """Change a skeleton by hand: merge, split and rename parts, move joints.
 
     Example: scape prep edit-skeleton set --merge chest shoulder_left --rename part3 neck -o set/skeleton.json
@@ -75,7 +68,8 @@ def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, ed
         rename: A part and its new name.
         unit: Unit of the template.
     """
-    wanted = [*(read_edits(edits) if edits else []), *_asked(merge, rename)]
+    wanted = [*(read_edits(edits) if edits else []), *([{"merge": list(merge)}] if merge else []),
+              *([{"rename": {rename[0]: rename[1]}}] if rename else [])]
     if not wanted:
         raise ValueError("edits: expected --edits FILE or one of --merge, --rename")
     before, body, poses = _read_skeleton(skeleton, template, unit)
@@ -86,18 +80,7 @@ def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, ed
                    judgement=Judgement())
 
 
-def _asked(merge: tuple[str, str] | None, rename: tuple[str, str] | None) -> list[dict[str, Any]]:
-    """The edits of the command line as they stand in a file."""
-    asked: list[dict[str, Any]] = []
-    if merge:
-        asked.append({"merge": list(merge)})
-    if rename:
-        asked.append({"rename": {rename[0]: rename[1]}})
-    return asked
-
-
-def _read_skeleton(path: Path, template: Path | None, unit: Unit | None
-                   ) -> tuple[Skeleton, Mesh, np.ndarray | None]:
+def _read_skeleton(path: Path, template: Path | None, unit: Unit | None) -> tuple[Skeleton, Mesh, np.ndarray | None]:
     """Skeleton, template, and the poses where a set has them."""
     if path.is_dir():
         whole = RegisteredSet.load(path)

@@ -212,7 +212,7 @@ def apply_edits(skeleton: Skeleton, template: Mesh, edits: Sequence[dict[str, An
                          f"got {len(template.faces)}")
     for number, edit in enumerate(edits, 1):
         try:
-            skeleton = _applied(skeleton, template, edit, poses)
+            skeleton = _apply(skeleton, template, edit, poses)
         except ValueError as error:
             raise ValueError(f"edits: entry {number}, {json.dumps(edit, default=str)}: {error}") from None
     return skeleton
@@ -226,7 +226,7 @@ def read_edits(path: str | Path) -> list[dict[str, Any]]:
     return stored
 
 
-def _applied(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
+def _apply(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
     """The skeleton after one entry of a list of edits."""
     known = {"merge": set(), "split": {"names"}, "rename": set(), "move_joint": {"position", "ring"}}
     if not isinstance(edit, dict):

@@ -85,7 +85,8 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     finder = SkeletonFinder(template, poses, config, progress, step)
     best = finder.runs[0]
     skeleton, symmetric = finder.skeleton(best, config.parts)
-    found = SkeletonSearch(skeleton, tuple(_opened(loop, skeleton) for loop in best.loops), finder.symmetry, symmetric,
+    loops = tuple(_name_loop(loop, skeleton) for loop in best.loops)
+    found = SkeletonSearch(skeleton, loops, finder.symmetry, symmetric,
                            tuple(run.energy for run in finder.runs), tuple(len(run.links) + 1 for run in finder.runs))
     if progress is not None:
         progress(config.restarts + 1, config.restarts + 1)
@@ -99,7 +100,7 @@ def skeleton_problem(found: SkeletonSearch, wanted: int | None) -> str | None:
     return "the body has one part and no joint; the meshes do not differ in pose, or are smaller than their unit says?"
 
 
-def _opened(loop: Loop, skeleton: Skeleton) -> OpenedLoop:
+def _name_loop(loop: Loop, skeleton: Skeleton) -> OpenedLoop:
     """A loop with the names of the parts that hold most of its two sides."""
     a, b = (skeleton.names[int(np.bincount(skeleton.part_of_face[side]).argmax())] for side in loop.sides)
     return OpenedLoop((a, b), loop.joined, loop.length)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from ..geometry.mesh import Mesh
+from ..geometry.sparse import connected_pieces
 from .motions import Motions, PosedSurface
 from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
@@ -29,8 +30,7 @@ def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, n
 
 def linked(links: np.ndarray, count: int) -> bool:
     """Whether links (n, 2) join all of `count` parts."""
-    graph = coo_array((np.ones(len(links)), links.T), shape=(count, count))
-    return bool(connected_components(graph, directed=False)[0] == 1)
+    return not connected_pieces(links[:, 0], links[:, 1], count).any()
 
 
 def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def dissolve_bands(search: PartSearch, label: np.ndarray) -> np.ndarray:
         for band in np.argsort(-explained, kind="stable"):
             if explained[band] < FADING:
                 return label
-            without = search.alternate(_shared_out(search, label, int(band), between[band]), rounds=4)
+            without = search.alternate(_share_out(search, label, int(band), between[band]), rounds=4)
             if without.max() < label.max():
                 label = without
                 break
@@ -98,7 +98,7 @@ def passages(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndar
         lost[p] = weights @ np.min([_squares(gap) for gap in gaps], axis=0) - own
         for i in range(len(near)):
             for k in range(i):
-                left = lost[p] + own - weights @ _blended(gaps[i], gaps[k])
+                left = lost[p] + own - weights @ _blend(gaps[i], gaps[k])
                 if left > won[p]:
                     won[p], between[p] = left, near[[k, i]]
     lost, won = lost + lost[partner], won + won[partner]
@@ -116,14 +116,14 @@ def _squares(gap: np.ndarray) -> np.ndarray:
     return (gap**2).sum(axis=(1, 2)) / gap.shape[1]
 
 
-def _blended(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _blend(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(n,) the least squares that a blend of two motions leaves of their gaps, its share free for every vertex."""
     apart = a - b
     share = np.clip(-(apart * b).sum(axis=(1, 2)) / np.maximum((apart**2).sum(axis=(1, 2)), 1e-300), 0, 1)
     return _squares(b + share[:, None, None] * apart)
 
 
-def _shared_out(search: PartSearch, label: np.ndarray, band: int, between: np.ndarray) -> np.ndarray:
+def _share_out(search: PartSearch, label: np.ndarray, band: int, between: np.ndarray) -> np.ndarray:
     """Labels where every triangle of a band, and of its mirror image, goes to the neighbour that it follows better."""
     partner = search.sides.partners(label)
     costs = search.surface.face_costs(search.motions(label))

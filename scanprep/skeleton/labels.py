@@ -3,7 +3,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from ..geometry.sparse import connected_pieces
 
 
 def field_energy(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.ndarray) -> float:
@@ -108,8 +110,7 @@ def _cut(own: np.ndarray, i: np.ndarray, j: np.ndarray, W: np.ndarray, state: np
 def pieces(pairs: np.ndarray, label: np.ndarray) -> np.ndarray:
     """(F,) number of the connected piece of equal labels that each triangle lies in."""
     a, b = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]].T
-    n = len(label)
-    return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)[1]
+    return connected_pieces(a, b, len(label))
 
 
 def keep_connected(costs: np.ndarray, pairs: np.ndarray, areas: np.ndarray, label: np.ndarray) -> np.ndarray:

@@ -12,7 +12,6 @@ from .tree import Skeleton
 
 ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
 LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
-FAR = 0.6                            # of a limb: elbows and knees are at 0.41 to 0.44, wrists, ankles at 0.75 to 0.81
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
@@ -27,7 +26,7 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
     person = _person(template, skeleton, symmetry) if symmetry.holds else None
     if person is None:
         return skeleton.names
-    left = _left(template, skeleton, person)
+    left = _way_left(template, skeleton, person)
     if left is None:
         return skeleton.names
     names = dict(zip(person.spine, _spine_names(person), strict=True))
@@ -77,34 +76,44 @@ def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person |
         return None
     near = _neighbours(skeleton)
     middle = [p for p in range(len(partner)) if partner[p] == p]
-    along = {p: [q for q in near[p] if partner[q] == q] for p in middle}
-    limbs = [(p, chain) for p in middle for q in near[p] if partner[q] != q and (chain := _chain(near, p, q))]
-    if (len(limbs) != 4 or max(len(q) for q in along.values()) > 2
-            or len(middle) + sum(len(chain) for _, chain in limbs) != len(partner)):
+    limbs = _limbs(near, partner, middle)
+    found = limbs and _spine(template, skeleton, {p: [q for q in near[p] if q in middle] for p in middle}, limbs)
+    if not found:
         return None
-
-    # The chain in the middle from the legs to the head, and which limbs are legs: those far from the neck
-    heads = [p for p in middle if len(along[p]) < 2 and p not in {q for q, _ in limbs}]
-    if len(heads) > 1:
-        return None
-    roots = np.array([_joint(skeleton, chain[0], p) for p, chain in limbs])
-    if heads:
-        spine = _chain(along, -1, heads[0])[::-1]
-        neck = _joint(skeleton, spine[-1], spine[-2])
-        order = np.lexsort((-np.linalg.norm(roots - neck, axis=1), [spine.index(p) for p, _ in limbs]))
-    else:                                                                 # without one, the heavier limbs
-        order = np.argsort([-_points(template, skeleton, chain)[1].sum() for _, chain in limbs])
-        spine = _chain(along, -1, limbs[order[0]][0])
-        neck = roots[order[2:]].mean(axis=0)
+    spine, neck, order = found
     legs, arms = [limbs[i][1] for i in order[:2]], [limbs[i][1] for i in order[2:]]
     if {partner[legs[0][0]], partner[arms[0][0]]} != {legs[1][0], arms[1][0]} or limbs[order[0]][0] != spine[0]:
         return None
-    hips = roots[order[:2]].mean(axis=0)
+    # the legs go on where the trunk ends, as on somebody who stands
+    hips = np.mean([_joint(skeleton, leg[0], spine[0]) for leg in legs], axis=0)
     up = (neck - hips) / np.linalg.norm(neck - hips)
     down = np.mean([_bones(template, skeleton, leg)[-1] for leg in legs], axis=0) - hips
-    if down @ up > -0.7 * np.linalg.norm(down):                           # the legs do not go on where the trunk ends
+    if down @ up > -0.7 * np.linalg.norm(down):
         return None
-    return _Person(spine, arms, legs, limbs[order[2]][0], bool(heads), up, hips)
+    return _Person(spine, arms, legs, limbs[order[2]][0], spine[-1] != limbs[order[2]][0], up, hips)
+
+
+def _limbs(near: dict[int, list[int]], partner: np.ndarray, middle: list[int]) -> list[tuple[int, list[int]]]:
+    """The part in the middle and the chain that hangs on it, of four limbs; none of a body that has others."""
+    limbs = [(p, chain) for p in middle for q in near[p] if partner[q] != q and (chain := _chain(near, p, q))]
+    whole = len(middle) + sum(len(chain) for _, chain in limbs) == len(partner)
+    forks = any(sum(partner[q] == q for q in near[p]) > 2 for p in middle)
+    return limbs if len(limbs) == 4 and whole and not forks else []
+
+
+def _spine(template: Mesh, skeleton: Skeleton, along: dict[int, list[int]], limbs: list[tuple[int, list[int]]]
+           ) -> tuple[list[int], np.ndarray, np.ndarray] | None:
+    """The chain in the middle from the legs to the head, the neck (3,), and the order of the limbs, legs first."""
+    heads = [p for p in along if len(along[p]) < 2 and p not in {q for q, _ in limbs}]
+    if len(heads) > 1:
+        return None
+    roots = np.array([_joint(skeleton, chain[0], p) for p, chain in limbs])
+    if heads:                                                             # legs are far from the neck
+        spine = _chain(along, -1, heads[0])[::-1]
+        neck = _joint(skeleton, spine[-1], spine[-2])
+        return spine, neck, np.lexsort((-np.linalg.norm(roots - neck, axis=1), [spine.index(p) for p, _ in limbs]))
+    order = np.argsort([-_points(template, skeleton, chain)[1].sum() for _, chain in limbs])     # the heavier limbs
+    return _chain(along, -1, limbs[order[0]][0]), roots[order[2:]].mean(axis=0), order
 
 
 def _neighbours(skeleton: Skeleton) -> dict[int, list[int]]:
@@ -151,7 +160,7 @@ def _bones(template: Mesh, skeleton: Skeleton, limb: list[int]) -> np.ndarray:
     return np.array([*places, points[np.linalg.norm(points - places[0], axis=1).argmax()]])
 
 
-def _left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | None:
+def _way_left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | None:
     """The direction (3,) to the person's left: up × front, front where the soles reach; None if that is not clear."""
     front, length = np.zeros(3), 0.0
     for leg in person.legs:
@@ -189,6 +198,7 @@ def _limb_names(template: Mesh, skeleton: Skeleton, limb: list[int], kinds: dict
     if len(limb) in (3, 4) and lengths[0] < 0.45 * lengths[1]:          # too short for an upper arm or thigh
         lengths, lead = lengths[1:], (first,)
     n, whole = len(lengths), kinds[1][0]
-    if n == 2 and lengths[0] > FAR * lengths.sum():                     # the knee was never seen to bend, the ankle was
+    # of a limb: elbows and knees are at 0.41 to 0.44, wrists, ankles at 0.75 to 0.81
+    if n == 2 and lengths[0] > 0.6 * lengths.sum():                     # the knee was never seen to bend, the ankle was
         return *lead, whole, kinds[3][-1]
     return (*lead, *kinds[n]) if n in kinds else tuple(f"{whole}{k + 1}" for k in range(n))

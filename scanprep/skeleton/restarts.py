@@ -26,7 +26,7 @@ from .joints import (
 from .motions import PosedSurface
 from .names import name_parts
 from .parts import FADING, PartSearch, SkeletonConfig, find_parts
-from .symmetry import Symmetry, find_symmetry, mirrored_poses
+from .symmetry import Symmetry, find_symmetry, mirror_poses
 from .tree import Skeleton, reorder
 
 Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
@@ -44,7 +44,15 @@ class SkeletonFinder:
     def __init__(self, template: Mesh, poses: np.ndarray, config: SkeletonConfig,
                  progress: Callable[[int, int], None] | None = None, step: Step = once) -> None:
         check_template(template)
-        poses = _checked_poses(template, poses)
+        poses = np.asarray(poses, dtype=np.float64)
+        n = len(template.vertices)
+        if poses.ndim != 3 or poses.shape[1:] != (n, 3):
+            raise ValueError(f"poses: expected shape (M, {n}, 3) for this template, got {poses.shape}")
+        if len(poses) < 3:
+            raise ValueError(f"poses: expected at least 3, got {len(poses)}; where they differ the joints show")
+        bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
+        if len(bad):
+            raise ValueError(f"poses: {len(bad)} have vertices that are not finite, the first is pose {bad[0]}")
         self.template, self.config, self.symmetry = template, config, find_symmetry(template, poses)
         tied = self.symmetry.holds if config.symmetric is None else config.symmetric
         if tied and not self.symmetry.two_sided:
@@ -54,8 +62,8 @@ class SkeletonFinder:
         kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
         symmetry = self.symmetry if tied else None
         runs = _restarts(self.surface, config, symmetry, tell, kept)                # [Articulated] E- and M-steps
-        if tied and self.symmetry.holds and _held_back(_best(runs)):     # few poses: a limb bends on one side alone
-            both = np.concatenate([poses, mirrored_poses(template, poses, self.symmetry)])
+        if tied and self.symmetry.holds and _is_held_back(_best(runs)):     # few poses: a limb bends on one side alone
+            both = np.concatenate([poses, mirror_poses(template, poses, self.symmetry)])
             self.surface = PosedSurface(template, both)
             runs = _restarts(self.surface, config, symmetry, tell, kept, "mirrored")
         self.first, self.runs = runs[0], sorted(runs, key=lambda run: run.score)
@@ -65,25 +73,17 @@ class SkeletonFinder:
         surface, config = self.surface, replace(self.config, parts=parts)
         label, links, tied = _of_count(run, surface, config)
         if tied:
-            label = _borders_untied(surface, config, label, links)
+            # labels of the same tree after the borders of both sides moved each by itself: no body is quite symmetric
+            free = PartSearch(surface, replace(config, patches=2))
+            moved = free.alternate(label, rounds=12, core=True)
+            touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
+            same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
+            label = moved if same else label
         joints = place_joints(surface, label, surface.core_motions(label), links)   # [Articulated] joints
-        skeleton = _assembled(self.template, label, links, joints)
+        skeleton = _assemble(self.template, label, links, joints)
         if tied:
             skeleton = replace(skeleton, names=name_parts(self.template, skeleton, self.symmetry))
         return skeleton, tied
-
-
-def _checked_poses(template: Mesh, poses: np.ndarray) -> np.ndarray:
-    poses = np.asarray(poses, dtype=np.float64)
-    n = len(template.vertices)
-    if poses.ndim != 3 or poses.shape[1:] != (n, 3):
-        raise ValueError(f"poses: expected shape (M, {n}, 3) for this template, got {poses.shape}")
-    if len(poses) < 3:
-        raise ValueError(f"poses: expected at least 3, got {len(poses)}; where they differ the joints show")
-    bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
-    if len(bad):
-        raise ValueError(f"poses: {len(bad)} have vertices that are not finite, the first is pose {bad[0]}")
-    return poses
 
 
 def _progress(progress: Callable[[int, int], None] | None, restarts: int) -> Callable[[], None]:
@@ -117,7 +117,7 @@ def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry 
     rng = np.random.default_rng(config.seed)
     searches = [PartSearch(surface, config, symmetry, rng) for _ in range(config.restarts)]
     runs = []
-    with SideBySide(_searched, searches) as found:
+    with SideBySide(_search, searches) as found:
         for number, search in enumerate(searches):
             label, links, loops = kept(f"{poses or ('free' if symmetry is None else 'symmetric')} restart {number}",
                                        make=partial(found, number))
@@ -132,13 +132,13 @@ def _best(runs: list[Restart]) -> Restart:
     return min(runs, key=lambda run: run.score)
 
 
-def _searched(search: PartSearch) -> Tree:
+def _search(search: PartSearch) -> Tree:
     """Labels and links of a tree, and the loops that were opened for it."""
     label = find_parts(search)                                                      # [Articulated]
     label = dissolve_bands(search, label)
     label, links, loops = to_tree(search, label)                                    # [SCAPE] §3
-    label, links = _improved(search, label, links)
-    return *_settled(search, label, links), loops
+    label, links = _improve(search, label, links)
+    return *_settle(search, label, links), loops
 
 
 def _score(search: PartSearch, label: np.ndarray) -> float:
@@ -148,7 +148,7 @@ def _score(search: PartSearch, label: np.ndarray) -> float:
     return float(np.log(energy + search.config.tolerance**2) + 0.1 * (label.max() + 1))
 
 
-def _improved(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _improve(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels and links of a tree after parts were joined, and cut, as long as the score falls.
 
     Only parts that are not well apart are joined: hands are too small to lower the energy much. A cut that makes a mere
@@ -173,14 +173,14 @@ def _improved(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple
     return label, links
 
 
-def _settled(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _settle(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels and links of a tree after labels and core motions alternated to the end, if it still is that tree."""
     moved = search.alternate(label, rounds=12, core=True)
     tree = without_weak(search, moved)
     return (moved, tree) if moved.max() == label.max() and len(tree) == len(links) else (label, links)
 
 
-def _held_back(run: Restart) -> bool:
+def _is_held_back(run: Restart) -> bool:
     """Whether parts that need not be symmetric would fit far better, beginning with those found."""
     free = PartSearch(run.search.surface, replace(run.search.config, patches=2))
     return free.energy(free.alternate(run.label, rounds=10)) < 0.85 * run.search.energy(run.label)
@@ -196,23 +196,14 @@ def _of_count(best: Restart, surface: PosedSurface, config: SkeletonConfig) -> t
         return best.label, best.links, tied
     try:
         label, links = tree_of(best.search, best.label, best.links, config.parts)
-        return *(_settled(best.search, label, links) if tied else (label, links)), tied
+        return *(_settle(best.search, label, links) if tied else (label, links)), tied
     except ValueError:
         if not tied or config.symmetric:
             raise
     return *tree_of(PartSearch(surface, config), best.label, best.links, config.parts), False
 
 
-def _borders_untied(surface: PosedSurface, config: SkeletonConfig, label: np.ndarray, links: np.ndarray) -> np.ndarray:
-    """Labels of the same tree after the borders of both sides moved each by itself: no body is quite symmetric."""
-    free = PartSearch(surface, replace(config, patches=2))
-    moved = free.alternate(label, rounds=12, core=True)
-    touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
-    same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
-    return moved if same else label
-
-
-def _assembled(template: Mesh, label: np.ndarray, links: np.ndarray, joints: np.ndarray) -> Skeleton:
+def _assemble(template: Mesh, label: np.ndarray, links: np.ndarray, joints: np.ndarray) -> Skeleton:
     """Number the parts from the middle outwards and hang every joint on its child."""
     P = int(label.max()) + 1
     areas = np.bincount(label, template.face_areas, P)

@@ -62,7 +62,7 @@ class Symmetry(MirrorPlane):
         return bool(self.left.any()) and not bool(self.left.all())
 
 
-def mirrored_poses(template: Mesh, poses: np.ndarray, symmetry: Symmetry) -> np.ndarray:
+def mirror_poses(template: Mesh, poses: np.ndarray, symmetry: Symmetry) -> np.ndarray:
     """Poses (M, N, 3), metres, with left and right exchanged: what a body does on one side it can do on the other."""
     body = template if symmetry.pose < 0 else template.with_vertices(poses[symmetry.pose])
     image = Surface(body).closest(symmetry.image)
@@ -78,13 +78,13 @@ def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:
     vertices. `holds` says whether the body is symmetric at all.
     """
     few = _spread(template, 800)
-    at_rest = _matched(template, _best_plane(template, few)[1], -1)
+    at_rest = _match(template, _best_plane(template, few)[1], -1)
     if at_rest.holds or poses is None:
         return at_rest
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 24)).astype(int))
     planes = [_best_plane(template.with_vertices(poses[m]), few) for m in chosen]
     best = int(np.argmin([distance for distance, _ in planes]))
-    posed = _matched(template.with_vertices(poses[chosen[best]]), planes[best][1], int(chosen[best]))
+    posed = _match(template.with_vertices(poses[chosen[best]]), planes[best][1], int(chosen[best]))
     return posed if posed.holds or posed.distance < at_rest.distance else at_rest
 
 
@@ -106,11 +106,11 @@ def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, MirrorPlane]:
     def fitted(plane: MirrorPlane, rounds: int) -> tuple[float, MirrorPlane]:
         before = np.zeros(0)
         for _ in range(rounds):
-            nearest = target.match(plane.reflect(x), _mirrored(normals, plane), min_cosine=-1.0).index
+            nearest = target.match(plane.reflect(x), _mirror(normals, plane), min_cosine=-1.0).index
             if np.array_equal(nearest, before):
                 break
             before, plane = nearest, MirrorPlane.between(x, x[nearest])
-        image = _mirrored(normals, plane)
+        image = _mirror(normals, plane)
         match = target.match(plane.reflect(x), image, min_cosine=-1.0)
         off = target.scale**2 * ((target.normals[match.index] - image)**2).sum(axis=1)
         return float(np.sqrt((match.distances**2 + off).mean())) / size, plane
@@ -129,11 +129,11 @@ def _size(body: Mesh) -> float:
     return 2 * float(np.linalg.norm(body.vertices - body.vertices.mean(axis=0), axis=1).max())
 
 
-def _mirrored(normals: np.ndarray, plane: MirrorPlane) -> np.ndarray:
+def _mirror(normals: np.ndarray, plane: MirrorPlane) -> np.ndarray:
     return MirrorPlane(plane.normal, np.zeros(3)).reflect(normals)
 
 
-def _matched(body: Mesh, plane: MirrorPlane, pose: int) -> Symmetry:
+def _match(body: Mesh, plane: MirrorPlane, pose: int) -> Symmetry:
     """Warp the mirror image of a body onto it and pair the triangles."""
     size = _size(body)
     target = OrientedPoints(body.vertices, body.vertex_normals, NORMAL_WEIGHT * size)
@@ -148,10 +148,10 @@ def _matched(body: Mesh, plane: MirrorPlane, pose: int) -> Symmetry:
         weight[~match.valid] = 0
         solve = factor(csc_array(diags_array(weight + 1e-6) + stiffness * laplacian))
         image = start + solve(weight[:, None] * (body.vertices[match.index] - start))
-    return _paired(body, start, image, plane, pose)
+    return _pair(body, start, image, plane, pose)
 
 
-def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, plane: MirrorPlane, pose: int) -> Symmetry:
+def _pair(body: Mesh, start: np.ndarray, image: np.ndarray, plane: MirrorPlane, pose: int) -> Symmetry:
     """Pair triangles by the warped mirror image (N, 3) of the body, which began at `start` (N, 3)."""
     size, normal = _size(body), plane.normal
     centres, areas, normals = body.corners.mean(axis=1), body.face_areas, body.face_normals

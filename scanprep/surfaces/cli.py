@@ -72,8 +72,11 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
             made = make_template(seen, faces, progress=progress)
         rows = [Metric("views", len(seen))]
     else:
-        paths = [path for given in scans for path in (_files_of(given) if given.is_dir() else [given])]
-        views = [_read_body(path, unit) for path in paths]
+        paths = [path for given in scans for path in ([given] if not given.is_dir() else list_files(
+            given, lambda path: is_scan(path) and ".landmarks." not in path.name, "views, meshes or point clouds"))]
+        # meshing points wants their normals
+        views = [found if isinstance(found := read_scan(path, unit), Mesh) else read_points(path, unit)
+                 for path in paths]
         scan = views[0] if len(views) == 1 else views_without_cameras(views)
         path = landmarks or (landmarks_beside(paths[0]) if len(paths) == 1 else None)
         surface = scan if isinstance(scan, Mesh) else scan.points
@@ -95,18 +98,6 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
         say(f"note: {note}")
     return Outcome(output, [*rows, Metric("landmarks carried", len(marks)), *about_mesh(made)],
                    judgement=_as_template(made).joined(Judgement.of(check=doubts)))
-
-
-def _files_of(folder: Path) -> list[Path]:
-    """The meshes and point clouds of a folder of views, by name."""
-    return list_files(folder, lambda path: is_scan(path) and ".landmarks." not in path.name,
-                      "views, meshes or point clouds")
-
-
-def _read_body(path: Path, unit: Unit | None) -> Mesh | PointCloud:
-    """A scan with the normals of its points, which meshing them wants."""
-    found = read_scan(path, unit)
-    return found if isinstance(found, Mesh) else read_points(path, unit)
 
 
 def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None) -> Outcome:
@@ -140,7 +131,7 @@ def _manifold(mesh: Mesh, path: Path) -> Mesh:
 
 
 def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Unit | None = None,
-          config: CleanScanConfig = CleanScanConfig()) -> Outcome:  # noqa: B008
+          config: CleanScanConfig = CleanScanConfig()) -> Outcome:
     """Keep the body of a raw scan; floor, furniture and specks go.
 
     Example: scape prep clean raw.ply -o body.ply
@@ -171,8 +162,7 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
 
 def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None,
                   features: Annotated[bool, Called("--by-shape")] = False, unit: Unit | None = None,
-                  config: AlignViewsConfig = AlignViewsConfig()  # noqa: B008
-                  ) -> Outcome:
+                  config: AlignViewsConfig = AlignViewsConfig()) -> Outcome:
     """Bring range views into one frame, all of them together.
 
     Example: scape prep views views -o aligned
@@ -186,15 +176,16 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         unit: Unit of the views, cameras and landmarks.
         config: Settings.
     """
-    seen, paths = _read_views(views, unit), list_meshes(views)
-    names = [name_of(path) for path in paths]
-    marks = [_view_landmarks(landmarks, path, mesh, unit) for path, (mesh, _) in zip(paths, seen, strict=True)] \
-        if landmarks else None
-    found = align_views(seen, config, landmarks=marks, features=features)
-    for name, (mesh, _) in zip(names, found.views, strict=True):
+    seen, names, marks = _read_views(views, unit), list[str](), list[dict[str, np.ndarray]]()
+    for path, (mesh, _) in zip(list_meshes(views), seen, strict=True):
+        names.append(name_of(path))
+        beside = landmarks_beside(path, landmarks) if landmarks else None
+        marks.append(read_landmarks(beside, mesh, unit) if beside else {})
+    found = align_views(seen, config, landmarks=marks if landmarks else None, features=features)
+    placed = dict(zip(names, found.views, strict=True))
+    for name, (mesh, _) in placed.items():
         write_mesh(output / f"{name}.ply", mesh)
-    storage.write_json(output / "cameras.json",
-                       {name: camera.tolist() for name, (_, camera) in zip(names, found.views, strict=True)})
+    storage.write_json(output / "cameras.json", {name: camera.tolist() for name, (_, camera) in placed.items()})
     shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
     doubts = views_doubts(found, names)
     return Outcome(output, [
@@ -207,14 +198,7 @@ def align_cameras(views: ViewsArg, output: Output, landmarks: Path | None = None
         judgement=Judgement.of(views_problem(found), doubts))
 
 
-def _view_landmarks(folder: Path, path: Path, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
-    """The landmarks of one view; none where it has no file."""
-    marks = landmarks_beside(path, folder)
-    return read_landmarks(marks, view, unit) if marks else {}
-
-
-def merge(views: ViewsArg, output: Output, unit: Unit | None = None,
-          config: MergeConfig = MergeConfig()) -> Outcome:  # noqa: B008
+def merge(views: ViewsArg, output: Output, unit: Unit | None = None, config: MergeConfig = MergeConfig()) -> Outcome:
     """Merge range views into one surface, open where nothing was seen.
 
     Example: scape prep merge views -o body.ply
@@ -234,7 +218,7 @@ def merge(views: ViewsArg, output: Output, unit: Unit | None = None,
 
 
 def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | None = None,
-         config: FillConfig = FillConfig()) -> Outcome:  # noqa: B008
+         config: FillConfig = FillConfig()) -> Outcome:
     """Close the holes of a mesh; what was there stays as it was.
 
     Example: scape prep fill body.ply -o closed.ply
@@ -269,8 +253,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
-           config: DecimateConfig = DecimateConfig(),  # noqa: B008
-           of_set: DecimateSetConfig = DecimateSetConfig()) -> Outcome:  # noqa: B008
+           config: DecimateConfig = DecimateConfig(), of_set: DecimateSetConfig = DecimateSetConfig()) -> Outcome:
     """Fewer triangles for the same surface: of a mesh, or of a registered set, whose parts and landmarks stay in step.
 
     Example: scape prep decimate closed.ply --faces 14000 -o template.ply
@@ -289,7 +272,12 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
                                           ("method", config.method != DecimateConfig().method)) if given]
         if wrong:
             raise UsageError(f"--{wrong[0]}: it says nothing about a registered set, which {mesh} is")
-        return _reduce_set(mesh, output, faces, of_set)
+        whole = RegisteredSet.load(mesh)
+        with bar("decimating") as progress:
+            done = write_decimated_set(whole, output, faces, of_set, progress)
+        return Outcome(output, [
+            Metric("meshes", len(done.entries)), Metric("triangles before", len(whole.template.faces)),
+            *about_mesh(done.template)], {"decimate": of_set}, judgement=_as_template(done.template))
     given = read_scan_mesh(mesh, unit)
     before, keep = _manifold(given, mesh), None
     if landmarks:
@@ -300,15 +288,6 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
     write_mesh(output, after)
     return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config},
                    judgement=_as_template(after))
-
-
-def _reduce_set(folder: Path, output: Path, faces: int, config: DecimateSetConfig) -> Outcome:
-    before = RegisteredSet.load(folder)
-    with bar("decimating") as progress:
-        after = write_decimated_set(before, output, faces, config, progress)
-    return Outcome(output, [
-        Metric("meshes", len(after.entries)), Metric("triangles before", len(before.template.faces)),
-        *about_mesh(after.template)], {"decimate": config}, judgement=_as_template(after.template))
 
 
 def _as_template(mesh: Mesh) -> Judgement:

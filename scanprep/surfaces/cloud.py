@@ -12,7 +12,6 @@ from ..geometry.mesh import Mesh
 from ..repair.manifold import repair
 
 MOST = 40_000                          # points that are meshed: 7 mm apart on a person, as the triangles of a template
-TRIM = 2.5                             # spacings from the nearest point, beyond which nothing was measured
 LEAST = 100                            # points of anything that has a surface
 AWAY = 2.5                             # metres from which cameras look at people
 
@@ -42,11 +41,12 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
     """
     from ..adapters.open3d_filters import oriented_normals, screened_poisson
 
-    points, normals = _thinned(cloud)
+    points, normals = _thin(cloud)
     spacing = spacing_of(points)
     surface = screened_poisson(points, oriented_normals(points) if normals is None else normals, spacing)
     away = cKDTree(points).query(surface.vertices)[0]
-    surface = surface.submesh((away <= TRIM * spacing)[surface.faces].all(axis=1))[0]
+    # spacings from the nearest point, beyond which nothing was measured
+    surface = surface.submesh((away <= 2.5 * spacing)[surface.faces].all(axis=1))[0]
     if not len(surface.faces):
         raise ValueError("cloud: no surface lies between its points; are they of a surface?")
     surface = repair(surface, 0.02)
@@ -75,7 +75,7 @@ def mesh_of_view(view: PointCloud | np.ndarray) -> tuple[Mesh, np.ndarray]:
     """
     from ..adapters.open3d_filters import ball_pivoting, oriented_normals
 
-    points, normals = _thinned(view)
+    points, normals = _thin(view)
     if normals is None:
         normals = oriented_normals(points)
         # from the axis along which normals are longest to the direction around which they lie
@@ -100,7 +100,7 @@ def spacing_of(points: np.ndarray) -> float:
     return float(np.sqrt(np.pi / 6) * np.median(cKDTree(points).query(few, 7)[0][:, 6]))
 
 
-def _thinned(cloud: PointCloud | np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def _thin(cloud: PointCloud | np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Points at different places, so many as a template needs, and their normals if they have any."""
     points = cloud.points if isinstance(cloud, PointCloud) else np.asarray(cloud, dtype=np.float64)
     normals = cloud.normals if isinstance(cloud, PointCloud) else None

@@ -23,10 +23,7 @@ from ..skeleton.symmetry import find_symmetry
 from ..words import number_of
 from .cloud import AWAY, mesh_of_cloud, mesh_of_view
 
-ONE_PIECE = 0.9                        # of the surface of a body that is one mesh hangs together
-MOST_FILLED = 0.05                     # of a surface, beyond which its shape is half a guess
 OFF = 0.01                             # metres from the template at which a landmark was clicked on something else
-UNEVEN = 0.03                          # of all triangles that one side may have more of than its area lets expect
 
 
 @dataclass(frozen=True)
@@ -75,8 +72,9 @@ class MadeTemplate:
     @property
     def doubts(self) -> list[str]:
         """What somebody should look at before scans are registered with it."""
+        # of a surface, beyond which its shape is half a guess
         return [*([f"{100 * self.filled:.0f}% of the surface is filled, nothing was scanned there"]
-                  if self.filled > MOST_FILLED else []),
+                  if self.filled > 0.05 else []),
                 *([f"the surface is joined to itself in {number_of(self.handles, 'place')}: thighs, armpits or "
                    "fingers that touch"]
                   if self.handles else [])]
@@ -113,7 +111,8 @@ def template_of_scan(scan: Mesh | PointCloud, faces: int = 14000, config: Templa
     if isinstance(scan, Mesh):
         body = scan.submesh(kept[scan.faces].all(axis=1))[0]
         mesh = repair(body)
-        if mesh.face_areas.sum() < ONE_PIECE * body.face_areas.sum():
+        # of the surface of a body that is one mesh hangs together
+        if mesh.face_areas.sum() < 0.9 * body.face_areas.sum():
             notes.append("its pieces lie side by side or over each other: their points were meshed anew")
             mesh = mesh_of_cloud(PointCloud(body.vertices, body.vertex_normals))
         elif template_problem(body):
@@ -175,7 +174,8 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     keep = None if landmarks is None else np.unique(cKDTree(mesh.vertices).query(landmarks)[1])
     small = _improve(decimate(mesh, faces, config.decimate, keep), surface, keep)
     balance = left_share(small)
-    if balance is not None and abs(balance - 0.5) > UNEVEN:
+    # of all triangles that one side may have more of than its area lets expect
+    if balance is not None and abs(balance - 0.5) > 0.03:
         # collapses of least error spend triangles on the noise of one side; those of shortest edges do not
         small = _improve(decimate(mesh, faces, replace(config.decimate, method="even")), surface, keep)
         notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, "

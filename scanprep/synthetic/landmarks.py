@@ -13,7 +13,7 @@ from .topology import load
 
 
 @lru_cache(maxsize=1)
-def _stored() -> dict[str, Any]:
+def _load() -> dict[str, Any]:
     return json.loads(Path(__file__).with_name("landmarks.json").read_text(encoding="utf-8"))
 
 
@@ -41,7 +41,7 @@ def _points() -> dict[str, np.ndarray]:
 
     place: dict[str, Callable[..., np.ndarray]] = {"body": body, "face": face, "limb": limb, "foot": foot}
     return {name: place[kind](*numbers)
-            for name, (kind, *numbers) in (_stored()["landmarks"] | _stored()["marker_places"]).items()}
+            for name, (kind, *numbers) in (_load()["landmarks"] | _load()["marker_places"]).items()}
 
 
 @lru_cache(maxsize=1)
@@ -62,14 +62,14 @@ def _vertices() -> dict[str, int]:
 
 def landmarks() -> dict[str, int]:
     """Name -> vertex of the anatomical landmarks."""
-    return {full: _vertices()[full] for name in _stored()["landmarks"]
+    return {full: _vertices()[full] for name in _load()["landmarks"]
             for full in ([name.format("left"), name.format("right")] if "{}" in name else [name])}
 
 
 def markers() -> dict[str, int]:
     """Label -> vertex of a set of 41 motion-capture markers, labelled as in the CMU recordings."""
     out = {side[0].upper() + label: _vertices()[name.format(side)]
-           for label, name in _stored()["markers"].items() for side in ("left", "right")}
-    out.update({label: _vertices()[name] for label, name in _stored()["middle_markers"].items()})
+           for label, name in _load()["markers"].items() for side in ("left", "right")}
+    out.update({label: _vertices()[name] for label, name in _load()["middle_markers"].items()})
     out["RBAC"] = _vertices()["right scapula"]
     return out

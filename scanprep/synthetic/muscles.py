@@ -70,7 +70,24 @@ def drivers(anatomy: Anatomy, axes: np.ndarray, relative: np.ndarray) -> np.ndar
         out[COLUMNS[name, side]] += anatomy.scale * value
 
     for side, sign, arm, leg in (("l", 1, 4, 10), ("r", -1, 7, 13)):
-        _arm_drivers(put, side, sign, axes, relative, arm, strong, soft)
+        flexion = _bend(axes, relative, arm, arm + 1)
+        f = np.sin(np.clip(flexion, -0.5, 2.6) / 2) * 1.15
+        put("biceps", side, strong * f)
+        put("triceps", side, -0.5 * strong * f)
+        put("elbow_fold", side, max(f, 0))
+        put("olecranon", side, f)
+        put("flexors", side, 0.8 * (0.5 * strong + 0.5 * soft) * f)
+        change = relative[arm] @ axes[arm] - axes[arm]
+        up, fore, across = change[2], -change[1], -sign * change[0]
+        rotvec = rotations.log(relative[arm + 2])
+        put("brachioradialis", side, -0.7 * sign * twist_about(rotvec, axes[arm + 1]) * strong)
+        put("deltoid", side, strong * up / 1.3)
+        put("shoulder_cap", side, up / 1.5)
+        put("pectoral", side, strong * (0.8 * fore + 0.3 * across - 0.45 * up))
+        put("scapula_in", side, -0.8 * up - 0.4 * fore)
+        put("scapula_out", side, 0.8 * up + 0.3 * fore)
+        put("lat", side, strong * 0.7 * up)
+        put("trapezius", side, strong * 0.7 * up)
         _leg_drivers(put, side, sign, axes, relative, leg, strong, soft)
     spine = relative[1] @ relative[2] @ np.array([0, 0, 1.0])
     bend, lean = -spine[1], spine[0]
@@ -91,28 +108,6 @@ def _bend(axes: np.ndarray, relative: np.ndarray, parent: int, part: int) -> flo
     """Change of the angle between two bones against rest, radians."""
     rest = np.arccos(np.clip(axes[parent] @ axes[part], -1, 1))
     return float(np.arccos(np.clip(axes[parent] @ relative[part] @ axes[part], -1, 1)) - rest)
-
-
-def _arm_drivers(put: Put, side: str, sign: int, axes: np.ndarray, relative: np.ndarray, arm: int, strong: float,
-                 soft: float) -> None:
-    flexion = _bend(axes, relative, arm, arm + 1)
-    f = np.sin(np.clip(flexion, -0.5, 2.6) / 2) * 1.15
-    put("biceps", side, strong * f)
-    put("triceps", side, -0.5 * strong * f)
-    put("elbow_fold", side, max(f, 0))
-    put("olecranon", side, f)
-    put("flexors", side, 0.8 * (0.5 * strong + 0.5 * soft) * f)
-    change = relative[arm] @ axes[arm] - axes[arm]
-    up, fore, across = change[2], -change[1], -sign * change[0]
-    rotvec = rotations.log(relative[arm + 2])
-    put("brachioradialis", side, -0.7 * sign * twist_about(rotvec, axes[arm + 1]) * strong)
-    put("deltoid", side, strong * up / 1.3)
-    put("shoulder_cap", side, up / 1.5)
-    put("pectoral", side, strong * (0.8 * fore + 0.3 * across - 0.45 * up))
-    put("scapula_in", side, -0.8 * up - 0.4 * fore)
-    put("scapula_out", side, 0.8 * up + 0.3 * fore)
-    put("lat", side, strong * 0.7 * up)
-    put("trapezius", side, strong * 0.7 * up)
 
 
 def _leg_drivers(put: Put, side: str, sign: int, axes: np.ndarray, relative: np.ndarray, leg: int, strong: float,

@@ -59,7 +59,7 @@ class Person:
 
         `pose[0]` turns the body about `joints[0]`.
         """
-        pose = _checked(pose)
+        pose = _check(pose)
         return self._poser(pose) + (0 if trans is None else np.asarray(trans, dtype=np.float64))
 
     def posed_joints(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
@@ -67,17 +67,17 @@ class Person:
 
         `posed_joints(pose)[0]` is `joints[0] + trans`.
         """
-        pose = _checked(pose)
+        pose = _check(pose)
         joints = self._poser.part_motion(pose)[1] + self._poser.settling(pose)
         joints[0] = self.joints[0]
         return joints + (0 if trans is None else np.asarray(trans, dtype=np.float64))
 
     def part_rotations(self, pose: np.ndarray) -> np.ndarray:
         """World rotations (16, 3, 3) of the parts in a pose."""
-        return self._poser.part_motion(_checked(pose))[0]
+        return self._poser.part_motion(_check(pose))[0]
 
 
-def _checked(pose: np.ndarray) -> np.ndarray:
+def _check(pose: np.ndarray) -> np.ndarray:
     pose = np.asarray(pose, dtype=np.float64)
     if pose.shape != (len(PARTS), 3) or not np.isfinite(pose).all():
         raise ValueError(f"pose: expected finite rotation vectors ({len(PARTS)}, 3), got shape {pose.shape}")

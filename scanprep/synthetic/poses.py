@@ -97,11 +97,11 @@ def named_pose(name: str) -> np.ndarray:
     """A pose (16, 3), radians, by its name in `NAMED_POSES`."""
     if name not in NAMED_POSES:
         raise ValueError(f"name: no pose '{name}', expected one of {', '.join(NAMED_POSES)}")
-    return _named(name).copy()
+    return _read_pose(name).copy()
 
 
 @cache
-def _named(name: str) -> np.ndarray:
+def _read_pose(name: str) -> np.ndarray:
     return compose(**_STORED["named"][name])
 
 
@@ -169,7 +169,7 @@ def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for foot in (12, 15):
         toe = a.ends[foot] * [1, 1, 0]
         heel = a.joints[foot] * [1, 1, 0] + [0, 0.055, 0]
-        soles.append([_carried(a, pose, foot, np.stack([heel, toe])) for pose in poses])
+        soles.append([_carry(a, pose, foot, np.stack([heel, toe])) for pose in poses])
     points = np.swapaxes(np.array(soles), 0, 1).reshape(len(poses), 4, 3)
     lowest = points[:, :, 2].min(axis=1)
     weight = np.exp(-(points[:, :, 2] - lowest[:, None]) / 0.01)
@@ -182,7 +182,7 @@ def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return -smooth, advance
 
 
-def _carried(a: Anatomy, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:
+def _carry(a: Anatomy, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:
     chain = [part]
     while PARENTS[chain[-1]] >= 0:
         chain.append(int(PARENTS[chain[-1]]))

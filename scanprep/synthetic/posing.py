@@ -26,7 +26,7 @@ class Poser:
         self.joints = anatomy.joints
         self.axes = anatomy.ends - anatomy.joints
         self.axes = self.axes / np.linalg.norm(self.axes, axis=1, keepdims=True)
-        smooth = _smoothed(vertices)
+        smooth = _smooth(vertices)
         self._coordinates = np.einsum("nij,ni->nj", _detail_frames(smooth, template.mesh.faces), vertices - smooth)
         self._root_vertices = np.flatnonzero(template.part_of_vertex == 0)
 
@@ -54,33 +54,18 @@ class Poser:
 
     def __call__(self, pose: np.ndarray) -> np.ndarray:
         """Vertices (N, 3) in a pose (16, 3), part 0 centred where it was at rest."""
-        x = self._moved(pose)
+        x = self._move(pose)
         return x + (self.root - x[self._root_vertices].mean(axis=0))
 
     def settling(self, pose: np.ndarray) -> np.ndarray:
         """The shift (3,) that brings the centroid of part 0 back to where it was at rest, metres."""
-        return self.root - self._moved(pose)[self._root_vertices].mean(axis=0)
+        return self.root - self._move(pose)[self._root_vertices].mean(axis=0)
 
-    def _moved(self, pose: np.ndarray) -> np.ndarray:
+    def _move(self, pose: np.ndarray) -> np.ndarray:
         relative = rotations.exp(pose)
-        x = self._bulged(relative)
-        x = self._twisted(x, pose)
-        shift = self.girdle(relative)
-        for arm, field in zip((4, 7), girdle_masks(), strict=True):
-            x = x + (field * self.weights[:, 2])[:, None] * shift[arm]
-        R, place = self.part_motion(pose)
-        x = _dual_quaternion_blend(x, self.weights, self.main, R, place - np.einsum("pij,pj->pi", R, self.joints))
-        smooth = _smoothed(x)
-        mushed = smooth + np.einsum("nij,nj->ni", _detail_frames(smooth, load().mesh.faces), self._coordinates)
-        blend = mush_mask()[:, None]
-        return x + blend * (mushed - x)
-
-    def _bulged(self, relative: np.ndarray) -> np.ndarray:
         amounts = drivers(self.anatomy, self.axes, relative)
-        return self.rest + (masks() @ amounts)[:, None] * self.normals
-
-    def _twisted(self, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Turn the skin about the bones, so that a twist spreads along a limb."""
+        x = self.rest + (masks() @ amounts)[:, None] * self.normals
+        # turn the skin about the bones, so that a twist spreads along a limb
         for part, share in twist_shares():
             axis = self.axes[part if part not in (6, 9) else part - 1]
             twist = twist_about(pose[part], axis)
@@ -91,7 +76,15 @@ class Poser:
                 turn = Rotation.from_rotvec(angle[near, None] * axis)
                 x = x.copy()
                 x[near] = base + turn.apply(x[near] - base)
-        return x
+        shift = self.girdle(relative)
+        for arm, field in zip((4, 7), girdle_masks(), strict=True):
+            x = x + (field * self.weights[:, 2])[:, None] * shift[arm]
+        R, place = self.part_motion(pose)
+        x = _dual_quaternion_blend(x, self.weights, self.main, R, place - np.einsum("pij,pj->pi", R, self.joints))
+        smooth = _smooth(x)
+        mushed = smooth + np.einsum("nij,nj->ni", _detail_frames(smooth, load().mesh.faces), self._coordinates)
+        blend = mush_mask()[:, None]
+        return x + blend * (mushed - x)
 
 
 @lru_cache(maxsize=1)
@@ -148,7 +141,7 @@ def _smoothstep(x: np.ndarray) -> np.ndarray:
     return x * x * (3 - 2 * x)
 
 
-def _smoothed(x: np.ndarray, rounds: int = 8) -> np.ndarray:
+def _smooth(x: np.ndarray, rounds: int = 8) -> np.ndarray:
     mean = neighbour_mean()
     for _ in range(rounds):
         x = 0.4 * x + 0.6 * (mean @ x)

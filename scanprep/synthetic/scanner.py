@@ -125,7 +125,7 @@ def _view(mesh: Mesh, rays: Rays, config: ScannerConfig, number: int, rng: np.ra
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     directions = pixel_rays((height, width), K, T[:3, :3]).reshape(-1, 3)
     face, measured = rays.cast(np.broadcast_to(camera, directions.shape), directions)
-    measured = _measured(mesh, rays, config, camera, directions, face, measured, rng)
+    measured = _measure(mesh, rays, config, camera, directions, face, measured, rng)
     seen = np.isfinite(measured)
     triangles = _triangulate(measured.reshape(height, width), config)
     points = camera + np.where(seen, measured, 0)[:, None] * directions
@@ -137,7 +137,7 @@ def _view(mesh: Mesh, rays: Rays, config: ScannerConfig, number: int, rng: np.ra
     return RangeView(surface, surface.vertex_normals, camera, T, kept.reshape(height, width), K)
 
 
-def _measured(mesh: Mesh, rays: Rays, config: ScannerConfig, camera: np.ndarray, directions: np.ndarray,
+def _measure(mesh: Mesh, rays: Rays, config: ScannerConfig, camera: np.ndarray, directions: np.ndarray,
               face: np.ndarray, distance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Distances with noise; NaN where the ray missed, grazed, was lost or fell into a blind region."""
     hit = np.flatnonzero(face >= 0)

@@ -60,7 +60,12 @@ def blending() -> tuple[np.ndarray, np.ndarray]:
         np.add.at(share, (mesh.faces[:, corner], template.part_of_face), mesh.face_areas / 3)
     share /= share.sum(axis=1, keepdims=True)
     a, b = mesh.edges.T
-    width = _blend_width(template)
+    # over how many metres (N,) the motion of one part passes into that of the next
+    wide = {1: 0.075, 2: 0.075, 3: 0.040, 4: 0.052, 5: 0.030, 6: 0.020, 10: 0.060, 11: 0.034, 12: 0.020}
+    v = np.abs(template.mesh.vertices * [1, 0, 0]) + template.mesh.vertices * [0, 1, 1]
+    d = np.stack([np.linalg.norm(v - template.anatomy.joints[j], axis=1) for j in wide], axis=1)
+    near = np.exp(-0.5 * ((d - d.min(axis=1, keepdims=True)) / 0.04)**2)
+    width = near @ np.array(list(wide.values())) / near.sum(axis=1)
     results = []
     for spread in (1.3, 1.0):
         w = (spread * 0.5 * (width[a] + width[b]) / mesh.edge_lengths)**2 / 6
@@ -69,15 +74,6 @@ def blending() -> tuple[np.ndarray, np.ndarray]:
         weights = solve(solve(share))
         results.append(weights / weights.sum(axis=1, keepdims=True))
     return results[0], results[1]
-
-
-def _blend_width(template: Template) -> np.ndarray:
-    """Over how many metres (N,) the motion of one part passes into that of the next."""
-    wide = {1: 0.075, 2: 0.075, 3: 0.040, 4: 0.052, 5: 0.030, 6: 0.020, 10: 0.060, 11: 0.034, 12: 0.020}
-    v = np.abs(template.mesh.vertices * [1, 0, 0]) + template.mesh.vertices * [0, 1, 1]
-    d = np.stack([np.linalg.norm(v - template.anatomy.joints[j], axis=1) for j in wide], axis=1)
-    near = np.exp(-0.5 * ((d - d.min(axis=1, keepdims=True)) / 0.04)**2)
-    return near @ np.array(list(wide.values())) / near.sum(axis=1)
 
 
 @lru_cache(maxsize=1)
@@ -131,7 +127,7 @@ def carry(shape: BodyShape, stages: int = 3) -> tuple[np.ndarray, Anatomy]:
         wanted = np.einsum("np,pij,nj->ni", weights, total, offset)
         gradient = None
         for _ in range(2):
-            vertices, gradient = _relaxed(field, vertices, wanted, gradient)
+            vertices, gradient = _relax(field, vertices, wanted, gradient)
         before = now
     value, gradient = _symmetric(field, vertices)
     step = np.clip(value / np.maximum((gradient**2).sum(axis=1), 0.1), -0.005, 0.005)
@@ -155,7 +151,7 @@ def _symmetric(field: Field, vertices: np.ndarray, gradient: np.ndarray | None =
     return value, gradient
 
 
-def _relaxed(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
+def _relax(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
             ) -> tuple[np.ndarray, np.ndarray]:
     """One Newton step onto the surface, then tangential steps towards the canonical neighbourhoods."""
     value, gradient = _symmetric(field, vertices, gradient)

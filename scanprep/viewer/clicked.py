@@ -22,8 +22,6 @@ from ..pictures.shading import CLAY, Dots, Shape, Solid
 from ..pictures.thinning import thinned
 from .surface_clicks import Clickable
 
-MOST_DOTS = 150_000                  # of a cloud
-TRIED = 1500                         # points of a body by which it is turned as another
 KEPT = ".before"                     # ending of the copy of a landmark file as it was found
 
 Places = dict[str, np.ndarray]
@@ -92,8 +90,9 @@ class Clicked:
         """What is drawn of it: no more triangles or points than one can see."""
         if self._shown is None:
             shape, points = self.body.shape, self.body.points
+            # of a cloud
             self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
-                Dots(points[::max(1, len(points) // MOST_DOTS)], CLAY, 0.004)
+                Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
         return self._shown
 
 
@@ -147,7 +146,8 @@ def camera_like(first: Camera, template: np.ndarray, body: Mesh | np.ndarray,
         flat = flat / np.linalg.norm(flat)
         right = np.cross(camera.vertical, flat)
         back, across = np.cos(turn) * flat + np.sin(turn) * right, np.cos(turn) * right - np.sin(turn) * flat
-        few = all_points[np.random.default_rng(0).permutation(len(all_points))[:TRIED]]
+        # points of a body by which it is turned as another
+        few = all_points[np.random.default_rng(0).permutation(len(all_points))[:1500]]
         found = few @ np.stack([across, camera.vertical, back]).T
         return np.asarray((found - np.median(found, axis=0)) / max(float(np.ptp(found[:, 1])), 1e-12))
 

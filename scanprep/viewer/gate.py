@@ -8,7 +8,6 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 LONGEST_LINE = 200                   # characters of one line about a request
 LONGEST_NAME = 120                   # characters of the name of a stored file
-OPENINGS = 16                        # addresses for one use that may be unused at a time
 
 
 class Gate:
@@ -29,7 +28,8 @@ class Gate:
 
     def opening(self) -> str:
         """A token for one use: other users of the machine can see the command line of a browser that starts."""
-        self._openings = [*self._openings[1 - OPENINGS:], secrets.token_urlsafe(32)]
+        # addresses for one use that may be unused at a time
+        self._openings = [*self._openings[1 - 16:], secrets.token_urlsafe(32)]
         return self._openings[-1]
 
     def use(self, opening: str) -> bool:

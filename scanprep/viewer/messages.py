@@ -15,7 +15,6 @@ from typing import Any
 from ..geometry import storage
 
 LENGTH = struct.Struct("<I")
-ALIGNED = 8                          # bytes: data begin at a multiple of this
 KEYS = {"kind": str, "latest": str, "number": int, "fields": dict}
 
 
@@ -48,7 +47,8 @@ class Message:
         header = {"kind": self.kind, "latest": self.latest, "number": self.number,
                   "fields": storage.as_json(dict(self.fields))}
         text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode("utf-8")
-        text += b" " * (-(len(text) + LENGTH.size) % ALIGNED)
+        # bytes: data begin at a multiple of this
+        text += b" " * (-(len(text) + LENGTH.size) % 8)
         return LENGTH.pack(len(text)) + text + self.data
 
     @classmethod

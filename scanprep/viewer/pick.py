@@ -33,7 +33,6 @@ ENOUGH = 4                           # landmarks from which the others can be pr
 # of a scan's size, 13 cm on a person: of 192 landmarks predicted after four the worst was 7 cm off; left and right of
 # one kind are 15 cm apart or more, but for the eyes, 7 cm
 FAR = 0.06
-SLIDES = -1                          # movements by key are one as long as they follow each other
 
 
 @dataclass(frozen=True)
@@ -108,17 +107,15 @@ class PickApp:
     def state(self) -> Message:
         """Everything but the bodies."""
         with self._lock:
-            return Message("state", {**self._state(), **self.more()}, latest="state")
-
-    def _state(self) -> dict[str, Any]:
-        shown = [self.template, *([self.scan] if self.scan else [])]
-        return {
-            "names": list(self.names), "chosen": self.chosen, "fixed": self.fixed, "note": self.note,
-            "panes": [{"places": _lists(one.places), "predicted": _lists(one.predicted), "file": one.file.name}
-                      for one in shown],
-            "scan": self.current, "scans": [{"name": one.path.name, "count": len(one.places)} for one in self.scans],
-            "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": ENOUGH,
-            "question": self.question}
+            shown = [self.template, *([self.scan] if self.scan else [])]
+            return Message("state", {
+                "names": list(self.names), "chosen": self.chosen, "fixed": self.fixed, "note": self.note,
+                "panes": [{"places": _lists(one.places), "predicted": _lists(one.predicted), "file": one.file.name}
+                          for one in shown],
+                "scan": self.current,
+                "scans": [{"name": one.path.name, "count": len(one.places)} for one in self.scans],
+                "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": ENOUGH,
+                "question": self.question, **self.more()}, latest="state")
 
     def more(self) -> dict[str, Any]:
         """What an app that is built on this one adds to the state."""
@@ -165,18 +162,14 @@ class PickApp:
         self._change(self._number(pane), {self._named(name): place}, drag)
         if not drag:
             self.choose_next(name, pane)
-            self._ask_if_far(pane, name, place)
+            # a click on the scan that is far from where the landmark was predicted is questioned
+            expected = one.predicted.get(name)
+            away = 0.0 if expected is None else float(np.linalg.norm(place - expected))
+            if pane == SCAN and away > FAR * extent(one.body.points):
+                self.chosen, self.alternating = name, None
+                self.question = {"name": name, "away": away,
+                                 "text": f"This is {100 * away:.0f} cm from where “{name}” was expected: keep it?"}
         self._predict_if_time(send, pane)
-
-    def _ask_if_far(self, pane: int, name: str, place: np.ndarray) -> None:
-        """Question a click on the scan that is far from where the landmark was predicted."""
-        one = self._of(self._number(pane))
-        expected = one.predicted.get(name)
-        away = 0.0 if expected is None else float(np.linalg.norm(place - expected))
-        if pane == SCAN and away > FAR * extent(one.body.points):
-            self.chosen, self.alternating = name, None
-            self.question = {"name": name, "away": away,
-                             "text": f"This is {100 * away:.0f} cm from where “{name}” was expected: keep it?"}
 
     def on_keep(self, send: Send, name: str) -> None:
         """The landmark is where it should be, however far from where it was expected."""
@@ -186,7 +179,7 @@ class PickApp:
         """Move a landmark along a ray, metres: into the body, to where a joint is."""
         along = _point(direction)
         place = self._editable(pane).places[name] + by * along / np.linalg.norm(along)
-        self._change(self._number(pane), {name: place}, SLIDES)
+        self._change(self._number(pane), {name: place}, -1)         # by key: one as long as they follow each other
 
     def on_remove(self, send: Send, pane: int, name: str) -> None:
         """Take a landmark away."""
@@ -197,14 +190,12 @@ class PickApp:
 
     def on_swap(self, send: Send) -> None:
         """Exchange left and right of the scan: the commonest error of landmarks, and undone like any other change."""
-        places = self._editable(SCAN).places
-        others = {name: other_side(name) for name in places}
-        after = {other: places[name] for name, other in others.items() if other is not None}
-        gone = {name: None for name, other in others.items() if other is not None and name not in after}
+        one = self._editable(SCAN)
+        others = {name: other for name in one.places if (other := other_side(name)) is not None}
+        after = {other: one.places[name] for name, other in others.items()}
         if not after:
             raise ValueError("no landmark of the scan names a side")
-        self._change(self._number(SCAN), {**after, **gone})
-        one = self._of(self._number(SCAN))
+        self._change(self.current, {**after, **{name: None for name in others if name not in after}})
         one.predicted = {other_side(name) or name: place for name, place in one.predicted.items()}
 
     def on_choose(self, send: Send, name: str) -> None:
@@ -268,15 +259,12 @@ class PickApp:
     def _number(self, pane: int) -> int:
         return -1 if pane == TEMPLATE else self.current
 
-    def _of(self, number: int) -> Clicked:
-        return self.template if number < 0 else self.scans[number]
-
     def _editable(self, pane: int) -> Clicked:
         if pane == TEMPLATE and self.fixed:
             raise ValueError("the landmarks of the model are fixed; click on the scan")
         if pane not in (TEMPLATE, SCAN) or (pane == SCAN and self.scan is None):
             raise ValueError(f"pane: expected 0, the template, or 1, the scan, got {pane}")
-        return self._of(self._number(pane))
+        return self.template if pane == TEMPLATE else self.scans[self.current]
 
     def _named(self, name: str) -> str:
         name = " ".join(str(name).split())[:200]
@@ -288,8 +276,8 @@ class PickApp:
 
     def _change(self, number: int, after: Mapping[str, np.ndarray | None], drag: int = 0) -> None:
         """Set landmarks, remember what they were, save; the changes of one drag are one."""
-        one = self._of(number)
-        before = {name: one.places.get(name) for name in after}
+        places = (self.template if number < 0 else self.scans[number]).places
+        before = {name: places.get(name) for name in after}
         last = self.done[-1] if self.done else None
         if drag and last and (last.drag, last.body, *last.after) == (drag, number, *after):
             before = dict(self.done.pop().before)
@@ -298,7 +286,7 @@ class PickApp:
         self._set(number, after)
 
     def _set(self, number: int, places: Mapping[str, np.ndarray | None]) -> None:
-        one = self._of(number)
+        one = self.template if number < 0 else self.scans[number]
         for name, place in places.items():
             if place is None:
                 one.places.pop(name, None)

@@ -34,8 +34,6 @@ __all__ = ["App", "Message", "Send", "Server", "Stopped", "serve"]
 
 ADDRESS = "127.0.0.1"
 GRACE = 0.5                          # seconds that work gets to end
-LARGEST_REQUEST = 2**20              # bytes of a request that is no file
-STRANGERS = 64                       # connections at a time that have not shown the token; a browser opens six
 HERE = Path(__file__).parent
 
 
@@ -48,7 +46,8 @@ class _Door(HTTPServer):
 
     def handle_stream(self, stream: IOStream, address: tuple[str, int]) -> None:
         self.strangers = [one for one in self.strangers if not one.closed()]
-        if len(self.strangers) >= STRANGERS:         # each takes a file from this process, which may have few
+        # connections at a time that have not shown the token; a browser opens six
+        if len(self.strangers) >= 64:         # each takes a file from this process, which may have few
             self.strangers.pop(0).close()
         self.strangers.append(stream)
         super().handle_stream(stream, address)
@@ -90,7 +89,8 @@ class Server:
 
     def __enter__(self) -> Server:
         self.dropped = Path(tempfile.mkdtemp(prefix="scapekit-"))
-        self._worker, self._greeter = Worker("scapekit work", self._failed), Worker("scapekit greeting", self._failed)
+        self._worker = Worker("scapekit work", self._report_failure)
+        self._greeter = Worker("scapekit greeting", self._report_failure)
         self._thread.start()
         assert self._ready.wait(10), "the server did not start"
         return self
@@ -153,7 +153,7 @@ class Server:
         except RuntimeError:
             raise Stopped from None
 
-    def _failed(self, problem: BaseException) -> None:
+    def _report_failure(self, problem: BaseException) -> None:
         """A job failed: the tabs are told; the terminal too, once, where nobody foresaw it."""
         text = str(problem)
         if not isinstance(problem, ValueError):
@@ -173,7 +173,8 @@ class Server:
             routes, default_handler_class=handlers.Unknown, default_handler_args=own,      # type: ignore[arg-type]
             log_function=lambda handler: None, websocket_max_message_size=handlers.LARGEST_MESSAGE,
             websocket_ping_interval=30)
-        self._door = server = _Door(application, max_body_size=LARGEST_REQUEST)
+        # bytes of a request that is no file
+        self._door = server = _Door(application, max_body_size=(2**20))
         server.add_sockets(self._sockets)
         self._loop, self._ending = asyncio.get_running_loop(), asyncio.Event()
         self._ready.set()
@@ -194,7 +195,7 @@ def serve(app: App, port: int | None = None, open_browser: bool = True, say: Cal
         Start the browser of this machine, unless the user is logged in from another one.
     """
     remote = "SSH_CONNECTION" in os.environ
-    with contextlib.suppress(KeyboardInterrupt), _terminated_as_interrupted(), Server(app, port, say) as server:
+    with contextlib.suppress(KeyboardInterrupt), _terminate_as_interrupt(), Server(app, port, say) as server:
         say(f"{one_line(app.title)}: {server.address}\nCtrl-C ends it")
         if remote or not open_browser:
             say(f"from another machine: ssh -N -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
@@ -222,7 +223,7 @@ def _has_screen() -> bool:
 
 
 @contextlib.contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
+def _terminate_as_interrupt() -> Iterator[None]:
     """SIGTERM ends the block as Ctrl-C does."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -10,9 +10,6 @@ from ..geometry.mesh import Mesh
 from ..geometry.places import spacing
 from ..geometry.surface import Rays, Surface
 
-BESIDE = 1e-6                        # of the size: so far behind a hit a ray goes on
-BY, DEEP = 4.0, 8.0                  # spacings of a cloud: from the ray to points, and along it
-
 
 @dataclass(frozen=True, eq=False)
 class Clickable:
@@ -65,10 +62,11 @@ class Clickable:
     def _point_along(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         along = (self.points - origin) @ direction
         aside = np.linalg.norm(self.points - origin - along[:, None] * direction, axis=1)
-        near = np.flatnonzero((aside < BY * self._spacing) & (along > 0))
+        # spacings of a cloud: from the ray to points, and along it
+        near = np.flatnonzero((aside < 4.0 * self._spacing) & (along > 0))
         if not len(near):
             return None
-        front = near[along[near] < along[near].min() + DEEP * self._spacing]
+        front = near[along[near] < along[near].min() + 8.0 * self._spacing]
         return self.points[front[aside[front].argmin()]].copy()
 
     def middle(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
@@ -78,7 +76,8 @@ class Clickable:
             return None
         direction = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
         size = float(np.ptp(self.points, axis=0).max())
-        last = self.hit(first + BESIDE * size * direction, direction)
+        # of the size: so far behind a hit a ray goes on
+        last = self.hit(first + 1e-6 * size * direction, direction)
         return None if last is None else (first + last) / 2
 
     def nearest(self, point: np.ndarray) -> np.ndarray:

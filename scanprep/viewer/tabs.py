@@ -9,7 +9,6 @@ from .messages import Message
 from .waiting import Waiting
 
 LONGEST_QUEUE = 2**29                # bytes that wait for one tab; beyond, it is closed, and greeted when it returns
-REMEMBERED = 4096                    # tabs whose last message is known
 ACKNOWLEDGED = "acknowledged"
 
 Frames = Iterable[tuple[bytes, str]]
@@ -125,5 +124,6 @@ class Tabs:
     def _remember(self, name: str, number: int) -> None:
         self._last[name] = number
         self._last.move_to_end(name)
-        while len(self._last) > REMEMBERED:
+        # tabs whose last message is known
+        while len(self._last) > 4096:
             self._last.popitem(last=False)

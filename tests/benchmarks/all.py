@@ -42,7 +42,7 @@ RESULTS = HERE / "results"
 MARKS = "<!-- figures -->", "<!-- end of figures -->"       # in the README
 MODELS = {"MEN": "learning", "FOLD_0": "scape_5fold"}      # and the benchmarks that learn them
 PEERS = ("open3d", "pymeshlab", "trimesh", "meshmonk", "pycpd", "pyfmaps", "py-dem-bones", "pymeshfix", "pyfqmr",
-         "pymomentum-core", "opensim", "usd-core")
+         "pymomentum-core", "opensim")
 
 
 @cache

@@ -77,7 +77,7 @@ BENCHMARKS = (
     Benchmark("scape_5fold", "Held-out poses (SCAPE-5fold)", "scape_5fold.py --keep FOLD_0", models.poses,
               "Skeleton and model from the training poses of the fold alone. Seen on held-out poses while deciding: "
               "refinements on fold 0 and on coarse copies of folds 0 and 1; the width of blending on fold 1; that "
-              "more parts help at all, and the radial features, on folds 1 and 3. A pose fit has three numbers a "
+              "more parts help at all, on folds 1 and 3. A pose fit has three numbers a "
               "part, so some of the gain of more parts is freedom of the fit. Where we lose: deep squats and seated "
               "poses.",
               quick="scape_5fold.py --keep FOLD_0 --folds 0 --kinds LBS 'LBS + linear correctives' 'SCAPE, linear'"),

@@ -15,7 +15,7 @@ import time
 import numpy as np
 from protocols import machine, write_report
 
-from model import LearnConfig, learn_scape
+from model import learn_scape
 from model.body import BodyModel
 from model.fitting.vertices import FitConfig, PoseFitter, ShapeFitter
 from model.learning.mixing import MIX, learn_scape_mix
@@ -67,7 +67,7 @@ def acquaintances(model: BodyModel, scans: np.ndarray) -> float:
     return float(np.mean(errors))
 
 
-def run(stage: Stage, seed: int, features: str, held: int) -> dict[str, object]:
+def run(stage: Stage, seed: int, held: int) -> dict[str, object]:
     """One seed: both designs, learned and measured."""
     rng = np.random.default_rng(seed)
     mixed, who = stage.people(30, 3, rng), np.repeat(np.arange(30), 3)
@@ -75,14 +75,10 @@ def run(stage: Stage, seed: int, features: str, held: int) -> dict[str, object]:
     new, known = stage.people(held, 1, rng), stage.people(held // 2, 3, rng)
     known = known.reshape(held // 2, 3, *known.shape[1:])
     result = dict[str, object](seed=seed)
-    separated = {"linear": LearnConfig(), "quadratic": LearnConfig(features="quadratic", prunings=(0.01,))}
-    designs = {
-        "mixed 30 x 3": lambda: learn_scape_mix(stage.template, mixed, who.tolist(), stage.skeleton,
-                                                dataclasses.replace(MIX, features=features))}
-    for kind, config in separated.items():
-        for count in (45, 60):
-            designs[f"separated {count} + {90 - count}, {kind}"] = lambda config=config, count=count: learn_scape(
-                stage.template, poses[:count], others[:90 - count], stage.skeleton, config)
+    designs = {"mixed 30 x 3": lambda: learn_scape_mix(stage.template, mixed, who.tolist(), stage.skeleton)}
+    for count in (45, 60):
+        designs[f"separated {count} + {90 - count}"] = lambda count=count: learn_scape(
+            stage.template, poses[:count], others[:90 - count], stage.skeleton)
     for name, learn in designs.items():
         begin = time.perf_counter()
         model = learn()
@@ -91,7 +87,7 @@ def run(stage: Stage, seed: int, features: str, held: int) -> dict[str, object]:
                         "new_people_20_betas": strangers(model, new, 20),
                         "new_people_29_betas": strangers(model, new, 29),
                         "known_people_mm": acquaintances(model, known),
-                        **{k: model.info[k] for k in ("rounds", "held_out_errors", "ridge", "pruning", "features")
+                        **{k: model.info[k] for k in ("rounds", "ridge", "pruning", "features")
                            if k in model.info}}
         print(seed, name, result[name], flush=True)
     return result
@@ -104,13 +100,12 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=2000, help="triangles of the bodies; all of them at 18756")
     parser.add_argument("--held", type=int, default=20, help="new people in new poses")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--features", default=MIX.features, help="of the mix")
     args = parser.parse_args()
     stage = Stage(args.faces)
-    runs = [run(stage, seed, args.features, args.held) for seed in args.seeds]
+    runs = [run(stage, seed, args.held) for seed in args.seeds]
     report: dict[str, object] = {
         "protocol": "synthetic people, 90 meshes, true skeleton", "faces": len(stage.template.faces), "held": args.held,
-        "features": args.features, "config": dataclasses.asdict(MIX), "machine": machine(), "runs": runs}
+        "config": dataclasses.asdict(MIX), "machine": machine(), "runs": runs}
     for against in [name for name in runs[0] if name.startswith("separated")]:
         for what in ("new_people", "new_people_20_betas", "new_people_29_betas"):
             ratio = [r["mixed 30 x 3"][what]["mean_mm"] / r[against][what]["mean_mm"] for r in runs]

@@ -3,23 +3,20 @@
     python tests/benchmarks/other_programs.py --folder DIR [-m MODEL.npz --motion MOTION.npz] [-o FILE]
         [--bpy PYTHON] [--npm DIR]
 
-The motion, else a walk of a synthetic person, is exported as GLB, BVH, USD (skinned, and as points) and, by the command
-of model/README.md, FBX, a body at rest as static GLB. Every file is opened in Blender (a Python that has `bpy`, named
-by `--bpy` or `$BPY`), USD in usd-core too, GLB in three.js (headless Chromium, skinned on the processor); the Khronos
-validator checks GLB. `--npm` or `$NPM` is a folder in which `npm install three gltf-validator` was called. Programs
-that are not there are left out. The result holds a row
-for each file and program; a new file is a new entry of `cases`, a new program a new entry of `PROGRAMS`.
+The motion, else a walk of a synthetic person, is exported as GLB, BVH and, by the command of model/README.md, FBX, a
+body at rest as static GLB. Every file is opened in Blender (a Python that has `bpy`, named by `--bpy` or `$BPY`), GLB
+in three.js (headless Chromium, skinned on the processor); the Khronos validator checks GLB. `--npm` or `$NPM` is a
+folder in which `npm install three gltf-validator` was called. Programs that are not there are left out. The result
+holds a row for each file and program; a new file is a new entry of `cases`, a new program one of `PROGRAMS`.
 """
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -91,14 +88,6 @@ def cases(model_file, motion_file, folder):
     write_bvh(path("rerooted.bvh"), ready.skeleton, poses, trans, motion.rate, "cm", up, ready.mesh)
     joints = joint_places(ready.skeleton, poses[frames], trans[frames]) @ U
     found["rerooted.bvh"] = joints, times, ready.skeleton.names
-    if importlib.util.find_spec("pxr"):
-        from model.export.usd import write_points_usd, write_skinned_usd
-
-        write_skinned_usd(path("rerooted.usdc"), ready, poses, trans, motion.rate, up)
-        found["rerooted.usdc"] = found["rerooted.glb"]
-        every = (motion.vertices(subject, np.array([t]))[0] for t in range(len(motion.poses)))
-        write_points_usd(path("motion.points.usdc"), subject.template, every, len(motion.poses), motion.rate, up)
-        found["motion.points.usdc"] = found["rerooted.glb"]
     return {name: (path(name), *rest) for name, rest in found.items()}
 
 
@@ -195,18 +184,7 @@ def validated(asked, path):
             "messages": sorted({each["code"] for each in issues["messages"] if each["severity"] < 2})}
 
 
-def usd_core(asked, cases, folder):
-    """As `blender`, by the queries of UsdSkel and UsdGeom."""
-    if not importlib.util.find_spec("pxr"):
-        return {}
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from usd_reader import shown
-
-    return {name: shown(path, times * asked.rate) for name, (path, _, times, _) in cases.items()
-            if path.suffix == ".usdc"}
-
-
-PROGRAMS = {"usd-core": (usd_core, "folder"), "Blender": (blender, "bpy"), "three.js": (three, "npm")}
+PROGRAMS = {"Blender": (blender, "bpy"), "three.js": (three, "npm")}
 
 
 def main():

@@ -1,7 +1,7 @@
 """Registration of mesh000 to the virtual scans of `scans.py`: accuracy beside time.
 
     SCAPEKIT_DATA=... python tests/benchmarks/registration.py [--marks 10|7|4|0] [--front] [--set tuning|held]
-        [--poses 3,8] [--men 3] [--published] [--kept FOLDER] [-o FILE]
+        [--poses 3,8] [--men 3] [--published] [--method NAME] [--kept FOLDER] [-o FILE]
 
 With `--marks 0` the template is led by `register_unmarked`, with no click. What we lose at: the surface is right
 long before the correspondence is; skin slides over muscles, and nothing in the shape says by how much.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +24,7 @@ from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES, TestScan, erro
 from scanprep.judgement import size
 from scanprep.registration.figures import ScanFigures, figures_of, review
 from scanprep.registration.limbs import Doubt, limb_doubts
-from scanprep.registration.nonrigid import Registration, register, registration_problem
+from scanprep.registration.nonrigid import METHODS, Registration, register, registration_problem
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.repair import repaired
 from scanprep.registration.schedule import RegistrationConfig
@@ -113,13 +114,14 @@ def main() -> None:
     parser.add_argument("--poses", help="numbers of SCAPE poses instead of those of the set")
     parser.add_argument("--men", help="numbers of SPRING men instead of those of the set")
     parser.add_argument("--published", action="store_true", help="the registration of [SCAPE] instead of ours [Hahnel]")
+    parser.add_argument("--method", choices=METHODS, default="graph", help="how the template is brought near the scan")
     parser.add_argument("--kept", type=Path, help="folder for the registered vertices")
     parser.add_argument("-o", "--output", help="write all figures here")
     args = parser.parse_args()
     data = load_real()
     poses, men = (tuple(int(k) for k in text.split(",") if k) if text is not None else default
                   for text, default in zip((args.poses, args.men), SETS[args.chosen], strict=True))
-    config = RegistrationConfig.published() if args.published else RegistrationConfig()
+    config = replace(RegistrationConfig.published() if args.published else RegistrationConfig(), method=args.method)
     parts = person_parts(data.template)
     assert parts is not None, "the template is a person"
     judged: list[Judged] = []
@@ -138,6 +140,7 @@ def main() -> None:
     print("flags:", told)
     if args.output:
         write_report(args.output, {"marks": args.marks, "front": args.front, "published": args.published,
+                                 "method": args.method,
                                  "machine": machine(), "summary": summary, "flags": told, "rows": rows})
 
 

@@ -24,8 +24,7 @@ from scanprep.skeleton.tree import Skeleton
 SETTINGS = {
     "linear": LearnConfig(),
     "quadratic": LearnConfig(features="quadratic"),
-    "radial (kernel ridge)": LearnConfig(features="radial"),
-    "radial, support vectors": LearnConfig(features="radial", regressor="svr"),
+    "support vectors": LearnConfig(regressor="svr"),
     "linear, no refinement": LearnConfig(refinements=0),
     "linear, as published": LearnConfig.published(),
 }

@@ -23,7 +23,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration.graph_fit import start_fit
 from scanprep.registration.limbs import limb_doubts
 from scanprep.registration.matches import prepare
-from scanprep.registration.nonrigid import measured
+from scanprep.registration.nonrigid import measure_fit
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.repair import repaired
 
@@ -63,7 +63,7 @@ def put_right(data: RealData, parts: PersonParts, pose: int, degrees: int) -> No
     for limb in LIMBS:
         p = parts.skeleton.names.index(limb)
         x = rolled(data, parts, item.truth.vertices, p, np.radians(degrees))
-        before = measured(given, replace(start_fit(data.template, np.eye(4), 300), x=x, moved=0.0), item.scan)
+        before = measure_fit(given, replace(start_fit(data.template, np.eye(4), 300), x=x, moved=0.0), item.scan)
         after = repaired(data.template, item.scan, before, parts, landmarks)
         off = [1e3 * np.linalg.norm(fit.mesh.vertices - item.truth.vertices, axis=1)[part == p].mean()
                for fit in (before, after)]

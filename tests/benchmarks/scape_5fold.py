@@ -38,7 +38,7 @@ def scape(**settings: object) -> Learn:
 
 def rigid(template: Mesh, poses: np.ndarray, skeleton: Skeleton) -> BodyModel:
     """Parts that only turn, Q = I."""
-    model = learn_scape(template, poses, None, skeleton, replace(LearnConfig(), features="linear", refinements=0))
+    model = learn_scape(template, poses, None, skeleton, replace(LearnConfig(), refinements=0))
     return replace(model, pose_space=PoseSpace.identity(skeleton))
 
 
@@ -61,10 +61,9 @@ KINDS: dict[str, Learn] = {
     "LBS + linear correctives": skinning(True),
     "SCAPE, published": published,
     "SCAPE, published, 0.1 square radians": partial(published, pruning=0.1),
-    "SCAPE, linear": scape(features="linear"),
+    "SCAPE, linear": scape(),
     "SCAPE, quadratic": scape(features="quadratic"),
-    "SCAPE, radial": scape(features="radial"),
-    "SCAPE, support vectors": scape(features="radial", regressor="svr"),
+    "SCAPE, support vectors": scape(regressor="svr"),
     "BlendSCAPE": lambda template, poses, skeleton: learn_blendscape(template, poses, None, skeleton),
 }
 

@@ -1,21 +1,19 @@
 """The command `scape animate`."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
-from model.body import BodyModel
 from model.linear import Subject
 from model.posing.cli import read_subject
 from scanprep.arguments import Place
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import JUDGEMENT, Metric, Outcome, bar, judgement_of
-from scanprep.folders import FolderCommand, as_line, figure
+from scanprep.console import JUDGEMENT, Metric, Outcome
+from scanprep.folders import FolderCommand, as_line, do_one, figure
 from scanprep.geometry.files import list_files
 from scanprep.geometry.storage import read_json
 from scanprep.ranges import BETAS, Positive
@@ -28,17 +26,14 @@ from ..subject.person import PersonConfig
 from .motions import ENDINGS, MEAN_DISTANCE, is_motion, motion_among
 from .work import MEAN_ERROR, BetasTo, Work
 
-ERRORS = (MEAN_ERROR, MEAN_DISTANCE)         # of markers, or of the joint centres of another skeleton
 MarkersArg = Annotated[Path, Place("MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: Unit | None = None, rate: Positive | None = None,
-                    subject_prefix: str | None = None,
-                    retarget_to: Path | None = None, betas_to: Path | None = None,
-                    config: AnimateConfig = AnimateConfig(),   # noqa: B008
-                    person: PersonConfig = PersonConfig(),                                         # noqa: B008
-                    workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
+                    subject_prefix: str | None = None, retarget_to: Path | None = None, betas_to: Path | None = None,
+                    config: AnimateConfig = AnimateConfig(), person: PersonConfig = PersonConfig(),
+                    workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """The motion of a person from markers, and the person; or a motion of another skeleton on a body.
 
     A folder is worked through file by file, each into a folder of its name; called again, it goes on where it was,
@@ -78,28 +73,37 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         person: Settings of the person from markers.
         workers: Who works through the files of a folder.
     """
-    found = _files(markers)
+    found = list_files(markers, lambda path: path.suffix.lower() in READERS or motion_among(path),
+                       f"files ending in {', '.join(READERS)}, or motions ({', '.join(ENDINGS)})"
+                       ) if markers.is_dir() else []
+    names = [path.stem for path in found]
+    if twice := sorted({name for name in names if names.count(name) > 1}):      # written over each other
+        raise ValueError(f"{markers}: expected files of different names, {twice[0]} comes with several endings")
     if markers.is_file() and is_motion(markers) and (layout or subject_prefix):
         raise ValueError(f"{markers}: a motion has no markers; leave out --layout and --subject-prefix")
     loaded, name = read_model(model)
-    work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
+    body = loaded if subject == "markers" else body_of(loaded, subject, unit)
+    work = Work(loaded, name, None if layout is None else layout_or_file(layout),
+                body if isinstance(body, Subject) else None,
                 None if retarget_to is None else read_subject(loaded, retarget_to, unit),
                 None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix, rate,
                 config, person)
     settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
-        with bar("following the markers") as following:
-            done = space.run(work, [Task("motion", markers)], inside=following).only
-        return Outcome(output, done, settings, judgement=judgement_of(done),
-                       following=f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
-    folder = FolderCommand(("file",), "{} followed", _summary, _error, settings,
-                           lambda name, rows: [as_line(m) for m in rows if m.name in (JUDGEMENT, *ERRORS)])
-    return folder.carry_out("files", space, work, [Task(path.stem, path, path.stem) for path in found], workers)
+        return do_one("following the markers", space, work, Task("motion", markers), settings,
+                      f"open {output / 'report.html'}; {output / 'animation.glb'} is for 3D programs")
+    # millimetres, of markers or of the joint centres of another skeleton; 0 for a motion that was copied
+    errors = MEAN_ERROR, MEAN_DISTANCE
+    return FolderCommand(
+        ("file",), "{} followed", _summary, lambda rows: figure(rows, *errors), settings,
+        lambda name, rows: [as_line(m) for m in rows if m.name in (JUDGEMENT, *errors)],
+    ).carry_out("files", space, work, [Task(path.stem, path, path.stem) for path in found], workers)
 
 
 def _summary(results: Results, count: int) -> list[Metric]:
-    off = {name: _error(metrics) for name, metrics in results.values.items()}
-    markers = any(m.name == MEAN_ERROR for metrics in results.values.values() for m in metrics)
+    """The rows of the closing table."""
+    off = {name: figure(rows, MEAN_ERROR, MEAN_DISTANCE) for name, rows in results.values.items()}
+    markers = any(m.name == MEAN_ERROR for rows in results.values.values() for m in rows)
     rows = [Metric("files", count), Metric("done before", len(off) - len(results.fresh)),
             Metric("failed", len(results.failures))]
     if off:
@@ -107,30 +111,6 @@ def _summary(results: Results, count: int) -> list[Metric]:
         rows += [Metric(f"distance of {what}, mean of the files", float(np.mean(list(off.values()))), "mm"),
                  Metric(f"the same, worst file ({max(off, key=off.__getitem__)})", max(off.values()), "mm")]
     return rows
-
-
-def _error(metrics: Sequence[Metric]) -> float:
-    """Millimetres; 0 for a motion that was copied."""
-    return figure(metrics, *ERRORS)
-
-
-def _files(markers: Path) -> list[Path]:
-    """The file, or the files of markers and motions in a folder; those of one name would be written over each other."""
-    if not markers.is_dir():
-        return [markers]
-    found = list_files(markers, lambda path: path.suffix.lower() in READERS or motion_among(path),
-                       f"files ending in {', '.join(READERS)}, or motions ({', '.join(ENDINGS)})")
-    names = [p.stem for p in found]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"{markers}: expected files of different names, {twice[0]} comes with several endings")
-    return found
-
-
-def _subject(model: BodyModel, given: str | None, unit: Unit | None) -> Subject | None:
-    """Whose body it is; None when it is to be found from the markers."""
-    body = model if given == "markers" else body_of(model, given, unit)
-    return body if isinstance(body, Subject) else None
 
 
 def read_betas_to(path: Path, n_betas: int) -> BetasTo:

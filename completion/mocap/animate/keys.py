@@ -20,9 +20,7 @@ from ..files.text import table_numbers
 
 USUAL_RATE = 30.0                    # frames a second between keys
 MOST_FRAMES = 200_000                # nearly two hours of them; more are times in other units than seconds
-LEAST_TURN = 2 * np.pi               # degrees of the largest turn of a joint, below which the table may be in radians
 PLACE = ("trans_x", "trans_y", "trans_z")
-ANGLE = re.compile(r".+_r[xyz]")     # a column of joint_angles.csv
 
 
 def holds_keys(path: Path) -> bool:
@@ -31,7 +29,7 @@ def holds_keys(path: Path) -> bool:
         return False
     with storage.taking_apart(path, "a table"):
         head = tables.decoded(storage.read_bytes(path, "a table")).split("\n", 1)[0]
-    return any(ANGLE.fullmatch(word.strip(' "\r').lower()) for word in re.split("[,;\t]", head))
+    return any(re.fullmatch(".+_r[xyz]", word.strip(' "\r').lower()) for word in re.split("[,;\t]", head))
 
 
 def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float | None = None) -> BodyMotion:
@@ -80,9 +78,16 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     table = table_numbers(path, rows[1:], len(head), separator, fill=True)
     lines = [number for number, _ in rows[1:]]
     times = table[:, head.index("time")]
-    _check_times(path, times, lines)
+    wrong = np.flatnonzero(~np.isfinite(times) | np.r_[False, ~(np.diff(times) > 0)])
+    if len(wrong):
+        raise storage.StorageError(f"{path}: line {lines[wrong[0]]}: expected a time in seconds that is later than "
+                                   f"that of the key before, found {times[wrong[0]]:g}")
     rate = rate or USUAL_RATE
-    at = times[0] + np.arange(_frames(path, times, rate)) / rate
+    span = (times[-1] - times[0]) * rate
+    if span >= MOST_FRAMES:
+        raise storage.StorageError(f"{path}: expected times in seconds, those from {times[0]:g} to {times[-1]:g} would "
+                                   f"be {span:.3g} frames at {rate:g} a second")
+    at = times[0] + np.arange(int(span + 1e-6) + 1) / rate
 
     columns = {word: i for i, word in enumerate(head)}
     poses = np.zeros((len(at), len(names), 3))
@@ -102,7 +107,7 @@ def judge_keys(poses: np.ndarray) -> Judgement:
     """What poses (T, J, 3) from keys are worth, radians: those of somebody who wrote radians hardly move."""
     largest = float(np.degrees(np.linalg.norm(poses, axis=-1)).max())
     return Judgement.of(check=[f"no joint turns by more than {largest:.2g} degrees; if the table has radians, write "
-                               "degrees"] if 0 < largest < LEAST_TURN else [])
+                               "degrees"] if 0 < largest < 2 * np.pi else [])
 
 
 def turned_between(times: np.ndarray, turns: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -145,20 +150,3 @@ def _coordinates(path: Path, table: np.ndarray, columns: dict[str, int], wanted:
         raise storage.StorageError(f"{path}: expected finite numbers in {wanted[0]}")
     found[~given.all(axis=1)] = np.nan
     return found
-
-
-def _check_times(path: Path, times: np.ndarray, lines: Sequence[int]) -> None:
-    """StorageError unless the times (n,) of keys are numbers that grow."""
-    wrong = np.flatnonzero(~np.isfinite(times) | np.r_[False, ~(np.diff(times) > 0)])
-    if len(wrong):
-        raise storage.StorageError(f"{path}: line {lines[wrong[0]]}: expected a time in seconds that is later than "
-                                   f"that of the key before, found {times[wrong[0]]:g}")
-
-
-def _frames(path: Path, times: np.ndarray, rate: float) -> int:
-    """How many frames there are from the first to the last key."""
-    span = (times[-1] - times[0]) * rate
-    if span >= MOST_FRAMES:
-        raise storage.StorageError(f"{path}: expected times in seconds, those from {times[0]:g} to {times[-1]:g} would "
-                                   f"be {span:.3g} frames at {rate:g} a second")
-    return int(span + 1e-6) + 1

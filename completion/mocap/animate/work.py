@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import find_coverage
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
@@ -64,19 +65,25 @@ class Work:
         """Follow the markers of a file, or bring its motion onto the body, write everything into the folder of a room,
         and return the figures; the first says what the motion is worth.
         """
-        if is_motion(path):
-            metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, self.rate,
-                                                room)
-        else:
-            metrics, motion, body, page = self._followed(path, room)
+        metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, self.rate, room) \
+            if is_motion(path) else self._follow(path, room)
         if self.retarget_to is not None:
-            metrics += _other_person(self, self.retarget_to, room.folder, motion, body, page)
+            other = retarget(motion, body, self.retarget_to)
+            other.save(room.folder / "onto.npz")
+            metrics += write_glb(room.folder / "onto.glb", other, self.retarget_to)
+            page.section("On another person", "The same rotations of the joints; the way over the ground is as much "
+                         "longer as the legs are, and the feet are on the ground when those of the first are.")
+            page.bodies([moving_pane(other, self.retarget_to)])
         if self.betas_to is not None:
-            metrics += _changing_body(self, self.betas_to, room.folder, motion, body, page)
+            bodies = partial(morphed_vertices, self.model, motion, betas_in_motion(self.betas_to, motion))
+            metrics += write_glb(room.folder / "morph.glb", motion, body, bodies)
+            page.section("With a body that changes", "Betas change straight from key to key, or are given for every "
+                         "frame.")
+            page.bodies([moving_pane(motion, body, bodies=bodies)])
         page.write(room.folder / "report.html")
         return metrics
 
-    def _followed(self, path: Path, room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
+    def _follow(self, path: Path, room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
         """The motion of the markers of a file."""
         sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
@@ -99,8 +106,8 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         covered = find_coverage(body, layout, [motion], [sequence])
-        problem = motion_problem(motion, body.template, layout, sequence)
-        moving = Judgement.of(problem, motion_doubts([motion], [sequence], body.template))
+        moving = Judgement.of(motion_problem(motion, body.template, layout, sequence),
+                              motion_doubts([motion], [sequence], body.template))
         judgement = covered.judgement().joined(moving, worn.judgement(sequence.labels), placed)
         if found is not None:
             judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
@@ -139,29 +146,6 @@ def figures(motion: Motion) -> list[Metric]:
         *details([markers_told([motion]), Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s")])]
 
 
-def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page
-                  ) -> list[Metric]:
-    other = retarget(motion, body, person)
-    other.save(output / "onto.npz")
-    told = write_glb(output / "onto.glb", other, person)
-    page.section("On another person", "The same rotations of the joints; the way over the ground is as much longer as "
-                 "the legs are, and the feet are on the ground when those of the first are.")
-    page.bodies([moving_pane(other, person)])
-    return told
-
-
-def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page
-                   ) -> list[Metric]:
-    def bodies(frames: np.ndarray) -> np.ndarray:
-        return morphed_vertices(work.model, motion, changes, frames)
-
-    changes = betas_in_motion(goal, motion)
-    told = write_glb(output / "morph.glb", motion, body, bodies)
-    page.section("With a body that changes", "Betas change straight from key to key, or are given for every frame.")
-    page.bodies([moving_pane(motion, body, bodies=bodies)])
-    return told
-
-
 def betas_in_motion(given: BetasTo, motion: Motion) -> dict[float, np.ndarray] | np.ndarray:
     """Betas at some seconds or (T, k) in every frame of a motion, from these or from those at its end."""
     if isinstance(given, dict):
@@ -175,8 +159,7 @@ def betas_in_motion(given: BetasTo, motion: Motion) -> dict[float, np.ndarray] |
     return {0.0: motion.betas, float(motion.times[-1]): given}
 
 
-def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str,
-                metrics: list[Metric]) -> Page:
+def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str, metrics: list[Metric]) -> Page:
     """The page of `scape animate`."""
     page = Page(f"{name}, animated", "The body in motion, with the markers that were measured as dots.")
     page.bodies([dotted_pane(motion, subject, markers.positions, "measured markers", markers.labels)],

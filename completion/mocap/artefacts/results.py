@@ -14,7 +14,9 @@ from scanprep.ranges import Settings
 from ..files.c3d import point_table, replace_points, write_c3d
 from ..files.c3d_points import add_points
 from ..files.markers import MarkerSequence, subject_columns, write_markers
+from ..files.opensim import unlike
 from ..files.text import MarkerFileError
+from ..pose.marked_body import stretches
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> 
                 frames.setdefault((min(a, b), max(a, b)), []).append(int(t))
     out = []
     for (a, b), times in frames.items():
-        for run in np.split(np.array(times), np.flatnonzero(np.diff(times) > 1) + 1):
+        for run in stretches(np.array(times)):
             there = run[seen[run, a] | seen[run, b]]
             if len(there):
                 out.append(Swap(labels[a], labels[b], int(there[0]), int(there[-1])))
@@ -175,8 +177,15 @@ def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | 
         if source is None or data is None:
             write_c3d(beside, sequence.positions, sequence.labels, sequence.rate, filled)
         else:
-            columns = _columns(source, data, sequence.labels, subject_prefix)
-            beside.write_bytes(replace_points(source, data, columns, sequence.positions,
+            # where the labels stand among the points that have positions
+            table = point_table(source, data)
+            columns, bare = subject_columns(source, [table.labels[i] for i in table.kept], subject_prefix)
+            missing = [label for label in sequence.labels if label not in bare]
+            if missing:
+                raise MarkerFileError(f"{source}: expected the labels of the sequence, {', '.join(missing)} not among "
+                                      f"{', '.join(bare)}")
+            rows = np.array([columns[bare.index(label)] for label in sequence.labels])
+            beside.write_bytes(replace_points(source, data, rows, sequence.positions,
                                               np.where(filled, -1, artefacts.order), unit))
         if joints is not None:
             _add_joints(source or path, beside, joints, subject_prefix, None if source is None else unit)
@@ -189,28 +198,12 @@ def _add_joints(name: Path, file: Path, joints: MarkerSequence, subject_prefix: 
     taken = point_table(name, data).labels
     who = (subject_prefix or "").split(",")[0]
     who = who or next((label.rpartition(":")[0] for label in taken if ":" in label), "")
-    labels: list[str] = []
-    for label in joints.labels:
-        label = f"{who}:{label}" if who else label
-        while label in taken:
-            label += "_"
-        labels.append(label)
+    labels = unlike([f"{who}:{label}" if who else label for label in joints.labels], taken)
     told = [f"joint centre of the model ({label})" for label in joints.labels]
     try:
         file.write_bytes(add_points(name, data, labels, told, joints.positions, unit))
     except MarkerFileError as error:                     # the markers are the user's, the joints can be had elsewhere
         say(f"virtual.c3d has no joint centres: {error}")
-
-
-def _columns(path: Path, data: bytes, labels: tuple[str, ...], subject_prefix: str | None) -> np.ndarray:
-    """Where the labels (L,) of a sequence stand among the points of a file that have positions."""
-    table = point_table(path, data)
-    columns, bare = subject_columns(path, [table.labels[i] for i in table.kept], subject_prefix)
-    missing = [label for label in labels if label not in bare]
-    if missing:
-        raise MarkerFileError(f"{path}: expected the labels of the sequence, {', '.join(missing)} not among "
-                              f"{', '.join(bare)}")
-    return np.array([columns[bare.index(label)] for label in labels])
 
 
 def artefact_table(artefacts: MarkerArtefacts) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
-from ..pose.robust import known_median, runs
+from ..pose.marked_body import known_median, stretches
 from .results import ArtefactConfig, BadKind, BadSpan
 
 SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within a tenth of a second
@@ -39,7 +39,8 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
         slipped = np.arange(len(seen)) >= slip
         kinds: tuple[tuple[BadKind, np.ndarray], ...] = (("noisy", noisy), ("slipped", slipped), ("stray", stray))
         for kind, bad in kinds:
-            out += _spans(label, kind, seen, bad, away, joined * rate)
+            out += [BadSpan(label, kind, int(seen[r[0]]), int(seen[r[-1]]), float(np.median(away[r])))
+                    for r in stretches(np.flatnonzero(bad), seen, max(1.0, joined * rate))]
     return tuple(sorted(out, key=lambda s: (s.begin, s.label)))
 
 
@@ -73,7 +74,7 @@ def _noisy(jitter: np.ndarray, limit: float, rate: float) -> np.ndarray:
     rough = jitter > limit
     reach = binary_dilation(wide, iterations=width // 2) if wide.any() else wide
     out = np.zeros(len(jitter), dtype=bool)
-    for run in runs(reach):
+    for run in stretches(np.flatnonzero(reach)):
         some = run[rough[run]]
         if len(some) > width // 2:
             out[some[0]:some[-1] + 1] = True
@@ -147,11 +148,3 @@ def _stray(away: np.ndarray, limit: np.ndarray, jumps: np.ndarray, gap: np.ndarr
         share = jumped if all(torn) else 1.0 if any(torn) and both else STRAY_SMOOTH
         out[begin:end] |= far > share * np.median(limit[begin:end])
     return out
-
-
-def _spans(label: str, kind: BadKind, seen: np.ndarray, bad: np.ndarray, away: np.ndarray, joined: float
-           ) -> list[BadSpan]:
-    """The spans of frames `seen` (n,) that are bad (n,), near ones joined."""
-    at = np.flatnonzero(bad)
-    runs = np.split(at, np.flatnonzero(np.diff(seen[at]) > max(1.0, joined)) + 1) if len(at) else []
-    return [BadSpan(label, kind, int(seen[r[0]]), int(seen[r[-1]]), float(np.median(away[r]))) for r in runs]

@@ -184,7 +184,7 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
     if frames > MOST_FRAMES and frames == (end - start) // width:      # not those that only fill the last block
         while end - start - frames * width < BLOCK and not any(data[start + (frames - 1) * width:][:width]):
             frames -= 1
-    labels = _labels(parameters, count)
+    labels = [label or f"point{i}" for i, label in enumerate((_lists(parameters, "LABELS") + [""] * count)[:count])]
     computed = {label for key in _COMPUTED for label in parameters.get(("POINT", key), ())}
     kept = tuple(i for i, label in enumerate(labels) if label not in computed)
     described = [str(text) for text in _lists(parameters, "DESCRIPTIONS")]
@@ -210,7 +210,10 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
     own = float(next(iter(parameters.get(("POINT", "SCALE"), ())), scale))
     sizes = list(dict.fromkeys([4 if scale < 0 else 2, 4 if own < 0 else 2]))
     if not any(counts):
-        raise _Damaged(_nothing(parameters, max(last - first + 1, 0)))
+        turned = len(parameters.get(("ROTATION", "LABELS"), ())) or sum(_whole(parameters, "ROTATION", "USED"))
+        raise _Damaged(f"expected points, the C3D file holds rotations of {turned} segments and no markers, as "
+                       "Theia3D writes them; export BVH in its place, for scape animate, or markers" if turned else
+                       f"expected points, the C3D file holds 0 points in {max(last - first + 1, 0)} frames")
     fitting: list[tuple[int, int, int, int]] = []
     for count, analog, size in itertools.product(filter(None, counts), analogs, sizes):
         width = (4 * count + analog) * size
@@ -239,15 +242,6 @@ def rotations_start(parameters: _Parameters, start: int, size: int) -> int:
     place = BLOCK * (sum(_whole(parameters, "ROTATION", "DATA_START")) - 1)
     used = _whole(parameters, "ROTATION", "USED") or [len(parameters.get(("ROTATION", "LABELS"), ()))]
     return place if used[0] and start < place < size else 0
-
-
-def _nothing(parameters: _Parameters, frames: int) -> str:
-    """Why there are no markers in a file without points."""
-    turned = len(parameters.get(("ROTATION", "LABELS"), ())) or sum(_whole(parameters, "ROTATION", "USED"))
-    if turned:
-        return (f"expected points, the C3D file holds rotations of {turned} segments and no markers, as Theia3D writes "
-                "them; export BVH in its place, for scape animate, or markers")
-    return f"expected points, the C3D file holds 0 points in {frames} frames"
 
 
 def _whole(parameters: _Parameters, group: str, name: str) -> list[int]:
@@ -279,20 +273,19 @@ def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[i
     return [*said, max(room, counted)]
 
 
-def _labels(parameters: _Parameters, count: int) -> list[str]:
-    """The labels of all points; beyond 255 they go on in LABELS2, LABELS3, ..."""
-    labels = (_lists(parameters, "LABELS") + [""] * count)[:count]
-    return [label or f"point{i}" for i, label in enumerate(labels)]
-
-
 def _lists(parameters: _Parameters, name: str) -> list[str]:
-    """The texts of all points of LABELS or DESCRIPTIONS and what continues it."""
-    texts: list[str] = []
-    part = 1
-    while more := parameters.get(("POINT", name if part == 1 else f"{name}{part}"), []):
-        texts += map(str, more)
-        part += 1
-    return texts
+    """The texts of all points of LABELS or DESCRIPTIONS; beyond 255 they go on in LABELS2, LABELS3, ..."""
+    lists = (parameters.get(("POINT", f"{name}{part}" if part > 1 else name)) for part in itertools.count(1))
+    return [str(text) for some in itertools.takewhile(bool, lists) for text in some or ()]
+
+
+def step_of(path: Path, table: PointTable, frames: int, unit: str | None) -> float:
+    """Metres of a step of the numbers of a file, to which so many frames go; `unit` where it says its own wrongly."""
+    if frames != table.frames:
+        raise MarkerFileError(f"{path}: expected a file of {frames} frames, found {table.frames}")
+    if (unit or table.unit) not in UNITS:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{table.unit}'")
+    return UNITS[unit or table.unit] * (1.0 if table.kind == "f4" else table.scale)
 
 
 def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.ndarray, source: np.ndarray,
@@ -304,14 +297,10 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     metres, `source` (T, L) the column a point was measured as, -1 if computed; `unit` of a file that says it wrongly.
     """
     table = point_table(path, data)
-    if len(positions) != table.frames:
-        raise MarkerFileError(f"{path}: expected a file of {len(positions)} frames, found {table.frames}")
+    scale = step_of(path, table, len(positions), unit)
     if len(columns) and np.max(columns) >= len(table.kept):
         raise MarkerFileError(f"{path}: expected a file of more than {np.max(columns)} points, found {len(table.kept)}")
-    if (unit or table.unit) not in UNITS:
-        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{table.unit}'")
     words, mine = table.words(data), np.array(table.kept)[columns]
-    scale = UNITS[unit or table.unit] * (1.0 if table.kind == "f4" else table.scale)
     fresh = np.empty((*positions.shape[:2], 4))
     fresh[..., :3] = positions / scale
     old = np.take_along_axis(words[:, mine, 3], np.maximum(source, 0), axis=1)

@@ -7,9 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from scanprep.geometry.format_common import UNITS
-
-from .c3d import BLOCK, PointTable, as_floats, file_parameters, holds, parameter_records, point_table, rotations_start
+from .c3d import (
+    BLOCK,
+    PointTable,
+    as_floats,
+    file_parameters,
+    holds,
+    parameter_records,
+    point_table,
+    rotations_start,
+    step_of,
+)
 from .text import MarkerFileError
 
 _MOST = 255                          # values along one dimension of a parameter, and blocks of all parameters
@@ -22,19 +30,20 @@ def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Seq
     Labels must be new; a point that is NaN is missing. `unit` of a file that says it wrongly.
     """
     table = point_table(path, data)
-    if len(positions) != table.frames:
-        raise MarkerFileError(f"{path}: expected a file of {len(positions)} frames, found {table.frames}")
-    if (unit or table.unit) not in UNITS:
-        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{table.unit}'")
     points = np.zeros((*positions.shape[:2], 4))
-    points[..., :3] = positions / UNITS[unit or table.unit] / (1.0 if table.kind == "f4" else table.scale)
+    points[..., :3] = positions / step_of(path, table, len(positions), unit)
     points[np.isnan(points).any(axis=2)] = [0, 0, 0, -1]
     if table.kind == "i2" and not holds(points):
         return add_points(path, as_floats(path, data), labels, descriptions, positions, unit)
-    begin = (data[0] - 1) * BLOCK
-    parameters = file_parameters(data, table.numbers)
+    begin, parameters = (data[0] - 1) * BLOCK, file_parameters(data, table.numbers)
     described = [str(text) for text in parameters.get(("POINT", "DESCRIPTIONS"), [])]
-    body, behind = _padded(_frames(data, table, points)), rotations_start(parameters, table.start, len(data))
+
+    # every frame with the new points between its own and its analog channels
+    size, T, behind = 4 if table.kind == "f4" else 2, table.frames, rotations_start(parameters, table.start, len(data))
+    rows = np.frombuffer(data, np.uint8, T * table.width, table.start).reshape(T, -1)
+    added = np.frombuffer(table.numbers.encoded(points if size == 4 else np.rint(points), table.kind), np.uint8)
+    own = 4 * len(table.labels) * size
+    body = _padded(np.concatenate([rows[:, :own], added.reshape(T, -1), rows[:, own:]], axis=1).tobytes())
     behind = behind if behind >= table.start + table.frames * table.width else 0
     described = (described + [""] * len(table.labels))[:len(table.labels)]
     try:
@@ -47,16 +56,6 @@ def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Seq
     struct.pack_into(f"{table.numbers.order}H", head, 2, len(table.labels) + len(labels))
     struct.pack_into(f"{table.numbers.order}H", head, 16, (begin + len(section)) // BLOCK + 1)
     return bytes(head) + section + body + (data[behind:] if behind else b"")
-
-
-def _frames(data: bytes, table: PointTable, points: np.ndarray) -> bytes:
-    """Every frame with the new points between its own and its analog channels."""
-    size, T = 4 if table.kind == "f4" else 2, table.frames
-    rows = np.frombuffer(data, np.uint8, T * table.width, table.start).reshape(T, -1)
-    values = points if table.kind == "f4" else np.rint(points)
-    added = np.frombuffer(table.numbers.encoded(values, table.kind), np.uint8).reshape(T, -1)
-    own = 4 * len(table.labels) * size
-    return np.concatenate([rows[:, :own], added, rows[:, own:]], axis=1).tobytes()
 
 
 def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: list[str], descriptions: list[str],
@@ -88,8 +87,13 @@ def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: lis
     first = begin // BLOCK + blocks + 1
     kept += [start[:-3] + struct.pack(f"{order}H", place) + start[-1:]
              for start, place in zip(starts, (first, first + before_rotations), strict=False)]
-    linked = [_linked(record, order, last=i == len(kept) - 1) for i, record in enumerate(kept)]
-    return _padded(data[begin:begin + 2] + bytes([blocks, table.numbers.processor]) + b"".join(linked))
+    # after its name each has the way to the next one, 0 for the last
+    linked = bytearray(data[begin:begin + 2] + bytes([blocks, table.numbers.processor]))
+    for i, record in enumerate(kept):
+        name = 2 + abs(struct.unpack_from("b", record)[0])
+        linked += record[:name] + struct.pack(f"{order}H", len(record) - name + 2 if i < len(kept) - 1 else 0) \
+            + record[name:]
+    return _padded(bytes(linked))
 
 
 def _parameter(group: int, name: str, values: bytes) -> bytes:
@@ -97,25 +101,17 @@ def _parameter(group: int, name: str, values: bytes) -> bytes:
     return bytes([len(name), group]) + name.encode() + values + b"\0"
 
 
-def _linked(record: bytes, order: str, last: bool) -> bytes:
-    """The record with the way to the next one, 0 for the last, after its name."""
-    name = 2 + abs(struct.unpack_from("b", record)[0])
-    return record[:name] + struct.pack(f"{order}H", 0 if last else len(record) - name + 2) + record[name:]
-
-
 def _records(data: bytes, table: PointTable) -> Iterator[tuple[int, str, bytes]]:
     """Group, negative for that of a group itself, name, and the bytes of every record without its link."""
     for group, name, place, link, step in parameter_records(data, table.numbers):
-        end = link + step if step else _last(data, link + 2, group)
+        end = link + step
+        if not step:                     # the last one ends after its values and its description
+            end = link + 2
+            if group > 0:
+                kind, count = struct.unpack_from("bB", data, end)
+                end += 2 + count + abs(kind) * int(np.prod(list(data[end + 2:end + 2 + count]), initial=1))
+            end += 1 + data[end]
         yield group, name, data[place:link] + data[link + 2:end]
-
-
-def _last(data: bytes, place: int, group: int) -> int:
-    """The byte after a record that links to none, whose values begin at a place."""
-    if group > 0:
-        kind, count = struct.unpack_from("bB", data, place)
-        place += 2 + count + abs(kind) * int(np.prod(list(data[place + 2:place + 2 + count]), initial=1))
-    return place + 1 + data[place]
 
 
 def _padded(data: bytes) -> bytes:

@@ -19,7 +19,6 @@ from .text import MarkerFileError, RawMarkers, encode_csv, encode_trc, read_trc
 
 READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_table, ".tsv": read_table}
 WRITTEN = (".c3d", ".trc", ".csv")
-FEWEST_LABELS = 8                    # of a person beside others
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
 
 
@@ -195,7 +194,7 @@ def marker_subjects(path: str | Path) -> tuple[str, ...]:
         return people
     bare = {who: {label.rpartition(":")[2] for label in labels if label.rpartition(":")[0] == who} for who in people}
     times = Counter(label for own in bare.values() for label in own)
-    props = [who for who, own in bare.items() if len(own) < FEWEST_LABELS and all(times[label] == 1 for label in own)]
+    props = [who for who, own in bare.items() if len(own) < 8 and all(times[label] == 1 for label in own)]
     if props:
         warnings.warn(f"{path}: {', '.join(props)} taken for props beside people and left out; taken all the same with "
                       f"subject_prefix={props[0]}", stacklevel=2)

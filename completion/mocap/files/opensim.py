@@ -5,6 +5,7 @@ numbers change places and signs and nothing else.
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,6 @@ from scanprep.skeleton.tree import Skeleton
 from ...motion import Motion
 from ..joint_angles import JointAngles, anatomical_angles, ground_axes
 from .markers import MarkerSequence, write_markers
-
-_AXES = "+x", "+y", "+z", "-x", "-y", "-z"
 
 
 def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.ndarray,
@@ -41,8 +40,11 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
         if angles.missing:
             say(f"motion.mot has no angles of {', '.join(angles.missing)}, for which this body has no parts")
         write_mot(folder / "motion.mot", angles, motion.rate)
-    every = points if markers is None else joined(markers, points)
-    write_markers(folder / "motion.trc", MarkerSequence(every.positions @ ground, every.labels, every.rate))
+    labels, positions, rate = points.labels, points.positions, motion.rate
+    if markers is not None:
+        labels, rate = (*markers.labels, *unlike(labels, markers.labels)), markers.rate
+        positions = np.concatenate([markers.positions, positions], axis=1)
+    write_markers(folder / "motion.trc", MarkerSequence(positions @ ground, labels, rate))
 
 
 def believed(motion: Motion, markers: MarkerSequence) -> MarkerSequence:
@@ -51,14 +53,14 @@ def believed(motion: Motion, markers: MarkerSequence) -> MarkerSequence:
     return MarkerSequence(np.where(doubted[..., None], np.nan, markers.positions), markers.labels, markers.rate)
 
 
-def joined(markers: MarkerSequence, more: MarkerSequence) -> MarkerSequence:
-    """Both beside each other; of labels that come twice the later ones get a `_` at the end."""
-    labels = list(markers.labels)
-    for label in more.labels:
-        while label in labels:
+def unlike(labels: Sequence[str], others: Sequence[str]) -> list[str]:
+    """Labels with a `_`, or more, at the end of those that are among others, or came before."""
+    out: list[str] = []
+    for label in labels:
+        while label in others or label in out:
             label += "_"
-        labels.append(label)
-    return MarkerSequence(np.concatenate([markers.positions, more.positions], axis=1), tuple(labels), markers.rate)
+        out.append(label)
+    return out
 
 
 def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> MarkerSequence:
@@ -71,17 +73,14 @@ def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> Mar
 
 def known_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | None) -> np.ndarray:
     """Joint centres (T, J, 3) without, NaN, those between two parts of which the markers do not tell."""
-    return centres if told is None else np.where((told | told[_above(skeleton)])[:, None], centres, np.nan)
+    if told is None:
+        return centres
+    return np.where((told | told[np.maximum(skeleton.parents, 0)])[:, None], centres, np.nan)
 
 
 def guessed_angles(skeleton: Skeleton, told: np.ndarray) -> np.ndarray:
     """(J,) bool: joints whose angles are guesses, for parts `told` (J,) of which the markers tell."""
-    return ~(told & told[_above(skeleton)])
-
-
-def _above(skeleton: Skeleton) -> np.ndarray:
-    """(J,) the parent of every part, of the root the root itself."""
-    return np.maximum(skeleton.parents, 0)
+    return ~(told & told[np.maximum(skeleton.parents, 0)])
 
 
 def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
@@ -99,7 +98,7 @@ def write_mot(path: str | Path, angles: JointAngles, rate: float) -> None:
     table = np.c_[np.arange(len(angles.degrees)) / rate, angles.degrees[:, :first], angles.pelvis,
                   angles.degrees[:, first:]]
     names = ("time", *angles.names[:first], "pelvis_tx", "pelvis_ty", "pelvis_tz", *angles.names[first:])
-    axes = [_AXES[int(np.abs(axis).argmax()) + (3 if axis.sum() < 0 else 0)] for axis in angles.ground.T]
+    axes = [f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]}" for axis in angles.ground.T]
     lines = [Path(path).stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names)}", "inDegrees=yes", "",
              "Angles are in degrees, pelvis_tx, pelvis_ty and pelvis_tz in metres.",
              f"Axes x, y, z are {', '.join(axes)} of the recording.",

@@ -19,7 +19,6 @@ from scanprep.words import number_of
 
 Rows = Sequence[tuple[int, Sequence[str]]]           # number and cells of each line of a table
 MOST_TOLD = 6                        # labels in one note
-OTHER_RATE = 0.02                    # share by which a rate and its times differ where one of them is wrong
 
 
 class MarkerFileError(StorageError):
@@ -83,10 +82,16 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     keys, values = ([cell for cell in rows[k][1] if cell] for k in (1, 2))
     # cells without anything separate here, and there stand for a value that is not said
     said = dict(zip(map(str.lower, keys), values if len(values) == len(keys) else rows[2][1], strict=False))
-    rate, frames, count = (_header_number(path, rows[2], said, key) for key in ("DataRate", "NumFrames", "NumMarkers"))
+    try:
+        cells = [said.get(key, "") for key in ("datarate", "numframes", "nummarkers")]
+        rate, frames, count = (value if np.isfinite(value) else None
+                               for value in tables.number_cells(cells, decimal_commas=True))
+    except ValueError:
+        raise MarkerFileError(f"{path}: line {rows[2][0]}: expected values of DataRate, NumFrames and NumMarkers, "
+                              f"found {' '.join(rows[2][1])[:60]!r}") from None
     named = next((k for k, (_, cells) in enumerate(rows) if cells[0].lower().startswith("frame")), 3)
     body = rows[named + 1:]
-    while body and not _is_number(body[0][1][0]):          # X1 Y1 Z1 ...
+    while body and not re.fullmatch(r"[-+]?\d+([.,]\d*)?(e[-+]?\d+)?", body[0][1][0].strip().lower()):    # X1 Y1 Z1 ...
         body = body[1:]
     if not body:
         raise MarkerFileError(f"{path}: truncated: expected frames below line {rows[named][0]}, found none")
@@ -102,23 +107,14 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     if frames is not None and frames != len(table):
         notes.append(f"NumFrames says {frames:g}, there are {len(table)}")
     clocked = even_rate(table[:, 1]) if len(table) > 1 else None
-    if clocked is not None and (not rate or abs(clocked / rate - 1) > OTHER_RATE):
+    # a fiftieth by which a rate and its times differ where one of them is wrong
+    if clocked is not None and (not rate or abs(clocked / rate - 1) > 0.02):
         notes.append(f"DataRate says {rate or 0:g} frames a second, the times {clocked:g}: the times are believed")
         rate = clocked
     labels, twice = distinct_labels(names)
     places = table[:, 2:].reshape(len(table), -1, 3)[:, columns]
     return RawMarkers(places, labels, rate if rate and rate > 0 else None, said.get("units") or "mm",
                       (*notes, *twice))
-
-
-def _header_number(path: Path, row: tuple[int, Sequence[str]], said: dict[str, str], key: str) -> float | None:
-    """A number of the header; None where it says nothing."""
-    try:
-        value = tables.number_cells([said.get(key.lower(), "")], decimal_commas=True)[0]
-    except ValueError:
-        raise MarkerFileError(f"{path}: line {row[0]}: expected values of DataRate, NumFrames and NumMarkers, "
-                              f"found {' '.join(row[1])[:60]!r}") from None
-    return value if np.isfinite(value) else None
 
 
 def _named_columns(cells: Sequence[str], count: float | None, usual: int) -> tuple[list[int], list[str]]:
@@ -172,7 +168,16 @@ def csv_markers(path: Path, separator: str, rows: Rows) -> RawMarkers:
         raise MarkerFileError(f"{path}: expected frames below the first line, found none")
     table = table_numbers(path, rows[1:], len(head), separator)
     places = [i for i, word in enumerate(head) if word not in clock]
-    rate = _rate(path, table[:, columns["time"]], [n for n, _ in rows[1:]]) if "time" in columns else None
+    rate = None
+    if "time" in columns:
+        times = table[:, columns["time"]]
+        rate = even_rate(times) if len(times) > 1 else 1.0
+        if rate is None:
+            typical = (times[-1] - times[0]) / (len(times) - 1)
+            off = np.flatnonzero(~(np.abs(np.diff(times) - typical) <= 0.5 * typical))
+            k = int(off[0]) if len(off) else 0
+            raise MarkerFileError(f"{path}: line {rows[1:][k + 1 if len(off) else 0][0]}: expected times in even steps "
+                                  f"of {typical:.4g} s, found {times[k + 1]:.6g} s after {times[k]:.6g} s")
     labels, notes = distinct_labels(labels)
     return RawMarkers(table[:, places].reshape(len(table), len(labels), 3), labels, rate, "m", notes)
 
@@ -190,29 +195,11 @@ def table_numbers(path: Path, rows: Rows, width: int, separator: str, fill: bool
     return table
 
 
-def _is_number(cell: str) -> bool:
-    return bool(re.fullmatch(r"[-+]?\d+([.,]\d*)?(e[-+]?\d+)?", cell.strip().lower()))
-
-
 def even_rate(times: np.ndarray) -> float | None:
     """Frames per second of times, at least two; None where they are not evenly spaced."""
     typical = (times[-1] - times[0]) / (len(times) - 1)
     even = typical > 0 and (np.abs(np.diff(times) - typical) <= 0.5 * typical).all()
     return round(1 / typical, 6) if even else None
-
-
-def _rate(path: Path, times: np.ndarray, numbers: Sequence[int]) -> float | None:
-    """Frames per second of evenly spaced times; None for a single frame."""
-    if len(times) < 2:
-        return 1.0
-    rate = even_rate(times)
-    if rate is None:
-        typical = (times[-1] - times[0]) / (len(times) - 1)
-        off = np.flatnonzero(~(np.abs(np.diff(times) - typical) <= 0.5 * typical))
-        k = int(off[0]) if len(off) else 0
-        raise MarkerFileError(f"{path}: line {numbers[k + 1] if len(off) else numbers[0]}: expected times in even "
-                              f"steps of {typical:.4g} s, found {times[k + 1]:.6g} s after {times[k]:.6g} s")
-    return rate
 
 
 def encode_csv(positions: np.ndarray, labels: Sequence[str], rate: float) -> bytes:

@@ -57,12 +57,20 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
     if not isinstance(body, Mesh):
         skeleton, body = skeleton or body.skeleton, at_rest(body)
     mirror = mirror or find_skin_mirror(body)
-    room = _Room(body, base, mirror)
-    whole = _with_partners(base, mirror)
+    sides = np.array([side_of(label) for label in base.labels])
+    turn = float(np.sign((sides * mirror.across[base.nearest]).sum()))
+    if turn == 0:
+        raise ValueError("base: expected labels that tell left from right, such as LELB and RELB, found "
+                         f"{', '.join(base.labels[:6])}")
+    # the partners that are missing in the base
+    lonely = {label: o for label in base.labels if (o := other_side(label)) and o not in base.labels}
+    rows = [base.labels.index(label) for label in lonely]
+    loose = tuple(o for label, o in lonely.items() if label in base.loose)
+    whole = base.joined(MarkerLayout(tuple(lonely.values()), mirror.partner[base.nearest[rows]], loose=loose))
     if count < len(whole.labels):
         raise ValueError(f"count: expected at least the {len(whole.labels)} markers of the base with their partners, "
                          f"got {count}")
-    places = room.spread(count - len(whole.labels), whole.nearest)
+    places = _spread(body, mirror, turn * mirror.across, count - len(whole.labels), whole.nearest)
     vertices = np.array([v for place in places for v in place], dtype=np.int64)
     return whole.joined(MarkerLayout(tuple(_names(body, skeleton, places)), vertices))
 
@@ -85,50 +93,30 @@ def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.nda
     return (away > 0.035 * length) & (_thickness(body, reach) >= thick * length) & (flatness >= 0.75) & ~at_end
 
 
-class _Room:
-    """Where on a body markers can be added."""
+def _spread(body: Mesh, mirror: SkinMirror, across: np.ndarray, count: int, taken: np.ndarray
+            ) -> list[tuple[int, ...]]:
+    """Places one by one, (left, right) or (middle,), until there are `count` vertices, far from those `taken`.
 
-    def __init__(self, body: Mesh, base: MarkerLayout, mirror: SkinMirror) -> None:
-        vertices = base.nearest
-        sides = np.array([side_of(label) for label in base.labels])
-        turn = float(np.sign((sides * mirror.across[vertices]).sum()))
-        if turn == 0:
-            raise ValueError("base: expected labels that tell left from right, such as LELB and RELB, found "
-                             f"{', '.join(base.labels[:6])}")
-        across = turn * mirror.across
-        length = _long_axis(body, mirror)[1]
-        self.graph, self.partner = SurfaceGraph(body), mirror.partner
-        free = sitting_room(body, mirror)
-        free &= free[self.partner]
-        edge = float(np.linalg.norm(np.diff(body.vertices[body.edges], axis=1), axis=-1).mean())
-        on_line = np.abs(across) < edge
-        from_line = self.graph.nearest(np.flatnonzero(on_line))[0]
-        self.apart = 2 * from_line                                   # of a place from its partner, along the skin
-        self.left = free & (across > 0) & (from_line > 0.012 * length)   # nearer ones are alone
-        self.line = free & on_line
-
-    def spread(self, count: int, taken: np.ndarray) -> list[tuple[int, ...]]:
-        """Places one by one, (left, right) or (middle,), until there are `count` vertices."""
-        near = self.graph.nearest(taken)[0]
-        found: list[tuple[int, ...]] = []
-        while (left := count - sum(map(len, found))) > 0:
-            both = np.where(self.left, np.minimum(np.minimum(near, near[self.partner]), self.apart), 0.0)
-            alone = np.where(self.line, near, 0.0)
-            v = int(both.argmax()) if left > 1 and both.max() >= alone.max() else int(alone.argmax())
-            if max(both[v], alone[v]) <= 0:
-                raise ValueError(f"count: no room on the body for {left} more markers")
-            place = (v, int(self.partner[v])) if left > 1 and both.max() >= alone.max() else (v,)
-            near = np.minimum(near, self.graph.nearest(np.array(place))[0])
-            found.append(place)
-        return found
-
-
-def _with_partners(base: MarkerLayout, mirror: SkinMirror) -> MarkerLayout:
-    """The base, and the partners that are missing in it."""
-    lonely = {label: o for label in base.labels if (o := other_side(label)) and o not in base.labels}
-    rows = [base.labels.index(label) for label in lonely]
-    loose = tuple(o for label, o in lonely.items() if label in base.loose)
-    return base.joined(MarkerLayout(tuple(lonely.values()), mirror.partner[base.nearest[rows]], loose=loose))
+    `across` (N,) is how far every vertex is from the other side, positive on the left, metres.
+    """
+    graph, partner, length = SurfaceGraph(body), mirror.partner, _long_axis(body, mirror)[1]
+    free = sitting_room(body, mirror)
+    free &= free[partner]
+    on_line = np.abs(across) < float(np.linalg.norm(np.diff(body.vertices[body.edges], axis=1), axis=-1).mean())
+    from_line = graph.nearest(np.flatnonzero(on_line))[0]
+    on_left = free & (across > 0) & (from_line > 0.012 * length)        # nearer ones are alone
+    near, found = graph.nearest(taken)[0], list[tuple[int, ...]]()
+    while (left := count - sum(map(len, found))) > 0:
+        # a place is from its partner, along the skin, twice as far as from the line
+        both = np.where(on_left, np.minimum(np.minimum(near, near[partner]), 2 * from_line), 0.0)
+        alone = np.where(free & on_line, near, 0.0)
+        paired = left > 1 and both.max() >= alone.max()
+        v = int(both.argmax() if paired else alone.argmax())
+        if max(both[v], alone[v]) <= 0:
+            raise ValueError(f"count: no room on the body for {left} more markers")
+        found.append((v, int(partner[v])) if paired else (v,))
+        near = np.minimum(near, graph.nearest(np.array(found[-1]))[0])
+    return found
 
 
 def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]]) -> list[str]:
@@ -180,19 +168,13 @@ def _fans(body: Mesh, z: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarr
         z = np.sqrt((np.arange(RAYS) + 0.5) / RAYS)                  # as many as the skin there sees of a lit sky
     turn = np.arange(len(z)) * np.pi * (3 - np.sqrt(5))
     local = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
-    n = body.vertex_normals
-    first = body.vertices[_a_neighbour(body)] - body.vertices          # turns with the body
+    n, neighbour = body.vertex_normals, np.zeros(len(body.vertices), dtype=np.int64)
+    neighbour[body.edges[:, 0]], neighbour[body.edges[:, 1]] = body.edges[:, 1], body.edges[:, 0]
+    first = body.vertices[neighbour] - body.vertices                   # turns with the body
     first = first - np.einsum("nd,nd->n", first, n)[:, None] * n
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     frames = np.stack([first, np.cross(n, first), n], axis=1)
     return np.repeat(body.vertices, len(z), axis=0), np.einsum("kc,ncd->nkd", local, frames).reshape(-1, 3)
-
-
-def _a_neighbour(body: Mesh) -> np.ndarray:
-    """(N,) one neighbour of every vertex."""
-    out = np.zeros(len(body.vertices), dtype=np.int64)
-    out[body.edges[:, 0]], out[body.edges[:, 1]] = body.edges[:, 1], body.edges[:, 0]
-    return out
 
 
 def _around(body: Mesh, radius: float) -> csr_array:

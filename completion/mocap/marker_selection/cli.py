@@ -14,7 +14,6 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered
-from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
@@ -32,7 +31,7 @@ from .linear import check_bodies, example_poses, in_poses
 
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
-           keep: str | None = None, unit: Unit | None = None, config: DesignConfig = DesignConfig()) -> Outcome:      # noqa: B008
+           keep: str | None = None, unit: Unit | None = None, config: DesignConfig = DesignConfig()) -> Outcome:
     """Choose the markers from which bodies are estimated best.
 
     Of the candidates markers are taken away, and added, one by one or in pairs of left and right, always the one that
@@ -53,8 +52,14 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
         config: Settings.
     """
     loaded, name = read_model(model)
+    # the candidates, those that are kept among them
     kept = None if keep is None else choose_layout(loaded, keep, ())[0]
-    among = _candidates(loaded, candidates, kept)
+    if candidates is None:
+        among = candidate_layout(loaded, choose_layout(loaded, "vicon47", ())[0] if kept is None else kept)
+    else:
+        among = choose_layout(loaded, candidates, ())[0]
+        if kept is not None and not set(kept.labels) <= set(among.labels):
+            among = among.joined(kept.without([label for label in kept.labels if label in among.labels]))
     labels = () if kept is None else kept.labels
     found, people = _read_bodies(loaded, bodies, unit)
     if config.poses:
@@ -66,25 +71,23 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
         partners = marker_pairs(among, loaded.template)
     with bar("choosing markers") as progress:
         result = design_markers(loaded, found, among, config, progress, keep=labels, partners=partners, people=people)
-    metrics = [Metric("model", name), *_figures(result, len(found), len(among.labels))]
+    metrics = [Metric("model", name), Metric("bodies", len(found)), Metric("candidates", len(among.labels)),
+               Metric("markers", len(result.layout.labels)), Metric("RMSE of all vertices", 1000 * result.rmse, "mm"),
+               *([] if result.full is None else [Metric("the same by full refits", 1000 * result.full, "mm")]),
+               Metric("chosen on the other half of the people", 1000 * result.other_half, "mm"),
+               Metric("with the whole surface seen", 1000 * result.floor, "mm"),
+               *(Metric(f"{c.count} markers by full refits", 1000 * c.full, "mm") for c in result.checks)]
     output.mkdir(parents=True, exist_ok=True)
     result.layout.save(output / "layout.json")
-    with storage.writing(output / "curve.csv") as part:
-        part.write_text(chart_rows(result), encoding="utf-8")
+    # the curves: which one, markers, RMSE in millimetres, and the labels that came or went
+    lines = ["curve,markers,rmse_mm,labels"]
+    for curve in result.curves:
+        steps = zip(((), *curve.steps), curve.counts.tolist(), (1000 * curve.rmse).tolist(), strict=True)
+        lines += [f'"{curve.name}",{count},{rmse:.4f},"{" ".join(markers)}"' for markers, count, rmse in steps]
+    storage.write(output / "curve.csv", "\n".join(lines) + "\n")
     design_page(result, loaded, among, labels, metrics).write(output / "report.html")
     settings = {"design": config, "model": name, "candidates": candidates, "keep": keep}
     return Outcome(output, metrics, settings, judgement=Judgement())
-
-
-def _candidates(model: BodyModel, given: str | None, kept: MarkerLayout | None) -> MarkerLayout:
-    """The candidates, those that are kept among them."""
-    if given is None:
-        return candidate_layout(model, choose_layout(model, "vicon47", ())[0] if kept is None else kept)
-    among = choose_layout(model, given, ())[0]
-    if kept is None or set(kept.labels) <= set(among.labels):
-        return among
-    own = kept.without([label for label in kept.labels if label in among.labels])
-    return among.joined(own)
 
 
 def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.ndarray, np.ndarray]:
@@ -100,31 +103,6 @@ def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.
         raise ValueError(f"{folder}: expected the triangles of the model ({model.template}); these have {len(faces)} "
                          f"faces and {vertices.shape[1]} vertices")
     return check_bodies(model, vertices), people
-
-
-def _figures(result: MarkerDesign, bodies: int, candidates: int) -> list[Metric]:
-    said = [Metric("bodies", bodies), Metric("candidates", candidates), Metric("markers", len(result.layout.labels)),
-            Metric("RMSE of all vertices", 1000 * result.rmse, "mm")]
-    if result.full is not None:
-        said.append(Metric("the same by full refits", 1000 * result.full, "mm"))
-    said += [Metric("chosen on the other half of the people", 1000 * result.other_half, "mm"),
-             Metric("with the whole surface seen", 1000 * result.floor, "mm")]
-    return said + [Metric(f"{c.count} markers by full refits", 1000 * c.full, "mm") for c in result.checks]
-
-
-CHOSEN, KEPT, LEFT = (0.80, 0.16, 0.14), (0.16, 0.32, 0.62), (0.72, 0.72, 0.70)
-
-
-def design_pane(design: MarkerDesign, body: Mesh, candidates: MarkerLayout, keep: tuple[str, ...] = ()) -> Pane:
-    """The body with its markers: chosen ones red, those kept blue, those left out small and grey."""
-    labels = np.array(candidates.labels)
-    skin = MarkerLayout(candidates.labels, candidates.vertices, 0.0, candidates.weights).place(body)
-    kept, chosen = np.isin(labels, keep), np.isin(labels, design.layout.labels)
-    size = 0.0075 * float(np.ptp(body.vertices, axis=0).max())
-    dots = [Dots(skin[which], color, radius, name=name, labels=labels[which].tolist()) for name, color, radius, which in
-            (("chosen", CHOSEN, size, chosen & ~kept), ("kept", KEPT, size, kept),
-             ("left out", LEFT, 0.6 * size, ~chosen)) if which.any()]
-    return Pane([body, *dots], look_around(body, turns=(20,))[0])
 
 
 def chart_curve(design: MarkerDesign) -> Any:
@@ -151,21 +129,19 @@ def chart_curve(design: MarkerDesign) -> Any:
     return figure
 
 
-def chart_rows(design: MarkerDesign) -> str:
-    """The curves as CSV: which one, markers, RMSE in millimetres, and the labels that came or went."""
-    lines = ["curve,markers,rmse_mm,labels"]
-    for curve in design.curves:
-        steps = zip(((), *curve.steps), curve.counts.tolist(), (1000 * curve.rmse).tolist(), strict=True)
-        lines += [f'"{curve.name}",{count},{rmse:.4f},"{" ".join(labels)}"' for labels, count, rmse in steps]
-    return "\n".join(lines) + "\n"
-
-
 def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout, keep: tuple[str, ...],
                 metrics: Sequence[Metric]) -> Page:
     """The page of `scape layout design`."""
     page = Page(f"{len(design.layout.labels)} markers", "Chosen so that bodies estimated from them are near the true "
                 "ones over their whole surface. Red: chosen; blue: kept; grey: left out.")
-    page.bodies([design_pane(design, at_rest(model), candidates, keep)], height=560)
+    body, labels = at_rest(model), np.array(candidates.labels)
+    skin = MarkerLayout(candidates.labels, candidates.vertices, 0.0, candidates.weights).place(body)
+    kept, used = np.isin(labels, keep), np.isin(labels, design.layout.labels)
+    size = 0.0075 * float(np.ptp(body.vertices, axis=0).max())
+    dots = [Dots(skin[which], color, radius, name=name, labels=labels[which].tolist()) for name, color, radius, which in
+            (("chosen", (0.80, 0.16, 0.14), size, used & ~kept), ("kept", (0.16, 0.32, 0.62), size, kept),
+             ("left out", (0.72, 0.72, 0.70), 0.6 * size, ~used)) if which.any()]
+    page.bodies([Pane([body, *dots], look_around(body, turns=(20,))[0])], height=560)
     chosen = [label for label in design.layout.labels if label not in keep]
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "

@@ -8,10 +8,11 @@ import numpy as np
 
 from model.body import BodyModel
 
+from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
-from .fits import DesignConfig, Progress, vertex_errors
+from .fits import DesignConfig, vertex_errors
 from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, symmetric_groups, walk
-from .linear import LinearBodies, WholeFits, fit_bodies, shared_shape
+from .linear import LinearBodies, fit_bodies, shared_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,17 +142,33 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
         linear = shared_shape(fits.linear, fits.x, np.asarray(people), fits.markers.n_betas)
         halves = np.arange(len(linear.rest)) < (len(linear.rest) + 1) // 2
     choice = choose(linear, groups, kept, config, lambda done: tell(min(2 * len(bodies) + done, total), total))
-    other = _other_half(linear, halves, groups, kept, config)
+
+    # sets chosen on one half of the bodies, measured on the other
+    other: list[np.ndarray] = []
+    for mine in (halves, ~halves) if halves.any() and not halves.all() else ():
+        rest = linear.of(~mine)
+        other.append(rest.left(rest.steps(_members(groups, choose(linear.of(mine), groups, kept, config).groups))))
     tell(total, total)
-    chosen = _members(groups, choice.groups)
-    full, checks = None, tuple[Check, ...]()
+
+    # the same without linearising
+    def refitted(chosen: list[int]) -> float:
+        return float(np.sqrt(vertex_errors(model, fits.refitted(chosen, config), bodies).mean()))
+
+    chosen, full, checks = _members(groups, choice.groups), None, list[Check]()
     if not config.joint:
-        full = _refitted(model, bodies, fits, chosen, config)
-        checks = tuple(_check(model, bodies, fits, groups, choice, count, config) for count in config.checks)
-    curves = tuple(_curve(name, path, groups, candidates.labels) for name, path in choice.paths.items())
-    gone = [label for i, label in enumerate(candidates.labels) if i not in chosen]
-    return MarkerDesign(candidates.without(gone), choice.rmse, full,
-                        float(np.sqrt(fits.linear.rest.mean())), other, curves, checks, choice.exchanged)
+        full = refitted(chosen)
+        for count in config.checks:
+            path = best_path(choice.paths, count)
+            at = path.at(count)
+            checks.append(Check(int(path.counts[at]), float(path.rmse[at]), refitted(_members(groups, path.set(at)))))
+    labels = candidates.labels
+    curves = tuple(Curve(name, tuple(labels[i] for i in _members(groups, path.start)),
+                         tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts, path.rmse)
+                   for name, path in choice.paths.items())
+    return MarkerDesign(candidates.without([label for i, label in enumerate(labels) if i not in chosen]), choice.rmse,
+                        full, float(np.sqrt(fits.linear.rest.mean())),
+                        float(np.sqrt(np.concatenate(other).mean())) if other else float("nan"), curves, tuple(checks),
+                        choice.exchanged)
 
 
 def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: DesignConfig,
@@ -199,34 +216,3 @@ def _kept(candidates: MarkerLayout, groups: Groups, keep: Sequence[str], config:
 
 def _members(groups: Groups, chosen: np.ndarray) -> list[int]:
     return sorted(i for g in chosen for i in groups[g])
-
-
-def _other_half(linear: LinearBodies, first: np.ndarray, groups: Groups, kept: np.ndarray, config: DesignConfig
-                ) -> float:
-    """RMSE, metres, with sets chosen on one half of the bodies and measured on the other."""
-    squared = []
-    for mine in (first, ~first):
-        if not mine.any() or mine.all():
-            return float("nan")
-        found = choose(linear.of(mine), groups, kept, config)
-        other = linear.of(~mine)
-        squared.append(other.left(other.steps(_members(groups, found.groups))))
-    return float(np.sqrt(np.concatenate(squared).mean()))
-
-
-def _refitted(model: BodyModel, bodies: np.ndarray, fits: WholeFits, chosen: list[int], config: DesignConfig) -> float:
-    x = fits.refitted(chosen, config)
-    return float(np.sqrt(vertex_errors(model, x, bodies).mean()))
-
-
-def _check(model: BodyModel, bodies: np.ndarray, fits: WholeFits, groups: Groups, choice: Choice, count: int,
-           config: DesignConfig) -> Check:
-    path = best_path(choice.paths, count)
-    i = path.at(count)
-    return Check(int(path.counts[i]), float(path.rmse[i]),
-                 _refitted(model, bodies, fits, _members(groups, path.set(i)), config))
-
-
-def _curve(name: str, path: Path, groups: Groups, labels: Sequence[str]) -> Curve:
-    return Curve(name, tuple(labels[i] for i in _members(groups, path.start)),
-                 tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts, path.rmse)

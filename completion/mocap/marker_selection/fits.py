@@ -10,7 +10,7 @@ import numpy as np
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
 from model.fitting.energy import MovingPoints, moving_points
-from model.linear import PointOperator, picked
+from model.linear import picked
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
@@ -77,9 +77,6 @@ class BodyPoints:
         # numbers of a batch of derivatives
         return max(1, 2**25 // max(1, 3 * self.count * (self.n_unknowns + self.shaped.load)))
 
-    def _operators(self, betas: np.ndarray) -> list[PointOperator]:
-        return [self.shaped.operator(own) for own in betas]
-
     def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         n = self.n_angles
         return x[:, :n].reshape(len(x), -1, 3), x[:, n:n + 3], x[:, n + 3:]
@@ -89,20 +86,16 @@ class BodyPoints:
         out = np.empty((len(x), self.count, 3))
         for start in range(0, len(x), self.batch):
             pose, trans, betas = self._split(x[start:start + self.batch])
-            for i, operator in enumerate(self._operators(betas)):
-                out[start + i] = operator.evaluate(pose[i], trans[i])
+            for i, own in enumerate(betas):
+                out[start + i] = self.shaped.operator(own).evaluate(pose[i], trans[i])
         return out
 
     def follow(self, x: np.ndarray) -> MovingPoints:
         """The points with their derivatives by the unknowns (B, P); keep B small."""
         pose, trans, betas = self._split(x)
-        found = [operator.columns(p, t) for operator, p, t in zip(self._operators(betas), pose, trans, strict=True)]
+        found = [self.shaped.operator(own).columns(p, t) for own, p, t in zip(betas, pose, trans, strict=True)]
         by_pose = np.moveaxis(np.stack([columns for _, columns in found]), 1, -1)
         return moving_points(np.stack([y for y, _ in found]), by_pose, self.shaped.shape_jacobian(pose))
-
-
-Tell = Callable[[int], None]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +133,7 @@ def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> 
 
 
 def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, prior: Prior, start: np.ndarray,
-               iterations: int, tell: Tell | None = None) -> np.ndarray:
+               iterations: int, tell: Callable[[int], None] | None = None) -> np.ndarray:
     """Unknowns (Z, P) with which points come nearest to targets (Z, L, 3), metres, weighted (L,). [MoSh] Eq. 26"""
     root, found = np.sqrt(weights)[:, None], np.empty_like(start)
     size = min(24, points.batch)  # bodies that are minimised at once

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,8 +13,9 @@ from model.posing.transfer import own_body
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
 
+from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
-from .fits import BodyPoints, DesignConfig, Prior, Progress, fit_points, prior_around, rough_poses
+from .fits import BodyPoints, DesignConfig, Prior, fit_points, prior_around, rough_poses
 
 FIT_ITERATIONS = 20                  # most steps of that fit, and of a full refit
 
@@ -78,7 +79,13 @@ class WholeFits:
 def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig,
                progress: Progress | None = None) -> WholeFits:
     """Fit the model to every whole body (Z, N, 3), metres, in any poses, and linearise there."""
-    bodies, n_betas = check_bodies(model, bodies), _check(model, candidates, config)
+    bodies, n_betas = check_bodies(model, bodies), model.n_betas if config.n_betas is None else config.n_betas
+    if not 0 < n_betas <= model.n_betas:
+        raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {n_betas}")
+    N, most = len(model.template.vertices), int(np.max(candidates.vertices, initial=0))
+    if not candidates.labels or most >= N:
+        raise ValueError(f"candidates: expected markers on vertices 0..{N - 1}, got {len(candidates.labels)} markers "
+                         f"up to vertex {most}")
     tell = progress or (lambda done, total: None)
     template, total = model.template.vertices, 2 * len(bodies)
     few = spread_vertices(template, 400)  # vertices that stand for all of them in the first fit to each whole body
@@ -105,18 +112,6 @@ def check_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     if bodies.ndim != 3 or not len(bodies) or bodies.shape[1:] != wanted or not np.isfinite(bodies).all():
         raise ValueError(f"bodies: expected finite numbers of shape (Z, {wanted[0]}, 3), got shape {bodies.shape}")
     return bodies
-
-
-def _check(model: BodyModel, candidates: MarkerLayout, config: DesignConfig) -> int:
-    """How many betas are estimated."""
-    n_betas = model.n_betas if config.n_betas is None else config.n_betas
-    if not 0 < n_betas <= model.n_betas:
-        raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {n_betas}")
-    N, most = len(model.template.vertices), int(np.max(candidates.vertices, initial=0))
-    if not candidates.labels or most >= N:
-        raise ValueError(f"candidates: expected markers on vertices 0..{N - 1}, got {len(candidates.labels)} markers "
-                         f"up to vertex {most}")
-    return n_betas
 
 
 def _linearised(x: np.ndarray, markers: BodyPoints, places: np.ndarray, surface: BodyPoints, targets: np.ndarray,
@@ -156,7 +151,11 @@ def shared_shape(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_beta
     shift = np.zeros((len(names), F, P))
     betas = x[bodies][:, own].reshape(len(names), F, K)
     shift[..., own] = betas.mean(axis=1, keepdims=True) - betas
-    at = _moved(linear.of(bodies), shift.reshape(Z, P))
+    # steps are counted from where the shift leads
+    at, lead = linear.of(bodies), shift.reshape(Z, P)
+    at = replace(at, gaps=at.gaps - (at.rows @ lead[:, None, :, None])[..., 0],
+                 pull=at.pull - (at.gram @ lead[..., None])[..., 0], rest=at.left(lead),
+                 lean=at.lean - lead @ at.precision)
     C, r = at.gaps.shape[1:]
     rows, gaps = np.zeros((len(names), C, F * r, F * n + K)), at.gaps.reshape(len(names), F, C, r)
     gram, pull = np.zeros((len(names), F * n + K, F * n + K)), np.zeros((len(names), F * n + K))
@@ -175,14 +174,6 @@ def shared_shape(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_beta
     lean[:, F * n:] = alone[3][:, 0, own]                            # all bodies are at the same betas now
     return LinearBodies(rows, gaps.transpose(0, 2, 1, 3).reshape(len(names), C, F * r), gram, pull,
                         at.rest.reshape(len(names), F).mean(axis=1), precision, lean)
-
-
-def _moved(linear: LinearBodies, shift: np.ndarray) -> LinearBodies:
-    """The same affine bodies, with steps counted from where `shift` (Z, P) leads."""
-    gaps = linear.gaps - (linear.rows @ shift[:, None, :, None])[..., 0]
-    pull = linear.pull - (linear.gram @ shift[..., None])[..., 0]
-    return LinearBodies(linear.rows, gaps, linear.gram, pull, linear.left(shift), linear.precision,
-                        linear.lean - shift @ linear.precision)
 
 
 def example_poses(model: BodyModel, count: int) -> np.ndarray:

@@ -137,8 +137,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
     save_png(output.with_suffix(".png"), picture_layout(theirs, result.layout))
     write_mesh(output.with_suffix(".registered.ply"), result.registered)
     doubts = [f"{result.uncovered:.0%} of the target is not covered by the source; look at "
-              f"{output.with_suffix('.png').name}, and name landmarks if limbs are wrong"] \
-        if result.uncovered > UNCERTAIN else []
+              f"{output.with_suffix('.png').name}, and name landmarks if limbs are wrong"]
     return Outcome(output, [
         *_figures(result.layout, theirs), Metric("landmarks", 0 if pairs is None else len(pairs[0])),
         Metric("distance of the registered source, RMS", MM * result.rms, "mm"),
@@ -146,7 +145,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
         Metric("target not covered", 100 * result.uncovered, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
         Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout},
-        judgement=Judgement.of(check=doubts))
+        judgement=Judgement.of(check=doubts if result.uncovered > UNCERTAIN else []))
 
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None
@@ -155,8 +154,7 @@ def _body(model: Path | None, body: Path | None, unit: Unit | None
     if body is not None:
         return read_mesh(body, unit), None, None, str(body)
     loaded, name = read_model(model)
-    kept = loaded.info.get("people_vertices")
-    rest = at_rest(loaded)
+    kept, rest = loaded.info.get("people_vertices"), at_rest(loaded)
     skeleton = replace(loaded.skeleton, joints=loaded.joint_regressor @ rest.vertices)
     return rest, skeleton, None if kept is None else np.array(kept), name
 

@@ -165,6 +165,11 @@ class MarkerLayout:
                              f"layout: {', '.join(self.labels)}; sequence: {', '.join(labels) or 'none'}")
         return found
 
+    def worn(self, labels: Sequence[str], minimum: int = 3) -> tuple[np.ndarray, MarkerLayout]:
+        """Which columns (n,) of a sequence the layout knows, as `matched` finds them, and their part of the layout."""
+        known = self.matched(labels, minimum)
+        return np.array([list(labels).index(label) for label in known], dtype=int), self.select(known)
+
     def spelled(self, labels: Sequence[str]) -> MarkerLayout:
         """The same with those labels as aliases that differ from its own only in case, dots, blanks or dashes."""
         meant: dict[str, set[str]] = {}
@@ -251,22 +256,6 @@ def _plain(label: str) -> str:
 
 def _restored(path: Path, tree: Any) -> MarkerLayout:
     """The layout of a file."""
-    rows = _rows(path, tree)
-    if not rows:
-        raise MarkerFileError(f"{path}: expected markers in the layout, found none")
-    labels, places, distances, loose, wands = zip(*rows, strict=True)
-    free, on_wands = (tuple(label for label, is_one in zip(labels, some, strict=True) if is_one)
-                      for some in (loose, wands))
-    aliases = dict(tree.get("aliases", {}))
-    if all(isinstance(place, int) for place in places):
-        return MarkerLayout(labels, np.array(places), np.array(distances), None, aliases, free, on_wands)
-    pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"]) for p in places]
-    return MarkerLayout(labels, np.array([v for v, _ in pairs]), np.array(distances), np.array([w for _, w in pairs]),
-                        aliases, free, on_wands)
-
-
-def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool, bool]]:
-    """Label, place, distance, looseness of every marker in the file, and whether it may be on a wand."""
     sets = tree.get("markersets") if isinstance(tree, Mapping) else None
     if not isinstance(sets, list):
         raise MarkerFileError(f"{path}: expected a marker layout {{\"markersets\": [...]}}, found something else")
@@ -280,6 +269,15 @@ def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool, bool]]:
         for label, place in indices.items():
             if isinstance(place, bool) or not isinstance(place, int | Mapping):
                 raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {str(place)[:40]!r}")
-            rows.append((label, place, float(distance), bool(markers.get("loose", False)),
-                         bool(markers.get("wand", False))))
-    return rows
+            rows.append((label, place, float(distance), markers))
+    if not rows:
+        raise MarkerFileError(f"{path}: expected markers in the layout, found none")
+    labels, places, distances, owners = zip(*rows, strict=True)
+    loose, wands = (tuple(label for label, of in zip(labels, owners, strict=True) if of.get(kind, False))
+                    for kind in ("loose", "wand"))
+    vertices, weights = places, None
+    if not all(isinstance(place, int) for place in places):
+        pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"]) for p in places]
+        vertices, weights = zip(*pairs, strict=True)
+    return MarkerLayout(labels, np.array(vertices), np.array(distances), None if weights is None else np.array(weights),
+                        dict(tree.get("aliases", {})), loose, wands)

@@ -82,19 +82,14 @@ def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> M
     if kept is not None and len(kept) == len(template.vertices):
         for path, body in bodies:
             if body["name"] == "synthetic people":
-                return _on_kept(MarkerLayout.load(path), template, np.asarray(kept))
+                from scanprep.synthetic.topology import load
+
+                layout, whole = MarkerLayout.load(path), load().mesh.vertices
+                on_kept = Surface(Mesh(whole[np.asarray(kept)], template.faces)).closest(whole[layout.vertices])
+                return replace(layout, vertices=template.faces[on_kept.faces], weights=on_kept.bary)
     known = ", ".join(f"{body['name']} ({body['vertices']} vertices)" for _, body in bodies)
     raise ValueError(f"template: expected a body on which '{name}' is known: {known}; got another triangulation with "
                      f"{len(template.vertices)} vertices; for this one, {OWN}")
-
-
-def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLayout:
-    """The layout of the synthetic people on a template that kept only some of their vertices."""
-    from scanprep.synthetic.topology import load
-
-    whole = load().mesh.vertices
-    found = Surface(Mesh(whole[kept], template.faces)).closest(whole[layout.vertices])
-    return replace(layout, vertices=template.faces[found.faces], weights=found.bary)
 
 
 @cache
@@ -130,7 +125,12 @@ def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = Non
     named = layout_or_file(given)
     if isinstance(named, str):
         return named_layout(named, template, kept)
-    return clicked_layout(named, template) if _is_clicked(named) else MarkerLayout.load(named, len(template.vertices))
+    clicked = named.suffix.lower() != ".json" or named.name.endswith(".mrk.json")
+    if not clicked:                      # landmarks are JSON as well
+        tree = storage.read_json(named, "a marker layout", MarkerFileError)
+        clicked = isinstance(tree, dict) and bool(tree) and "markersets" not in tree and all(
+            isinstance(place, list | int) or (isinstance(place, dict) and "face" in place) for place in tree.values())
+    return clicked_layout(named, template) if clicked else MarkerLayout.load(named, len(template.vertices))
 
 
 def clicked_layout(path: Path, template: Mesh) -> MarkerLayout:
@@ -160,15 +160,6 @@ def layout_on(body: Mesh, places: Mapping[str, np.ndarray]) -> tuple[MarkerLayou
     inside = np.clip(found.bary, 0.0, 1.0)                        # without the last digits outside of the triangle
     weights = inside / inside.sum(axis=1, keepdims=True)
     return MarkerLayout(tuple(places), body.faces[found.faces], weights=weights), found.distances
-
-
-def _is_clicked(path: Path) -> bool:
-    """Whether a file holds landmarks, not a layout."""
-    if path.suffix.lower() != ".json" or path.name.endswith(".mrk.json"):
-        return True
-    tree = storage.read_json(path, "a marker layout", MarkerFileError)
-    return isinstance(tree, dict) and bool(tree) and "markersets" not in tree and all(
-        isinstance(place, list | int) or (isinstance(place, dict) and "face" in place) for place in tree.values())
 
 
 def layout_or_file(given: str | Path) -> str | Path:

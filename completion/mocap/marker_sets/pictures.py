@@ -2,13 +2,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.pictures.camera import Camera, look_around
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
 from scanprep.pictures.shading import Dots, Solid, render, side_by_side
@@ -28,47 +27,34 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
 
     Returns (H, W, 3) uint8.
     """
-    cameras, height = look_around(body), height or HEIGHT
-    width = int(height * max(c.width / c.height for c in cameras)) + 100
-    return side_by_side([_side(body, layout, camera, width, height) for camera in cameras], SIDES)
-
-
-def _side(body: Mesh, layout: MarkerLayout, camera: Camera, width: int, height: int) -> np.ndarray:
     from PIL import Image, ImageDraw
 
-    points = layout.place(body)
+    cameras, height, images = look_around(body), height or HEIGHT, []
+    width, size = int(height * max(c.width / c.height for c in cameras)) + 100, font(12)
+    points, radius = layout.place(body), 0.0055 * float(np.ptp(body.vertices, axis=0).max())
     colors = np.array([LOOSE if label in layout.loose else FIXED for label in layout.labels])
-    radius = 0.0055 * float(np.ptp(body.vertices, axis=0).max())
-    picture = Image.fromarray(render([Solid(body), Dots(points, colors, radius)], camera, width, height))
-    draw = ImageDraw.Draw(picture)
-    towards = camera.position - points
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    hidden = Rays(body).occluded(points + 1e-4 * towards, towards)
-    taken: list[tuple[float, float, float, float]] = []
-    places = camera.project(points, width, height)
-    for i in np.argsort(places[:, 1]):
-        if not hidden[i]:
-            taken.append(_write(draw, layout.labels[i], places[i], taken))
-    return np.asarray(picture)
-
-
-def _write(draw: Any, label: str, place: np.ndarray, taken: list[tuple[float, float, float, float]]
-           ) -> tuple[float, float, float, float]:
-    """Write a label beside its marker, where no other label is; returns the room it takes."""
-    size = font(12)
-    wide, high = draw.textlength(label, font=size), 13
-    x, y = place
-    spots = [(x + 7, y - 7), (x - 7 - wide, y - 7), (x + 5, y - 20), (x + 5, y + 6), (x - 5 - wide, y - 20),
-             (x - 5 - wide, y + 6)]
-    boxes = [(a, b, a + wide, b + high) for a, b in spots]
-    free = [box for box in boxes if not any(_meet(box, other) for other in taken)]
-    box = (free or boxes)[0]
-    draw.text(box[:2], label, fill=(24, 40, 92), font=size)
-    return box
-
-
-def _meet(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+    for camera in cameras:
+        image = Image.fromarray(render([Solid(body), Dots(points, colors, radius)], camera, width, height))
+        draw, taken = ImageDraw.Draw(image), list[tuple[float, float, float, float]]()
+        towards = camera.position - points
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        hidden = Rays(body).occluded(points + 1e-4 * towards, towards)
+        places = camera.project(points, width, height)
+        # each label beside its marker, where no other label is
+        for i in np.argsort(places[:, 1]):
+            if hidden[i]:
+                continue
+            wide, (x, y) = draw.textlength(layout.labels[i], font=size), places[i]
+            boxes = [(a, b, a + wide, b + 13) for a, b in (
+                (x + 7, y - 7), (x - 7 - wide, y - 7), (x + 5, y - 20), (x + 5, y + 6), (x - 5 - wide, y - 20),
+                (x - 5 - wide, y + 6))]
+            free = [box for box in boxes if not any(
+                box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3]
+                for other in taken)]
+            taken.append((free or boxes)[0])
+            draw.text(taken[-1][:2], layout.labels[i], fill=(24, 40, 92), font=size)
+        images.append(np.asarray(image))
+    return side_by_side(images, SIDES)
 
 
 def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = None) -> list[tuple[str, ...]]:

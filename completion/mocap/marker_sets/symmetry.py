@@ -58,9 +58,8 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
 
     Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
     """
-    pairs = label_pairs(layout.labels)
-    pairs[[other_side(label) is None for label in layout.labels]] = -1
-    untold = np.flatnonzero([other_side(label) is None for label in layout.labels])
+    pairs, untold = label_pairs(layout.labels), np.flatnonzero([other_side(label) is None for label in layout.labels])
+    pairs[untold] = -1
     if len(untold) == 0:
         return pairs
     mirror = mirror or find_skin_mirror(template)
@@ -100,10 +99,16 @@ def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks:
     ValueError
         Not symmetric; landmarks without three pairs of sides.
     """
-    if landmarks is None:
-        body, image, normal = _by_symmetry(template, poses)
+    if landmarks is not None:
+        body, (image, normal) = template, _by_landmarks(template, landmarks)
     else:
-        body, image, normal = _by_landmarks(template, landmarks)
+        symmetry = find_symmetry(template, poses)
+        if not symmetry.holds:
+            raise ValueError("template: expected one that stands symmetrically, its mirror image is "
+                             f"{symmetry.distance:.1%} of its size away; give landmarks whose names tell the sides")
+        body, image, normal = template, symmetry.image, symmetry.normal
+        if symmetry.pose >= 0 and poses is not None:
+            body = template.with_vertices(poses[symmetry.pose])
     found = Surface(body).closest(image)
     again = np.einsum("nc,ncd->nd", found.bary, found.points[body.faces[found.faces]])
     partner = cKDTree(body.vertices).query(found.points)[1]
@@ -111,18 +116,8 @@ def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks:
                       float(np.average(np.linalg.norm(again - body.vertices, axis=1), weights=body.vertex_areas)))
 
 
-def _by_symmetry(template: Mesh, poses: np.ndarray | None) -> tuple[Mesh, np.ndarray, np.ndarray]:
-    """The body in the pose that serves, the images (N, 3) of its vertices, and the normal of the plane."""
-    found = find_symmetry(template, poses)
-    if not found.holds:
-        raise ValueError("template: expected one that stands symmetrically, its mirror image is "
-                         f"{found.distance:.1%} of its size away; give landmarks whose names tell the sides")
-    body = template if found.pose < 0 or poses is None else template.with_vertices(poses[found.pose])
-    return body, found.image, found.normal
-
-
-def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[Mesh, np.ndarray, np.ndarray]:
-    """As `_by_symmetry`, from landmarks on both sides; the normal points to the left."""
+def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray]:
+    """The images (N, 3) of the vertices, from landmarks on both sides, and the normal of the plane, to the left."""
     from scanprep.registration.nonrigid import register
 
     pairs = [(v, landmarks[other]) for name, v in landmarks.items()
@@ -137,4 +132,4 @@ def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[Mesh, n
     normal = plane.normal * np.sign(((template.vertices[left] - template.vertices[right]) @ plane.normal).sum())
     start = plane.reflect(template.vertices)
     marks = np.r_[left, right, middle].astype(np.int64), y
-    return template, register(Mesh(start, template.faces[:, ::-1]), template, marks).mesh.vertices, normal
+    return register(Mesh(start, template.faces[:, ::-1]), template, marks).mesh.vertices, normal

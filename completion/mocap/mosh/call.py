@@ -51,22 +51,16 @@ class MoshCall(KeptCall):
     def models(self) -> Models:
         """All that was named, read."""
         loaded, name = read_model(self.model[0] if self.model else None)
-        return Models(loaded, name, _sexes(self.model, self.retarget_to),
-                      None if self.retarget_to is None else _character(self.retarget_to, loaded))
-
-
-def _sexes(models: tuple[Path, ...], character: Path | None) -> dict[str, BodyModel]:
-    """The models of women and men, where they are given."""
-    if len(models) not in (0, 1, 3):
-        raise UsageError(f"--model: expected one, or three of both sexes, of women and of men, got {len(models)}")
-    if character is not None and len(models) == 3:
-        raise UsageError("--character: a character is made of one model; expected one --model, got 3")
-    return dict(zip(("female", "male"), map(load_model, models[1:]), strict=True)) if len(models) == 3 else {}
-
-
-def _character(path: Path, model: BodyModel) -> BodyModel:
-    character = load_model(path)
-    if character.kind != model.kind or character.template.faces.shape != model.template.faces.shape:
-        raise ValueError(f"{path}: expected a character made of the model, with its {len(model.template.faces)} "
-                         f"triangles, found {character.kind} with {len(character.template.faces)}")
-    return character
+        if len(self.model) not in (0, 1, 3):
+            raise UsageError("--model: expected one, or three of both sexes, of women and of men, got "
+                             f"{len(self.model)}")
+        if self.retarget_to is not None and len(self.model) == 3:
+            raise UsageError("--character: a character is made of one model; expected one --model, got 3")
+        sexes = dict(zip(("female", "male"), map(load_model, self.model[1:]), strict=True)) if self.model[1:] else {}
+        character = None if self.retarget_to is None else load_model(self.retarget_to)
+        if character and (character.kind != loaded.kind
+                          or character.template.faces.shape != loaded.template.faces.shape):
+            raise ValueError(f"{self.retarget_to}: expected a character made of the model, with its "
+                             f"{len(loaded.template.faces)} triangles, found {character.kind} with "
+                             f"{len(character.template.faces)}")
+        return Models(loaded, name, sexes, character)

@@ -31,8 +31,8 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
                  subjects: str = "auto", subject_prefix: str | None = None, hold_out: tuple[str, ...] = (),
                  retarget_to: Annotated[Path | None, Called("--character")] = None, unit: Unit | None = None,
-                 rate: Positive | None = None, config: MoshConfig = MoshConfig(),               # noqa: B008
-                 workers: Workers = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
+                 rate: Positive | None = None, config: MoshConfig = MoshConfig(),
+                 workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
     Example: scape mosh walk.c3d -o out
@@ -79,29 +79,41 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     call = MoshCall(markers, model, layout, subjects, subject_prefix, held, retarget_to, unit, rate,
                     config)
     with bar("people") as people, bar("one of them") as inside:
-        return carried_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
+        return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
 
-def carried_out(call: MoshCall, space: Workspace, workers: Workers, command: str, *tell: Progress) -> Outcome:
+def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, *tell: Progress) -> Outcome:
     """Do what has changed of a call in an output that is open; `tell` is the progress of people, and inside one."""
     actors, loaded = call.actors(space.folder), call.models()
     work = Work(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
                 None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
                 call.unit, call.rate, call.config, command)
-    _keep_table(space, actors, call.subjects)
-    _tell(actors)
+    # who is who into subjects.csv; one that was mended stays as it is, and has to be named
+    table = space.folder / TABLE
+    if not table.exists() or space.is_ours(TABLE):
+        with space.staging("people") as staged:
+            write_table(staged.folder / TABLE, actors)
+    elif Grouping.of(call.subjects).table is not None:
+        warnings.warn(f"{table}: left as it was mended", stacklevel=2)
+    else:
+        raise ValueError(f"{table}: was mended; go by it with --subjects {table}, or move it away")
+    for actor in actors[:20]:
+        files, more = ", ".join(r.path.name for r in actor.recordings[:4]), len(actor.recordings) - 4
+        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''} ({actor.rule})")
+    if len(actors) > 20:
+        say(f"and {len(actors) - 20} more people")
     done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, *tell)
     results = Results({name: rows for name, (rows, _) in done.values.items()},
                       {name: line if line.startswith(f"{name}: ") else f"{name}: {line}"
                        for name, line in done.failures.items()}, done.fresh)
     lost = [f"{name}: {line}" for name, (_, failed) in done.values.items() for line in failed]
-    outcome = told(call, loaded.name, actors).write(space, results, len(actors), lost)
+    outcome = describe(call, loaded.name, actors).write(space, results, len(actors), lost)
     judged = [judgement_of(rows) for rows in results.values.values()]
     return replace(outcome, judgement=judged[0] if judged and len(actors) == 1 else outcome.judgement,
                    following=f"open {space.folder / 'report.html'}")
 
 
-def told(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
+def describe(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
     """What is told of the people of a call; `model` is its name."""
     rules = {actor.name: actor.rule for actor in actors}
 
@@ -114,28 +126,6 @@ def told(call: MoshCall, model: str, actors: Sequence[Actor]) -> FolderCommand:
         {"mosh": call.config, "model": model, "layout": call.layout, "held out": call.hold_out}, lines,
         "A marker that sits elsewhere than the layout has it, labels that are exchanged, a marker that should not be "
         "used: open this folder with `scape view` and press `mend` to put them right and run again.", call)
-
-
-def _keep_table(space: Workspace, actors: Sequence[Actor], subjects: str) -> None:
-    """Who is who into subjects.csv; one that was mended stays as it is, and has to be named."""
-    table = space.folder / TABLE
-    if not table.exists() or space.is_ours(TABLE):
-        with space.staging("people") as staged:
-            write_table(staged.folder / TABLE, actors)
-    elif Grouping.of(subjects).table is not None:
-        warnings.warn(f"{table}: left as it was mended", stacklevel=2)
-    else:
-        raise ValueError(f"{table}: was mended; go by it with --subjects {table}, or move it away")
-
-
-def _tell(actors: list[Actor], most: int = 20) -> None:
-    """Who is taken to be who."""
-    for actor in actors[:most]:
-        files = ", ".join(r.path.name for r in actor.recordings[:4])
-        more = len(actor.recordings) - 4
-        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''} ({actor.rule})")
-    if len(actors) > most:
-        say(f"and {len(actors) - most} more people")
 
 
 def _summary(results: Results, count: int) -> list[Metric]:

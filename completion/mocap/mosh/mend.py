@@ -25,7 +25,7 @@ from scanprep.viewer.surface_clicks import Clickable
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
-from .cli import carried_out, told
+from .cli import carry_out, describe
 from .mended_layout import Spot, changes, mended, next_file
 from .people import Found, found_people
 from .work import ERRORS
@@ -52,7 +52,7 @@ class Result:
         names = set(kept.kept(""))
         actors = [actor for actor in call.actors(folder) if actor.name in names]
         rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
-        order = told(call, models.name, actors).worst_first(Results(rows, {}, ()), rows)
+        order = describe(call, models.name, actors).worst_first(Results(rows, {}, ()), rows)
         people = found_people(folder, sorted(actors, key=lambda actor: order.index(actor.name)), models, call.unit,
                               call.rate)
         return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
@@ -147,12 +147,9 @@ class MoshApp(ResultsApp):
 
     def on_open(self, send: Send, scan: int) -> None:
         """Another person."""
-        if not 0 <= scan < len(self.scans):
-            raise ValueError(f"person: expected 0 to {len(self.scans) - 1}, got {scan}")
         if scan != self.current:
-            self.current, self.frame = scan, 0
-            self.choose_next(None)
-            send(self.scene())
+            self.frame = 0
+        super().on_open(send, scan)
 
     def on_frame(self, send: Send, frame: int) -> None:
         """Another of the worst frames."""
@@ -196,7 +193,7 @@ class MoshApp(ResultsApp):
         before = {one.name: self.result.figures(one.name) for one in self.result.people}
 
         def do(space: Workspace, tell: Progress) -> tuple[Outcome, str]:
-            outcome = carried_out(call, space, Workers(workers=1), MENDED, lambda done, total: None, tell)
+            outcome = carry_out(call, space, Workers(workers=1), MENDED, lambda done, total: None, tell)
             self.before = before
             failed = f"; failed: {'; '.join(outcome.failures)}" if outcome.failures else ""
             return outcome, f"run again with {Path(str(call.layout)).name}{failed}"

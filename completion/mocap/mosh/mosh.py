@@ -22,9 +22,8 @@ from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import animate
-from ..pose.settings import RATE, AnimateConfig
-from ..soft_tissue.follow import follow_soft_tissue
-from ..soft_tissue.settings import SoftTissueConfig
+from ..pose.marked_body import RATE, AnimateConfig
+from ..soft_tissue.follow import SoftTissueConfig, follow_soft_tissue
 from ..soft_tissue.soft_tissue import SoftTissue
 from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
 from ..subject.worn_elsewhere import Worn, find_worn
@@ -158,40 +157,67 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
 
     [MoSh] Eq. 23, Eq. 24
     """
-    config, sequences = config or MoshConfig(), one_or_more(sequences)
-    stages = _Stages(step, progress, STEPS * (1 + len(sequences) * (2 + config.soft_tissue)))
-    used = [_relabelled(stages, i, each, config) for i, each in enumerate(sequences)]
-    person = _person(stages, model, used, layout, config)                       # [MoSh] Eq. 23, shape and markers
-    worn = _worn(stages, person, used, layout, config)
-    orders, seen = [worn.order(each, layout) for each in sequences], [each.seen for each in sequences]
+    config = config or MoshConfig()
+    trials = [_Trial(i, each, each) for i, each in enumerate(one_or_more(sequences))]
+    stages = _Stages(model, config, step, progress, STEPS * (1 + len(trials) * (2 + config.soft_tissue)))
+
+    # shape and marker places from some frames, with labels as far as tracks tell; then what is worn elsewhere
+    for trial in trials:
+        stages.relabel(trial)
+    person = stages.find_person(trials, layout)                                 # [MoSh] Eq. 23, shape and markers
+    worn = stages.find_worn(trials, layout, person)
     if worn.changes:
-        sequences, used = ([worn.named(each, layout) for each in some] for some in (sequences, used))
+        for trial in trials:
+            trial.order = worn.order(trial.raw, layout)
+            trial.raw, trial.markers = worn.named(trial.raw, layout), worn.named(trial.markers, layout)
         layout = worn.placed(layout)
-        person = _person(stages, model, used, layout, config, "worn")
-    none, motions, artefacts = (None,) * len(used), list[Motion](), list[MarkerArtefacts]()
-    for n in range(3):  # most times that a person is followed and the markers are judged
-        motions = [_motion(stages, f"poses {n} {i}", person, each, config, near)    # [MoSh] Eq. 23, poses
-                   for i, (each, near) in enumerate(zip(used, motions or none, strict=True))]
-        artefacts = [_artefacts(stages, f"artefacts {n} {i}", person, each, motion, config, known) for i, (
-            each, motion, known) in enumerate(zip(sequences, motions, artefacts or none, strict=True))]
-        before, used = used, [each.repaired for each in artefacts]
-        settled = all(_same(before[i], used[i], t) for i, t in person.fit.frames)
+        person = stages.find_person(trials, layout, "worn")
+
+    # the poses of all frames, by which the markers are judged; where a frame of the person changed, it is found again
+    for n in range(3):
+        for trial in trials:
+            stages.follow(trial, person, f"poses {n} {trial.number}")           # [MoSh] Eq. 23, poses
+        for trial in trials:
+            stages.judge(trial, person, f"artefacts {n} {trial.number}")
+        settled = all(trials[i].unchanged(t) for i, t in person.fit.frames)
         if settled:
             break
-        person = _person(stages, model, used, layout, config, f"again {n}")
-    motions = [motion if settled and _same(old, new) else _motion(
-        stages, f"poses last {i}", person, new, config, motion)
-               for i, (motion, old, new) in enumerate(zip(motions, before, used, strict=True))]
-    soft = [_soft_tissue(stages, i, person, each, motion, config)               # [MoSh] Eq. 24
-            for i, (each, motion) in enumerate(zip(used, motions, strict=True)) if config.soft_tissue]
-    told = tuple(each.renamed(*names) for each, *names in zip(artefacts, orders, seen, strict=True))
-    return MoshResult(person.fit.betas, person.fit.layout, person.fit, tuple(motions), tuple(soft), told, worn,
-                      stages.seconds)
+        person = stages.find_person(trials, layout, f"again {n}")
+    for trial in trials:
+        if not (settled and trial.unchanged()):
+            stages.follow(trial, person, f"poses last {trial.number}")
+        if config.soft_tissue:
+            stages.find_soft_tissue(trial, person)                              # [MoSh] Eq. 24
+    every = [trial.result() for trial in trials]
+    return MoshResult(person.fit.betas, person.fit.layout, person.fit, tuple(motion for motion, _, _ in every),
+                      tuple(soft for _, soft, _ in every if soft is not None), tuple(found for *_, found in every),
+                      worn, stages.seconds)
 
 
-def _same(first: MarkerSequence, second: MarkerSequence, frames: int | slice = slice(None)) -> bool:
-    """Whether two sequences hold the same markers in the same places, in some frames."""
-    return np.array_equal(first.positions[frames], second.positions[frames], equal_nan=True)
+@dataclass(eq=False)
+class _Trial:
+    """A recording on its way through the stages: the markers as they came, as repaired by now, and what was found."""
+
+    number: int
+    raw: MarkerSequence                  # with names put back that were exchanged throughout
+    markers: MarkerSequence
+    followed: MarkerSequence | None = None       # the markers that `motion` follows
+    order: np.ndarray | None = None      # (L,) from which column of the recording `raw` takes each label
+    motion: Motion | None = None
+    artefacts: MarkerArtefacts | None = None
+    soft: SoftTissue | None = None
+
+    def unchanged(self, frames: int | slice = slice(None)) -> bool:
+        """Whether the markers of some frames are those that the motion follows."""
+        assert self.followed is not None, "followed"
+        return np.array_equal(self.followed.positions[frames], self.markers.positions[frames], equal_nan=True)
+
+    def result(self) -> tuple[Motion, SoftTissue | None, MarkerArtefacts]:
+        """What was found, artefacts by the labels of the recording as it came."""
+        assert self.motion is not None and self.artefacts is not None, "followed and judged"
+        if self.order is None:
+            return self.motion, self.soft, self.artefacts
+        return self.motion, self.soft, self.artefacts.renamed(self.order, self.raw.seen[:, np.argsort(self.order)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,15 +241,17 @@ def clocks() -> np.ndarray:
 class _Stages:
     """What runs the stages of a call: each is kept by what it depends on, its seconds count, the bar moves."""
 
+    model: BodyModel
+    config: MoshConfig
     step: Step
     progress: Progress | None
     total: int
     done: int = 0
     seconds: dict[str, np.ndarray] = field(default_factory=dict)
 
-    def run(self, stage: str, name: str, inputs: Any, make: Callable[[Progress | None], T], told: bool = False) -> T:
-        """What `make` finds, or found in an earlier run; it moves the bar if it is told."""
-        before, self.done = self.done, self.done + STEPS * told
+    def run(self, stage: str, name: str, inputs: Any, make: Callable[[Progress | None], T], bar: bool = False) -> T:
+        """What `make` finds, or found in an earlier run; it moves the bar, if it has a share in it."""
+        before, self.done = self.done, self.done + STEPS * bar
 
         def tell(done: int, total: int) -> None:
             if self.progress:
@@ -231,65 +259,60 @@ class _Stages:
 
         def timed() -> tuple[T, np.ndarray]:
             start = clocks()
-            return make(tell if told else None), clocks() - start
+            return make(tell if bar else None), clocks() - start
 
         value, seconds = self.step(name, inputs, timed)
         self.seconds[stage] = self.seconds.get(stage, 0) + seconds
         return value
 
+    def relabel(self, trial: _Trial) -> None:
+        """Labels put right as far as tracks tell."""
+        if self.config.repair:
+            trial.markers = self.run("artefacts", f"tracks {trial.number}", trial.raw,
+                                     lambda _: relabelled_by_tracks(trial.raw))
 
-def _relabelled(stages: _Stages, i: int, markers: MarkerSequence, config: MoshConfig) -> MarkerSequence:
-    """A sequence with labels put right as far as tracks tell."""
-    if not config.repair:
-        return markers
-    return stages.run("artefacts", f"tracks {i}", markers, lambda _: relabelled_by_tracks(markers))
+    def find_person(self, trials: Sequence[_Trial], layout: MarkerLayout, again: str = "") -> _Person:
+        """Shape and marker places; `again` names it where it was found before, of other markers."""
+        used, config, step = [trial.markers for trial in trials], self.config.person, self.step
+        step = inside(step, again) if again else step
+        return _Person(self.model, self.run(
+            "person", f"{again} person".strip(), (self.model, used, layout, config),
+            lambda tell: find_person(self.model, used, layout, config, tell, step), not again))
 
+    def find_worn(self, trials: Sequence[_Trial], layout: MarkerLayout, person: _Person) -> Worn:
+        """Which markers are not worn as the layout says."""
+        given = self.model, [trial.markers for trial in trials], layout, person.fit, self.config.person
+        return self.run("person", "worn", given, lambda _: find_worn(*given)) if self.config.repair else Worn()
 
-def _person(stages: _Stages, model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
-            config: MoshConfig, again: str = "") -> _Person:
-    """Shape and marker places; `again` names it where it was found before, of other markers."""
-    step = inside(stages.step, again) if again else stages.step
-    return _Person(model, stages.run(
-        "person", f"{again} person".strip(), (model, sequences, layout, config.person),
-        lambda tell: find_person(model, sequences, layout, config.person, tell, step), not again))
+    def follow(self, trial: _Trial, person: _Person, name: str) -> None:
+        """The motion of a person of fixed shape, near that of one who was thought to be a little different."""
+        fit, poses, markers, near = person.fit, self.config.poses, trial.markers, trial.motion
+        trial.motion = self.run("poses", name, (self.model, fit.betas, fit.layout, markers, poses, near),
+                                lambda tell: animate(person.subject, markers, fit.layout, poses, tell, near),
+                                near is None)
+        trial.followed = markers
 
+    def judge(self, trial: _Trial, person: _Person, name: str) -> None:
+        """What is wrong with the markers, by the body that carries them and by what the person before has told."""
+        fit, markers, motion, known = person.fit, trial.raw, trial.motion, trial.artefacts
+        assert motion is not None, "followed"
+        if not self.config.repair:
+            trial.artefacts = no_artefacts(person.subject, markers, fit.layout, motion)
+            return
+        bad = self.config.artefacts
+        trial.artefacts = self.run(
+            "artefacts", name, (self.model, fit.betas, fit.layout, markers, motion, bad, known),
+            lambda tell: find_artefacts(person.subject, markers, fit.layout, bad, motion, tell, known), known is None)
+        trial.markers = trial.artefacts.repaired
 
-def _worn(stages: _Stages, person: _Person, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
-          config: MoshConfig) -> Worn:
-    """Which markers are not worn as the layout says."""
-    if not config.repair:
-        return Worn()
-    model = person.model
-    return stages.run("person", "worn", (model, sequences, layout, person.fit, config.person), lambda _: find_worn(
-        model, sequences, layout, person.fit, config.person))
-
-
-def _motion(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, config: MoshConfig,
-            near: Motion | None) -> Motion:
-    """The motion of a person of fixed shape; `near` is that of a person who was thought to be a little different."""
-    fit, poses = person.fit, config.poses
-    return stages.run("poses", name, (person.model, fit.betas, fit.layout, markers, poses, near),
-                      lambda tell: animate(person.subject, markers, fit.layout, poses, tell, near), near is None)
-
-
-def _artefacts(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, motion: Motion,
-               config: MoshConfig, known: MarkerArtefacts | None) -> MarkerArtefacts:
-    """What is wrong with the markers, by the body that carries them; `known` is what the person before has told."""
-    fit, judge = person.fit, config.artefacts
-    if not config.repair:
-        return no_artefacts(person.subject, markers, fit.layout, motion)
-    return stages.run("artefacts", name, (person.model, fit.betas, fit.layout, markers, motion, judge, known),
-                      lambda tell: find_artefacts(person.subject, markers, fit.layout, judge, motion, tell, known),
-                      known is None)
-
-
-def _soft_tissue(stages: _Stages, i: int, person: _Person, markers: MarkerSequence, motion: Motion, config: MoshConfig
-                 ) -> SoftTissue:
-    """The motion with a shape that changes."""
-    model, layout, soft = person.model, person.fit.layout, config.soft
-    ground, floor = config.poses.ground, config.poses.floor
-    return stages.run("soft tissue", f"soft tissue {i}", (model, layout, markers, motion, soft, ground, floor),
-                      lambda tell: follow_soft_tissue(model, motion, markers, layout, soft, tell, ground, floor), True)
+    def find_soft_tissue(self, trial: _Trial, person: _Person) -> None:
+        """How the skin, or the shape, moves."""
+        model, layout, markers, motion = self.model, person.fit.layout, trial.markers, trial.motion
+        soft, ground, floor = self.config.soft, self.config.poses.ground, self.config.poses.floor
+        assert motion is not None, "followed"
+        trial.soft = self.run(
+            "soft tissue", f"soft tissue {trial.number}", (model, layout, markers, motion, soft, ground, floor),
+            lambda tell: follow_soft_tissue(model, motion, markers, layout, soft, tell, ground, floor), True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,30 +28,45 @@ from .pictures import chart_artefacts, chart_frames, chart_map, chart_timeline
 from .takes import Take
 
 SOME = 56                            # frames that changes of the body are measured in
-COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
-          "green for held-out markers, which no stage has seen.")
 
 
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
                 metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]], settings: Mapping[str, Any]
                 ) -> Page:
     """Shape and markers of a person, before in the `usual` layout, and the way to its sequences and their figures."""
-    body = pictures.standing(model, result.betas)
-    labels = result.layout.labels
+    body, labels, worn = pictures.standing(model, result.betas), result.layout.labels, result.worn
     before = usual.select(labels)
     found, moved = pictures.change_of_place(body, before, result.layout)
     page = Page(f"{name}: body shape and markers",
                 f"Found from the markers of {len(takes)} {'sequence' if len(takes) == 1 else 'sequences'} alone.")
-    told = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, np.linalg.norm(moved, axis=1), strict=True)]
-    page.bodies([pictures.person_pane(body, found, before.place(body), told)],
+    ways = [f"{label}: {MM * far:.0f} mm" for label, far in zip(labels, np.linalg.norm(moved, axis=1), strict=True)]
+    page.bodies([pictures.person_pane(body, found, before.place(body), ways)],
                 "the body in the mean pose of the model's people; red: where the markers sat, blue: where the layout "
                 "has them, with a rod from the one to the other", 520)
     page.section("Sequences")
     for take in takes:
         add_entry(page, take.name, map(as_line, _main(figures[take.name])))
-    _worn_section(page, result)
+    if worn.changes or worn.too_many:
+        page.section("Markers worn elsewhere", "Markers that were far from where the layout has them, sought over the "
+                     "whole body that the others tell.")
+        page.table([*((f"{first} and {second}", "bore each other's name; put back", np.nan, np.nan)
+                      for first, second in worn.exchanged),
+                    *((m.label, "worn elsewhere; moved there", MM * m.before, MM * m.after) for m in worn.moved),
+                    *((label, "no place on the skin explains it; left out", np.nan, np.nan) for label in worn.unplaced),
+                    *((label, "too many are far off; let be", np.nan, np.nan) for label in worn.too_many)],
+                   ("marker", "what was found", "from the layout's place (mm)", "from the new place (mm)"))
+    # the markers, that which moved most first
+    left: dict[str, list[np.ndarray]] = {}
+    for take in takes:
+        for label, column in zip(take.motion.labels, take.motion.residuals.T, strict=True):
+            left.setdefault(label, []).append(column)
+    lifts = np.asarray(before.distances), np.asarray(result.layout.distances)
+    rows = [(label, MM * float(np.linalg.norm(moved[i])), *(MM * moved[i]).round(1).tolist(),
+             *(MM * float(lift[i]) for lift in lifts),
+             MM * float(mean_over(np.concatenate(left.get(label, [np.array([np.nan])])), 0)))
+            for i, label in enumerate(before.labels)]
     page.section("Markers before and after", "From where the layout has each marker to where it was found.")
-    page.table(_moved_rows(result, before, moved, takes),
+    page.table(sorted(rows, key=lambda row: -row[1]),
                ("marker", "moved (mm)", "up (mm)", "forward (mm)", "to the left (mm)", "off the skin, layout (mm)",
                 "found (mm)", "distance left, fixed shape (mm)"))
     if before.loose:
@@ -61,24 +76,13 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     return closing(page, metrics, settings)
 
 
-def _worn_section(page: Page, result: MoshResult) -> None:
-    worn = result.worn
-    if not (worn.changes or worn.too_many):
-        return
-    page.section("Markers worn elsewhere", "Markers that were far from where the layout has them, sought over the "
-                 "whole body that the others tell.")
-    page.table([*((f"{first} and {second}", "bore each other's name; put back", np.nan, np.nan)
-                  for first, second in worn.exchanged),
-                *((m.label, "worn elsewhere; moved there", MM * m.before, MM * m.after) for m in worn.moved),
-                *((label, "no place on the skin explains it; left out", np.nan, np.nan) for label in worn.unplaced),
-                *((label, "too many are far off; let be", np.nan, np.nan) for label in worn.too_many)],
-               ("marker", "what was found", "from the layout's place (mm)", "from the new place (mm)"))
-
-
 def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Page:
     """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
+    motion, held, artefacts = take.motion, take.held, take.artefacts
     frames = spread_indices(len(take.shown.poses), SOME)
-    page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
+    page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}",
+                "Dots are the measured markers: red where they are believed, orange where they are seen but not "
+                "believed, green for held-out markers, which no stage has seen.")
     page.table([(m.name, m.text(), m.unit) for m in _main(metrics)])
     page.section("The whole sequence").bodies(
         [pictures.take_pane(take)], "Press the triangle to play, drag the body to turn it; it is kept in the middle.",
@@ -88,12 +92,41 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
     page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
                                 "as bad")
     page.bodies(pictures.frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest", 300)
-    page.table(_marker_rows(take), ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)",
-                                    "seen (%)", "believed (%)"))
-    _unused(page, take)
+    # the markers, the worst first, held-out ones above all
+    rows = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
+                       motion.trusted)
+    if held is not None:
+        rows = marker_rows([f"{label} (held out)" for label in held.labels], held.fixed, held.soft, None) + rows
+    page.table(rows, ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)", "seen (%)",
+                      "believed (%)"))
+    used = np.isfinite(motion.residuals).any(axis=0)
+    unused = [label for label, is_used in zip(motion.labels, used, strict=True)
+              if not is_used and (held is None or label not in held.labels)]
+    if unused:
+        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
     if take.soft is not None:
-        _soft_section(page, take, frames)
-    _artefact_section(page, take)
+        page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one "
+                     "fixed shape cannot. What it takes up may also be markers that slide with the skin.")
+        page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
+        page.bodies(pictures.changed_panes(take, pictures.most_changed(take, frames, 4)),
+                    "frames that change most", 300)
+    page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
+                 "swapped with another, has slipped, jitters or strays.")
+    found = [("swapped", f"{e.first} and {e.second}", e.begin, e.end, (e.end - e.begin + 1) / motion.rate, np.nan)
+             for e in artefacts.swaps]
+    found += [(b.kind, b.label, b.begin, b.end, (b.end - b.begin + 1) / motion.rate, MM * b.distance)
+              for b in artefacts.bad]
+    if found:
+        page.table(sorted(found, key=lambda row: row[2]),
+                   ("artefact", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
+    else:
+        page.text("None was found.")
+    page.chart(chart_timeline(take), "every marker over time")
+    if not artefacts.labels_touched.isdisjoint(artefacts.labels):
+        out = io.BytesIO()                          # as pixels: as lines it would grow with the sequence
+        chart_artefacts(artefacts, take.markers).savefig(out, format="png", dpi=130)
+        page.picture(out.getvalue(), "these markers: how far they were from where the body has them, and what is left "
+                     "of it")
     return page
 
 
@@ -102,39 +135,6 @@ def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) 
     page.section("Figures").figures(metrics)
     text = escape(json.dumps(storage.as_json(settings), indent=1))
     return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
-
-
-def _soft_section(page: Page, take: Take, frames: np.ndarray) -> None:
-    page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one fixed "
-                 "shape cannot. What it takes up may also be markers that slide with the skin.")
-    page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
-    page.bodies(pictures.changed_panes(take, pictures.most_changed(take, frames, 4)),
-                "frames that change most", 300)
-
-
-def _artefact_section(page: Page, take: Take) -> None:
-    artefacts, rate = take.artefacts, take.motion.rate
-    page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
-                 "swapped with another, has slipped, jitters or strays.")
-    found = [("swapped", f"{e.first} and {e.second}", e.begin, e.end, (e.end - e.begin + 1) / rate, np.nan)
-             for e in artefacts.swaps]
-    found += [(b.kind, b.label, b.begin, b.end, (b.end - b.begin + 1) / rate, MM * b.distance) for b in artefacts.bad]
-    if found:
-        page.table(sorted(found, key=lambda row: row[2]),
-                   ("artefact", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
-    else:
-        page.text("None was found.")
-    page.chart(chart_timeline(take), "every marker over time")
-    if not artefacts.labels_touched.isdisjoint(artefacts.labels):
-        page.picture(_drawn(chart_artefacts(artefacts, take.markers)), "these markers: how far they were from where "
-                     "the body has them, and what is left of it")
-
-
-def _drawn(figure: Any) -> bytes:
-    """A chart as pixels: as lines it would grow with the sequence."""
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=130)
-    return out.getvalue()
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
@@ -153,52 +153,14 @@ def _chosen_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
     person, subject, light = result.person, takes[0].subject, takes[0].light
     panes, vertical = [], upwards(takes[0].shown, subject)
     for (number, t), pose, trans in zip(person.frames.tolist(), person.poses, person.trans, strict=True):
-        vertices, take = subject.vertices(pose, trans).astype(float), takes[number]
-        dots = Dots(take.markers.select(_there(take, result)).positions[t], MARKER, 0.015)
+        vertices, markers = subject.vertices(pose, trans).astype(float), takes[number].markers
+        known = result.layout.matched(markers.labels, 0)
+        dots = Dots(markers.select([label for label in markers.labels if label in known]).positions[t], MARKER, 0.015)
         panes.append(Pane([light.mesh(vertices), dots], facing(subject, pose, vertices, vertical=vertical),
                           str(t) if len(takes) == 1 else f"{number + 1}: {t}"))
     return panes
 
 
-def _there(take: Take, result: MoshResult) -> list[str]:
-    return [label for label in take.markers.labels if label in result.layout.matched(take.markers.labels, 0)]
-
-
-def _moved_rows(result: MoshResult, before: MarkerLayout, moved: np.ndarray, takes: Sequence[Take]
-                ) -> list[tuple[Any, ...]]:
-    """The markers, that which moved most first."""
-    left: dict[str, list[np.ndarray]] = {}
-    for take in takes:
-        for label, column in zip(take.motion.labels, take.motion.residuals.T, strict=True):
-            left.setdefault(label, []).append(column)
-    out = []
-    for i, label in enumerate(before.labels):
-        off = np.concatenate(left.get(label, [np.array([np.nan])]))
-        out.append((label, MM * float(np.linalg.norm(moved[i])), *(MM * moved[i]).round(1).tolist(),
-                    MM * float(np.asarray(before.distances)[i]), MM * float(np.asarray(result.layout.distances)[i]),
-                    MM * float(mean_over(off, 0))))
-    return sorted(out, key=lambda row: -row[1])
-
-
 def _main(metrics: Sequence[Metric]) -> list[Metric]:
     """Those that tell how good a motion is."""
     return [m for m in metrics if m.unit == "mm" or m.name in ("frames", "swaps", "bad spans")]
-
-
-def _marker_rows(take: Take) -> list[tuple[Any, ...]]:
-    """The markers, the worst first, held-out ones above all."""
-    motion, held = take.motion, take.held
-    found = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
-                        motion.trusted)
-    if held is not None:
-        found = marker_rows([f"{label} (held out)" for label in held.labels], held.fixed, held.soft, None) + found
-    return found
-
-
-def _unused(page: Page, take: Take) -> None:
-    held = () if take.held is None else take.held.labels
-    used = np.isfinite(take.motion.residuals).any(axis=0)
-    unused = [label for label, is_used in zip(take.motion.labels, used, strict=True)
-              if not is_used and label not in held]
-    if unused:
-        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")

@@ -25,14 +25,14 @@ from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
 
 from ...motion_pictures import picture_bodies
-from ..artefacts.results import MarkerArtefacts, artefact_table, write_virtual
+from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
 from ..files.opensim import centre_sequence, known_centres
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage
-from ..pose.robust import judge_motions, markers_told, motion_doubts, motion_problem
+from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
@@ -73,9 +73,18 @@ class Work:
         found, failures = _solve(self, actor, room)
         solved = clocks() - start
         settings = {"mosh": self.config, "model": self.name, "layout": found.layout_name, "held out": self.hold_out}
-        _write_person(folder, found.result, {
-            "model": self.name, "layout": found.layout_name, "held_out": self.hold_out, "sex": found.guess,
-            "recordings": [r.path.name for r in actor.recordings]})
+        # the person: betas and how they were found, where the markers sat
+        result, person = found.result, found.result.person
+        storage.write_json(folder / "subject.json", {
+            "betas": result.betas.tolist(), "model": self.name, "layout": found.layout_name,
+            "held_out": self.hold_out, "sex": found.guess, "recordings": [r.path.name for r in actor.recordings],
+            "frames": person.frames.tolist(),
+            "moved": dict(zip(result.layout.labels, person.moved.tolist(), strict=True)),
+            "worn_elsewhere": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.worn.moved},
+            "exchanged": result.worn.exchanged, "left_out": result.worn.unplaced, "residual": person.residual,
+            "energies": person.energies, "converged": bool(person.converged)})
+        result.layout.save(folder / "layout.json")
+        # the sequences
         figures: dict[str, list[Metric]] = {}
         pages, total = np.zeros(2), len(found.takes) + 1
         for i, take in enumerate(found.takes):
@@ -83,17 +92,23 @@ class Work:
             figures[take.name], seconds = _write(self, found, take, room, settings)
             pages += seconds
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
+        # the page
         pages -= clocks()
         judgement = found.judgement(found.takes)
         metrics = [judgement_row(judgement), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
-        person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
+        person_page(actor.name, found.model, result, found.usual, found.takes, metrics, figures,
                     settings).write(folder / "report.html")
-        save_png(folder / PICTURE, person_picture(found.model, found.result))
+        save_png(folder / PICTURE, person_picture(found.model, result))
         pages += clocks()
+        # how long the stages took, those done in an earlier run too; not on the page, which is always the same
         whole = clocks() - start
-        # not on the page: it is the same however often it is made
-        metrics += _times(found, {"files": whole - solved - pages, "pages": pages}, whole)
+        stages = {**result.seconds, "files": whole - solved - pages, "pages": pages, "all": whole}
+        count = sum(len(take.motion.poses) for take in found.takes)
+        metrics += details([
+            *(Metric(f"{stage}, {what}", float(seconds[i]), "s") for i, what in
+              ((1, "processor time"), (0, "time by the clock")) for stage, seconds in stages.items()),
+            Metric("speed", count / max(float(whole[1]), 1e-9), "frames/s")])
         write_report(Outcome(folder, metrics, settings, failures, judgement=judgement), self.command, float(whole[0]))
         room.tell(2 * HALF, 2 * HALF)
         return metrics, failures
@@ -134,7 +149,15 @@ class _Found:
 
 
 def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
-    recordings, sequences, failures = _read(work, actor.recordings)
+    recordings, sequences, failures = list[Recording](), list[MarkerSequence](), list[str]()
+    for recording in actor.recordings:
+        try:
+            sequences.append(read_markers(recording.path, work.unit, recording.who, work.rate))
+            recordings.append(recording)
+        except ValueError as error:
+            failures.append(" ".join(str(error).split()))
+    if not sequences:
+        raise ValueError("; ".join(failures))
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = work.layout or choose_layout(work.model, None, labels)
     usual = usual.spelled(labels)
@@ -162,19 +185,6 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     return _Found(model, guess, result, takes, usual, layout_name), failures
 
 
-def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording], list[MarkerSequence], list[str]]:
-    found, sequences, failures = [], [], []
-    for recording in recordings:
-        try:
-            sequences.append(read_markers(recording.path, work.unit, recording.who, work.rate))
-            found.append(recording)
-        except ValueError as error:
-            failures.append(" ".join(str(error).split()))
-    if not sequences:
-        raise ValueError("; ".join(failures))
-    return found, sequences, failures
-
-
 def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]
            ) -> tuple[list[Metric], np.ndarray]:
     """A sequence into its folder, in steps that are kept; the figures, and the seconds (2,) of the page."""
@@ -184,10 +194,6 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
     def place(folder: Path) -> Path:
         (folder / take.name).mkdir(exist_ok=True)
         return folder / take.name
-
-    def character(folder: Path) -> tuple[np.ndarray, str, list[Metric]]:
-        assert work.character is not None, "asked for"
-        return _character(work.character, take, place(folder), factor)
 
     def page(folder: Path) -> None:
         start = time.perf_counter()
@@ -207,24 +213,13 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                           (solved, told, take.source.path, take.source.who, take.unit, factor),
                           lambda folder: write_take(place(folder), take, told, factor))
     shown: list[Any] = []
-    if work.character is not None:
-        *shown, exact = room.files(f"{take.name} character", (solved, work.character, factor), character)
+    if (body := work.character) is not None:
+        *shown, exact = room.files(f"{take.name} character", (solved, body, factor),
+                                   lambda folder: _character(body, take, place(folder), factor))
         metrics += exact
     start = clocks()
     room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
     return metrics, clocks() - start
-
-
-def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) -> None:
-    """subject.json with the betas and how they were found, layout.json with where the markers sat."""
-    person = result.person
-    moved = dict(zip(result.layout.labels, person.moved.tolist(), strict=True))
-    storage.write_json(folder / "subject.json", {
-        "betas": result.betas.tolist(), **about, "frames": person.frames.tolist(), "moved": moved,
-        "worn_elsewhere": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.worn.moved},
-        "exchanged": result.worn.exchanged, "left_out": result.worn.unplaced, "residual": person.residual,
-        "energies": person.energies, "converged": bool(person.converged)})
-    result.layout.save(folder / "layout.json")
 
 
 def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor: float = 1.0) -> list[Metric]:
@@ -247,22 +242,17 @@ def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor:
                   take.source.who, take.unit,
                   centre_sequence(known_centres(joint_centres(motion, body), body.skeleton, told), body.skeleton,
                                   motion.rate))
-    _write_artefacts(folder, take.artefacts)
+    # swapped labels, bad spans and how much was filled in, and the spans as a table
+    storage.write_json(folder / "artefacts.json", artefact_table(take.artefacts))
+    rows: list[tuple[str, str, int, int, str]] = [
+        *(("swapped", f"{s.first} {s.second}", s.begin, s.end, "") for s in take.artefacts.swaps),
+        *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in take.artefacts.bad)]
+    tables.write_table(folder / "artefacts.csv", ("artefact", "markers", "begin", "end", "distance"),
+                       sorted(rows, key=lambda row: (row[2], row[1])))
     return exact
 
 
-def _write_artefacts(folder: Path, found: MarkerArtefacts) -> None:
-    """artefacts.json with swapped labels, bad spans and how much was filled in, and the spans as artefacts.csv."""
-    storage.write_json(folder / "artefacts.json", artefact_table(found))
-    rows: list[tuple[str, str, int, int, str]] = [
-        *(("swapped", f"{s.first} {s.second}", s.begin, s.end, "") for s in found.swaps),
-        *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in found.bad)]
-    tables.write_table(folder / "artefacts.csv", ("artefact", "markers", "begin", "end", "distance"),
-                       sorted(rows, key=lambda row: (row[2], row[1])))
-
-
-def _character(character: BodyModel, take: Take, folder: Path, factor: float
-               ) -> tuple[np.ndarray, str, list[Metric]]:
+def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str, list[Metric]]:
     """The motion on a character: character.npz, character.glb; a picture, what it shows, how exact the GLB is."""
     if take.soft is not None:
         moving = retarget_soft_tissue(take.soft, take.model, character, factor)
@@ -292,16 +282,6 @@ def _person_metrics(found: _Found) -> list[Metric]:
                              float(np.linalg.norm(result.betas)), "sd"),
                       Metric(f"most beside the layout's place ({result.layout.labels[int(moved.argmax())]})",
                              float(moved.max()), "mm")])]
-
-
-def _times(found: _Found, written: Mapping[str, np.ndarray], whole: np.ndarray) -> list[Metric]:
-    """How long the stages took, those done in an earlier run too, and the `whole` (2,) of this one."""
-    frames = sum(len(take.motion.poses) for take in found.takes)
-    stages = {**found.result.seconds, **written, "all": whole}
-    return details([
-        *(Metric(f"{stage}, processor time", float(seconds[1]), "s") for stage, seconds in stages.items()),
-        *(Metric(f"{stage}, time by the clock", float(seconds[0]), "s") for stage, seconds in stages.items()),
-        Metric("speed", frames / max(float(whole[1]), 1e-9), "frames/s")])
 
 
 def _figures(takes: Sequence[Take]) -> list[Metric]:

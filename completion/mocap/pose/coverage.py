@@ -10,6 +10,7 @@ import numpy as np
 from model.linear import Subject
 from scanprep.console import Metric
 from scanprep.judgement import Judgement
+from scanprep.skeleton.roles import above
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion
@@ -17,10 +18,6 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
 FEWEST = 8                           # markers that tell of a body; six hold a pelvis and a head, and no limb
-HALF = 0.5                           # share of a file's markers that are to be used
-# share of the skin on parts that no marker saw: both hands have 5% of it, a head 7%, all above the waist 60%
-UNSEEN_SKIN = 0.25
-PASSING = 0.1                        # share of the frames in which a trajectory is there that counts as a marker
 # trajectories without a name, as Vicon, Motive and Qualisys write them
 UNNAMED = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"
 # points that Plug-in Gait computes: centres of mass, and of every segment its origin and the ends of its three axes
@@ -68,9 +65,10 @@ class Coverage:
             failed.append(f"{some}, a body needs {FEWEST}: other labels than the marker set's? (scape layout show)")
         elif len(self.parts) < 2:
             failed.append(f"all markers used are on one part of the body, the {self.parts[0]}")
-        elif len(self.used) < HALF * self.count:
+        elif len(self.used) < 0.5 * self.count:
             check.append(f"{some}: other labels than the marker set's? (scape layout show)")
-        if self.skin > UNSEEN_SKIN:
+        # both hands have 5% of the skin, a head 7%, all above the waist 60%
+        if self.skin > 0.25:
             check.append(f"no marker saw {', '.join(self.unseen)}: a guess, and their angles are left out")
         return Judgement.of(failed, check)
 
@@ -91,10 +89,9 @@ def find_coverage(subject: Subject, layout: MarkerLayout, motions: Sequence[Moti
     skeleton, body = subject.skeleton, subject.template
     used = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)
             if np.isfinite(column).any()}
-    lasting = set[str]()
-    for one in markers:
-        often = {label for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True) if share >= PASSING}
-        lasting |= often & marker_labels(one.labels)
+    # a trajectory that is there in a tenth of the frames counts as a marker
+    lasting = {label for one in markers for label, share in zip(one.labels, one.seen.mean(axis=0), strict=True)
+               if share >= 0.1 and label in marker_labels(one.labels)}
     doubted = {label for motion in motions for label in motion.distrusted}
     known = {layout.aliases.get(label, label) for label in used - doubted}
     part_of_marker = skeleton.part_of_vertex(body)[layout.nearest]
@@ -122,12 +119,7 @@ def marker_labels(labels: Iterable[str]) -> set[str]:
 
 def between(skeleton: Skeleton, seen: np.ndarray) -> np.ndarray:
     """(J,) bool: the parts (n,) and those on the way from one of them to another."""
-    found, ways = np.zeros(len(skeleton.parents), dtype=bool), []
-    for part in seen.tolist():
-        way = [part]
-        while skeleton.parents[way[-1]] >= 0:
-            way.append(int(skeleton.parents[way[-1]]))
-        ways.append(way)
+    found, ways = np.zeros(len(skeleton.parents), dtype=bool), [above(skeleton.parents, part) for part in seen.tolist()]
     if not ways:
         return found
     # from every part up to the first that all ways have in common

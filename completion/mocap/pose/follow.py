@@ -7,19 +7,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from model.linear import Subject
-from scanprep.geometry.sparse import overlapping_windows
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
-from ...smoothing import OVERLAP, WINDOW, coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from .foot_contact import Floor, FootContact, HeldPoints
+from .foot_contact import FootContact
 from .initialise import reinitialise_limbs, search
-from .marked_body import MarkedBody, batches
-from .robust import judge, label_order, marker_weights
-from .settings import AnimateConfig
+from .marked_body import AnimateConfig, MarkedBody, judge, marker_weights
 from .stream import STEPS, Tracker
+from .swaps import label_order
 
 __all__ = ["AnimateConfig", "animate"]
 
@@ -55,10 +52,10 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
 
     [SCAPE] §8
     """
-    config, labels = config or AnimateConfig(), layout.matched(markers.labels)
-    columns = [markers.labels.index(label) for label in labels]
-    targets, tell = markers.positions[:, columns], progress or (lambda done, total: None)
-    body = MarkedBody(subject, layout.select(labels), config.prior_weight, config.prior_shrinkage)
+    config, tell = config or AnimateConfig(), progress or (lambda done, total: None)
+    columns, worn = layout.worn(markers.labels)
+    targets = markers.positions[:, columns]
+    body = MarkedBody(subject, worn, config.prior_weight, config.prior_shrinkage)
     if config.smoothing or config.ground:
         start = None if near is None else body.body.join(near.poses, near.trans)
         x, order, converged = follow_whole(body, targets, markers.rate, config, tell, start)
@@ -105,23 +102,24 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     """
     T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x = between_keys(body, targets, rate, config) if start is None else start.copy()
-    moved, feet = np.zeros(T), None
-    seen = ~np.isnan(targets[..., 0])
-    inside = seen_span(targets)
+    moved, feet, inside = np.zeros(T), None, seen_span(targets)
     free = max(config.smoothing, 1)
     rounds = free + 2 * (config.ground and T > 2)                       # the last ones with the feet held
     for i in range(rounds):
         if i == free:
-            feet = FootContact(body, x, rate, None if config.floor is None else Floor.given(config.floor))
-        held = None if feet is None else feet.held(x)
+            feet = FootContact(body, x, rate, config.floor)
+        # swapped labels are put right, lost limbs found again, and outliers lose their weight
         order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
         near = reinitialise_limbs(body, x[inside], taken, config)
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
-        x[inside] = smoothed(body, stiffness, near, taken, weights, None if held is None else held.of(inside))
+
+        # one step of all frames together
+        x[inside] = body.smoothed(near, stiffness, body.system, taken, weights) if feet is None else \
+            body.smoothed(near, stiffness, feet.system, taken, weights, feet.held(x)[inside])
         moved[inside] = np.linalg.norm(body.positions(x[inside]) - body.positions(near), axis=2).max(axis=1)
         tell(round(T * (i + 1) / rounds), T)
-    return x, order, seen.any(axis=1) & (moved < STILL)
+    return x, order, (~np.isnan(targets[..., 0])).any(axis=1) & (moved < STILL)
 
 
 def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig) -> np.ndarray:
@@ -148,36 +146,6 @@ def _first_frame(targets: np.ndarray) -> int:
     if seen.max(initial=0) < 3:
         raise ValueError(f"markers: expected a frame with at least 3 known markers, the best has {seen.max(initial=0)}")
     return int(np.argmax(seen >= max(3, 0.9 * seen.max())))
-
-
-FURTHEST = 0.5                       # radians or metres that a step may go
-
-
-def smoothed(body: MarkedBody, stiffness: np.ndarray, x: np.ndarray, targets: np.ndarray, weights: np.ndarray,
-             held: HeldPoints | None = None) -> np.ndarray:
-    """Frames (T, P) after one Gauss-Newton step on markers (T, L, 3), weighted (T, L), and `coupled_steps`."""
-    if len(x) < 3:
-        return x
-    step = np.empty_like(x)
-    for near, kept, where in overlapping_windows(len(x), WINDOW - 2 * OVERLAP, OVERLAP):
-        step[where] = _window_steps(body, stiffness, x, targets, weights, held, near)[kept]
-    longest = np.abs(step).max(axis=1, keepdims=True)
-    return body.retract(x, step * np.minimum(1, FURTHEST / np.maximum(longest, 1e-12)))
-
-
-def _window_steps(body: MarkedBody, stiffness: np.ndarray, x: np.ndarray, targets: np.ndarray, weights: np.ndarray,
-                  held: HeldPoints | None, near: slice) -> np.ndarray:
-    """The steps (n, P) of the frames of a window; the others are as of `smoothed`."""
-    n, P = len(x[near]), x.shape[1]
-    gradient, hessian = np.empty((n, P)), np.empty((n, P, P))
-    for some in batches(n):
-        at = slice(near.start + some.start, min(near.start + some.stop, near.stop))
-        _, gradient[some], hessian[some] = body.system(x[at], targets[at], weights[at])
-        if held is not None:
-            _, pull, stiff = held.system(*body.body.split(x[at])[:2], at)
-            gradient[some] += pull
-            hessian[some] += stiff
-    return coupled_steps(x[near], gradient, hessian, stiffness)
 
 
 def low_pass(pose: np.ndarray, trans: np.ndarray, rate: float, cutoff: float) -> tuple[np.ndarray, np.ndarray]:

@@ -4,46 +4,26 @@ from __future__ import annotations
 import numpy as np
 
 from model.fitting import energy
-from model.fitting.named_points import ANNEALING
+from model.fitting.named_points import anneal, lay_on_points
 from model.priors import typical_poses
-from scanprep.geometry import rotations
 
-from .marked_body import MarkedBody
-from .robust import marker_weights, misfit
-from .settings import AnimateConfig
+from .marked_body import AnimateConfig, MarkedBody, marker_weights, misfit
 
 SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb has lost three quarters of its weight
 
 
 def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
     """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen."""
-    x = _laid_on(body, typical_poses(body.body.pose_mean, body.body.pose_covariance, axes=6), targets)
-    weights = np.full(body.count, config.marker_sd**-2)
-    for stiff in ANNEALING:
-        end = body.solve(x, targets, weights, 8, 1e-3, stiff / config.prior_weight if config.prior_weight else 0.0)
-        x = end.x
-    x = x[np.argsort(end.energy)[:2]]
+    x = lay_on_points(body.body, body.positions, typical_poses(body.body.pose_mean, body.body.pose_covariance, axes=6),
+                      targets)
+    weights, prior = np.full(body.count, config.marker_sd**-2), config.prior_weight
+    end = anneal(lambda x, stiff: body.solve(x, targets, weights, 8, 1e-3, stiff / prior if prior else 0.0), x)
+    x = end.x[np.argsort(end.energy)[:2]]
     for _ in range(5):                                                  # with all markers, then with the likely ones
         end = body.solve(x, targets, weights, 30, 1e-5)
         x = end.x[np.argmin(end.energy)][None]
         weights, _ = marker_weights(body.positions(x[0]), targets, config.marker_sd, config.outlier)
     return x[0]
-
-
-def _laid_on(body: MarkedBody, poses: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Unknowns (4 n, P) of poses (n, J, 3) laid on the markers, and rotated by quarters about their long axis."""
-    there = ~np.isnan(targets[:, 0])
-    goal = targets[there]
-    centre = goal.mean(axis=0)
-    axis = np.linalg.svd(goal - centre)[2][0]
-    rest = body.positions(body.body.join(poses, np.zeros((len(poses), 3))))[:, there]
-    R, _ = rotations.procrustes(rest, np.broadcast_to(goal, rest.shape))
-    quarters = rotations.exp(np.arange(4)[:, None] * np.pi / 2 * axis)
-    placed = np.repeat(poses, 4, axis=0)
-    placed[:, 0] = rotations.log(quarters @ (R @ rotations.exp(poses[:, 0]))[:, None]).reshape(-1, 3)
-    x = body.body.join(placed, np.zeros((len(placed), 3)))
-    x[:, -3:] = centre - body.positions(x)[:, there].mean(axis=1)
-    return x
 
 
 def reinitialise_limbs(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:

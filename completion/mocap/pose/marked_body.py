@@ -1,12 +1,16 @@
 """A body that carries markers: the inner loop of animation, with the pose prior and the normals that lift markers.
 
+How far each marker is believed is told here as well: outliers lose their weight.
+
 Derivatives are by small rotations of every joint from the right, `R_parent exp(pose) exp(d)`, so that no chart ends at
 a half turn.
 """
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 
@@ -18,13 +22,61 @@ from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
+from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
 
+from ...smoothing import coupled_steps, inertia
 from ..marker_sets.layout import MarkerLayout
 from .part_shapes import PartShapes, part_shapes
 
 BATCH = 64                           # frames whose parts are held at once
 MOST = 512                           # frames that are solved, each by itself, at once
 SAMPLES = 120                        # poses from which the turning of the normals is learned
+RATE = 120.0                         # frames per second for which the weight of the velocity is meant
+
+
+@dataclass(frozen=True)
+class AnimateConfig(Settings):
+    """Settings of `animate` and `MarkerStream`.
+
+    Attributes
+    ----------
+    marker_sd : float, metres
+        How far a marker lies from where the body would put it.
+    outlier : float, metres
+        Residual at which a marker has lost three quarters of its weight, at least; on a body that fits badly
+        it is three times the median residual.
+    prior_weight : float
+        Factor on the pose prior: small, it speaks for joints that no marker sees.
+    prior_shrinkage : float in [0, 1]
+        See `gaussian_prior`.
+    angle_acceleration : float, radians per second squared
+        How strongly joints accelerate, as a standard deviation.
+    place_acceleration : float, metres per second squared
+        The same for the place.
+    smoothing : int
+        Rounds over the whole sequence; 0 leaves the frame-by-frame solution.
+    low_pass : float, hertz
+        Cut-off of a Butterworth filter without lag on the result; 0 is none.
+    ground : bool
+        Feet do not sink into the floor and do not slide while they stand on it.
+    floor : four numbers, optional
+        A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
+    """
+
+    marker_sd: Positive = 0.01
+    outlier: Positive = 0.06
+    prior_weight: float = 0.3
+    prior_shrinkage: Share = 0.3
+    angle_acceleration: Positive = 60.0
+    place_acceleration: Positive = 15.0
+    smoothing: int = 2
+    low_pass: float = 0.0
+    ground: Annotated[bool, FLAG] = False
+    floor: tuple[Signed, Signed, Signed, Signed] | None = None
+
+    def inertia(self, rate: float, n_unknowns: int) -> np.ndarray:
+        """Information (P,) of the change of velocity from frame to frame."""
+        return inertia(n_unknowns, rate, self.angle_acceleration, self.place_acceleration)
 
 
 class MarkedBody:
@@ -59,15 +111,13 @@ class MarkedBody:
               stiff: float = 1.0) -> Minimum[np.ndarray]:
         """The best unknowns near x (B, P), each row by itself; arguments as of `system`, without B if all are alike."""
         targets, weights = (np.broadcast_to(of, (len(x), *of.shape[-k:])) for of, k in ((targets, 2), (weights, 1)))
-        ends = [levenberg_marquardt(partial(self._rows, targets[some], weights[some], stiff), x[some], iterations,
-                                    tolerance, retract=self.retract) for some in batches(len(x), MOST)]
+        ends = [levenberg_marquardt(partial(self.system, targets=targets[some], weights=weights[some], stiff=stiff),
+                                    x[some], iterations, tolerance, retract=self.retract)
+                for some in batches(len(x), MOST)]
         return ends[0] if len(ends) == 1 else Minimum(
             np.concatenate([end.x for end in ends]),
             Dense(*map(np.concatenate, zip(*(end.equations for end in ends), strict=True))),
             np.concatenate([end.converged for end in ends]), max(end.iterations for end in ends))
-
-    def _rows(self, targets: np.ndarray, weights: np.ndarray, stiff: float, x: np.ndarray) -> Dense:
-        return self.system(x, targets, weights, stiff)
 
     def with_prior(self, data: Dense, pose: np.ndarray, stiff: float = 1.0) -> Dense:
         """Equations whose first unknowns are those of poses (B, J, 3), and the pose prior."""
@@ -86,6 +136,27 @@ class MarkedBody:
     def retract(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
         return retract_pose(self.body.n_angles)(x, step)
+
+    def smoothed(self, x: np.ndarray, stiffness: np.ndarray, system: Callable[..., Dense], *of_frames: np.ndarray
+                 ) -> np.ndarray:
+        """Frames (T, P) that follow each other after one Gauss-Newton step, coupled as of `coupled_steps`.
+
+        `system` makes the equations of some frames from their unknowns and their rows of `of_frames`.
+        """
+        if len(x) < 3:
+            return x
+
+        def equations(near: slice) -> tuple[np.ndarray, np.ndarray]:
+            n, P = len(x[near]), x.shape[1]
+            gradient, hessian = np.empty((n, P)), np.empty((n, P, P))
+            for some in batches(n):
+                rows = (values[near][some] for values in (x, *of_frames))
+                _, gradient[some], hessian[some] = system(*rows)
+            return gradient, hessian
+
+        step = coupled_steps(x, equations, stiffness)
+        # radians or metres that a step may go
+        return self.retract(x, step * np.minimum(1, 0.5 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)))
 
     def step_to(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """The step (..., P) that leads from unknowns (..., P) to others."""
@@ -108,6 +179,56 @@ def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weight
     columns *= root[:, None]
     A = columns.reshape(B, P, -1)
     return Dense((residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ np.swapaxes(A, -1, -2))
+
+
+def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlier: float
+                   ) -> tuple[np.ndarray, np.ndarray]:
+    """Factors (..., L) on the squared distances of markers, 0 where nothing was seen, and which count: above a quarter.
+
+    Places and targets are (..., L, 3), metres, NaN where a marker was not seen; `sd` and `outlier` as in
+    `AnimateConfig`. What is common to all markers does not make an outlier: the body may be a step behind.
+    """
+    squared, scale = distances_apart(positions, targets, outlier)
+    share = np.where(np.isnan(squared), 0.0, (scale**2 / (scale**2 + squared))**2)
+    return share / sd**2, share > 0.25
+
+
+def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
+    """Squared distances (..., L) without what is common to all, and the length (..., 1) that makes an outlier."""
+    off = positions - targets
+    off = off - known_median(off, -2)[..., None, :]
+    squared = np.einsum("...d,...d->...", off, off)
+    # metres; a marker farther off is an outlier on however bad a fit
+    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(known_median(squared)), 5.0))[..., None]
+
+
+def known_median(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """The median of values that are not NaN, 0 without any; on few values much faster than numpy's."""
+    ordered = np.sort(values, axis=axis)                                # NaN comes last
+    seen = (~np.isnan(ordered)).sum(axis=axis, keepdims=True)
+    low, high = np.maximum((seen - 1) // 2, 0), np.minimum(seen // 2, values.shape[axis] - 1)
+    both = np.take_along_axis(ordered, low, axis=axis) + np.take_along_axis(ordered, high, axis=axis)
+    return np.where(seen > 0, 0.5 * both, 0.0).squeeze(axis)
+
+
+def stretches(rows: np.ndarray, times: np.ndarray | None = None, apart: float = 1.0) -> list[np.ndarray]:
+    """Growing rows (n,) as stretches of which none is farther `apart` from the one before, by number or in `times`."""
+    gaps = np.diff(rows if times is None else times[rows]) > apart
+    return np.split(rows, np.flatnonzero(gaps) + 1) if len(rows) else []
+
+
+def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
+    """(...) how badly markers (..., L), metres off, fit, of 0 to 1; each outlier counts the same."""
+    squared = apart**2
+    return np.nanmean(squared / (outlier**2 + squared), axis=-1)
+
+
+def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier: float
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label."""
+    residuals = np.linalg.norm(positions - targets, axis=-1)
+    squared, scale = distances_apart(positions, targets, outlier)
+    return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
 
 
 def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray, distances: np.ndarray

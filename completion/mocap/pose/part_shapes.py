@@ -16,7 +16,6 @@ from model.features import twists
 from model.linear import PointOperator
 from model.products import Products, Terms
 from scanprep.geometry import rotations
-from scanprep.skeleton.tree import Skeleton
 
 
 class PartShapes:
@@ -35,7 +34,10 @@ class PartShapes:
         self.bends = {(int(p), int(j)): ((mix[j] * of_part[p]) @ flat).reshape(m, 3, L)
                       for p, j in np.argwhere(uses)}
         self._below = terms.skeleton.descends.T.astype(float)
-        self._levels = _levels(terms.skeleton)
+        # parts of equal depth in the tree and their parents, from the root's children on
+        depth = terms.skeleton.descends.sum(axis=1) - 1
+        levels = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
+        self._levels = [(children, terms.skeleton.parents[children]) for children in levels]
         self._arrange()
 
     def _arrange(self) -> None:
@@ -143,15 +145,6 @@ def part_shapes(operator: PointOperator) -> PartShapes:
         return PartShapes(operator)
     assert isinstance(operator, Blended), "one of the two kinds of operators"
     return SkinnedShapes(operator)
-
-
-def _levels(skeleton: Skeleton) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Parts of equal depth in the tree and their parents, from the root's children on."""
-    depth = np.zeros(len(skeleton.parents), dtype=int)
-    for j, parent in enumerate(skeleton.parents):
-        depth[j] = depth[parent] + 1 if j else 0
-    levels = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
-    return [(children, skeleton.parents[children]) for children in levels]
 
 
 def _padded(lists: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:

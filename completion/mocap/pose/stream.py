@@ -11,13 +11,11 @@ from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 
 from ..marker_sets.layout import MarkerLayout
 from .initialise import search
-from .marked_body import MarkedBody
-from .robust import LabelWatch, judge, marker_weights, misfit
-from .settings import AnimateConfig
+from .marked_body import AnimateConfig, MarkedBody, judge, marker_weights, misfit
+from .swaps import LabelWatch
 
 STEPS = 3                            # most for a frame
 LOST = 0.08                          # metres, median residual of a frame above which it is searched anew
-LOOSE = 10.0                         # variance of a prediction from two uncertain frames, against the acceleration's
 PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
 
 
@@ -75,10 +73,9 @@ class MarkerStream:
             raise ValueError("config: expected ground=False and low_pass=0 for a stream, both need later frames")
         if not rate > 0:
             raise ValueError(f"rate: expected a number above 0, got {rate}")
-        known = layout.matched(labels)
-        self.rows = np.array([list(labels).index(label) for label in known])
+        self.rows, worn = layout.worn(labels)
         self.n_labels = len(labels)
-        body = MarkedBody(subject, layout.select(known), config.prior_weight, config.prior_shrinkage)
+        body = MarkedBody(subject, worn, config.prior_weight, config.prior_shrinkage)
         self.tracker = Tracker(body, config, rate)
 
     def push(self, positions: np.ndarray) -> Frame:
@@ -116,9 +113,9 @@ class KalmanPrediction:
 
     def begin(self, x: np.ndarray) -> None:
         self.x, self.velocity = x, np.zeros_like(x)
-        self.place = np.diag(LOOSE * self.noise)                       # covariances (P, P) of place, both, velocity
+        # covariances (P, P) of place, both, velocity; variances of two uncertain frames, against the acceleration's
+        self.place = self.speed = np.diag(10.0 * self.noise)
         self.cross = 0 * self.place
-        self.speed = np.diag(LOOSE * self.noise)
 
     def expect(self) -> tuple[np.ndarray, np.ndarray]:
         m = self.momentum
@@ -161,7 +158,7 @@ class Tracker:
     def begin(self, x: np.ndarray) -> None:
         """Continue from these unknowns (P,), at rest."""
         self.prediction.begin(x)
-        self.watch.forget()
+        self.watch.order = np.arange(self.body.count)
         self.started, self.since, self.passed = True, 0, 0
 
     def push(self, targets: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -186,11 +183,14 @@ class Tracker:
         end = self._solve(taken, expected, information)
         x, converged, found = end.x[0], bool(end.converged[0]), None
         self.places = self.body.positions(x)
-        if not self.wait and enough and not fresh and self._astray(taken):
+        # the body may have lost its markers, or a fifth of those seen
+        off = np.linalg.norm(self.places - taken, axis=1)
+        off = off[~np.isnan(off)]
+        astray = bool(np.median(off) > LOST or (off > self.config.outlier).mean() > 0.2)
+        if not self.wait and enough and not fresh and astray:
             found = self._found(taken)
-            if found is not None:
-                x, converged = found, True
-                self.places = self.body.positions(x)
+            x, converged = (x, converged) if found is None else (found, True)
+            self.places = self.body.positions(x)
         if self._to_pass_over(taken, before):
             self.watch.order, self.places = order, before
             if fresh:
@@ -238,21 +238,11 @@ class Tracker:
         near = LOST + 10.0 * self.since / self.rate
         lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > LOST)
         leapt, self.leapt = self.leapt, np.full_like(before, np.nan) if lost else self.places
-        self.believed = not lost and min(_apart(self.places, before), _apart(self.places, leapt)) <= near
+        # not where some places are not known
+        self.believed = not lost and any(np.median(np.linalg.norm(self.places - of, axis=1)) <= near
+                                         for of in (before, leapt))
         if self.believed:
             self.since = self.passed = 0
             return False
         self.passed += 1
         return self.passed <= 0.25 * self.rate                          # for so many seconds they are taken for wrong
-
-    def _astray(self, targets: np.ndarray) -> bool:
-        """The body has lost its markers (L, 3), or a fifth of those seen."""
-        apart = np.linalg.norm(self.places - targets, axis=1)
-        apart = apart[~np.isnan(apart)]
-        return bool(np.median(apart) > LOST or (apart > self.config.outlier).mean() > 0.2)
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> float:
-    """The median distance of points (L, 3), metres; infinite where some are not known."""
-    apart = float(np.median(np.linalg.norm(a - b, axis=1)))
-    return np.inf if np.isnan(apart) else apart

@@ -1,4 +1,4 @@
-"""Which labels were swapped when: pairs decided over the whole sequence, from tracks and from where the body is.
+"""Which labels were swapped when: pairs decided over the whole sequence, or frame by frame in a stream.
 
 A track tells from one frame to the next which label goes on where another was; no body is needed for that. Where the
 body has the markers tells which label belongs to a stretch of track.
@@ -10,12 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 
+from .marked_body import AnimateConfig, distances_apart, known_median
+
 TORN = 10.0                          # most that a torn track counts, in half squared standard deviations
 AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
 CHANGE = 4.0                         # what each change of a label must be worth, likewise
 WORTH = 2.0                          # least gain for which labels are swapped
 DEVIATION = 0.008                    # metres from its usual place on the body that a marker lies, in each direction
 MEMORY = 0.1                         # seconds that this distance stays much the same
+ENTER, LEAVE = 0.5, 1.0              # share of the distance left when labels of a stream are swapped, and put back
 AT_ONCE = 64                         # frames whose levels of all pairs are held
 
 
@@ -116,15 +119,9 @@ class Seats:
         return self.share * marker_levels(self.places[frames, rows, None], positions[:, None],
                                           self.deviation[frames, None, None])
 
-    def own(self, positions: np.ndarray) -> np.ndarray:
-        """What it counts (T, L) that labels at positions (T, L, 3) are the markers of the same rows."""
-        return self.share * marker_levels(self.places, positions, self.deviation[:, None])
-
-    def exchanged(self, positions: np.ndarray, a: int, b: int) -> np.ndarray:
-        """What it counts (T,) that the markers of two rows bear each other's label."""
-        two = [a, b]
-        return self.share * marker_levels(self.places[:, two], positions[:, two[::-1]],
-                                          self.deviation[:, None]).sum(axis=1)
+    def own(self, positions: np.ndarray, rows: slice | list[int] = slice(None)) -> np.ndarray:
+        """What it counts (T, R) that labels at positions (T, R, 3) are the markers of some rows, one each."""
+        return self.share * marker_levels(self.places[:, rows], positions, self.deviation[:, None])
 
 
 def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: np.ndarray) -> np.ndarray:
@@ -170,7 +167,7 @@ def _best_spans(tracks: Tracks, seats: Seats | None, touched: set[int]) -> list[
     out = []
     for a, b in sorted(pairs):
         begins = tracks.loose_ends(a, b)
-        gain = own[:, a] + own[:, b] - (0.0 if seats is None else seats.exchanged(at, a, b))
+        gain = own[:, a] + own[:, b] - (0.0 if seats is None else seats.own(at[:, [b, a]], [a, b]).sum(axis=1))
         total, swapped = best_stretches(tracks, a, b, begins, np.add.reduceat(gain, begins))
         if total > WORTH:
             out.append((total, a, b, swapped))
@@ -237,3 +234,47 @@ def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tupl
         state = 1 - state if from_other[state] else state
         states.append(state)
     return gained, np.array(states[::-1], dtype=bool)
+
+
+def label_order(positions: np.ndarray, targets: np.ndarray, rate: float, outlier: float) -> np.ndarray:
+    """Which column (T, L) each marker is taken from, the body having them at places (T, L, 3), by `find_order`."""
+    squared, scale = distances_apart(positions, targets, outlier)
+    if ((squared > (0.5 * scale)**2).sum(axis=1) < 2).all():            # nothing is far off, or everything is believed
+        return np.tile(np.arange(targets.shape[1]), (len(targets), 1))
+    shift = known_median(positions - targets, -2)[..., None, :]
+    # on a body that fits badly a marker is as much farther from its place as one must be to be an outlier
+    deviation = DEVIATION * scale[..., 0] / AnimateConfig.outlier
+    return find_order(targets, rate, positions - shift, deviation)
+
+
+class LabelWatch:
+    """Pairs of markers, of so many, that have swapped their labels, told frame by frame for streams.
+
+    A pair is swapped when that removes most of the distance of both from where the body would put them, and put back
+    when the labels as they came fit better again. No scores of `find_order`: a body that has leapt is far from all.
+    """
+
+    def __init__(self, count: int, outlier: float) -> None:
+        self.outlier = outlier
+        self.order = np.arange(count)
+
+    def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """Which column (L,) each marker is taken from, for places on the body and markers as they came (L, 3)."""
+        taken = targets[self.order]
+        squared, scale = distances_apart(positions, taken, self.outlier)
+        suspect = squared > (0.5 * scale)**2                            # never of NaN
+        changed = self.order != np.arange(len(self.order))
+        if suspect.sum() < 2 and not changed.any():
+            return self.order
+        shift = known_median(positions - taken, 0)
+        some = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
+        apart = np.linalg.norm(positions[some, None] - shift - taken[some], axis=2)
+        for i, j in zip(*np.triu_indices(len(some), 1), strict=True):
+            now, then = apart[i, i] + apart[j, j], apart[i, j] + apart[j, i]
+            a, b = some[i], some[j]
+            back = self.order[a] == b
+            if then < (LEAVE if back else ENTER) * now and (back or max(apart[i, j], apart[j, i]) < 0.5 * scale[0]):
+                self.order[[a, b]] = self.order[[b, a]]
+                taken[[a, b]] = taken[[b, a]]
+                apart[:, [i, j]] = apart[:, [j, i]]
+        return self.order

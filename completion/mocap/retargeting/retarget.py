@@ -84,22 +84,15 @@ def morphed_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mappi
     if len(poses) < 20 * len(steps):                  # making a body costs as much as the meshes of 20 frames
         out = model.vertices(poses, betas, trans)
     else:
-        out = _along_lines(model, middle, shares, steps, poses, trans)
+        first = model.subject(middle)
+        out = first.vertices(poses, trans).astype(np.float64)
+        for share, step in zip(shares.T, steps, strict=True):
+            out += share[:, None, None] * model.operator(middle + step).plus(-1, first.operator).evaluate(poses)
     if grounded:
         own = model.subject(motion.betas)
         up, sign = world_up(motion, own)
         low = lowest(own, poses, trans, up, sign)
         out[:, :, up] += (sign * (low - (sign * out[:, :, up]).min(axis=1)))[:, None]
-    return out
-
-
-def _along_lines(model: BodyModel, middle: np.ndarray, shares: np.ndarray, steps: np.ndarray, poses: np.ndarray,
-                 trans: np.ndarray) -> np.ndarray:
-    """Meshes (n, N, 3) of bodies that are a middle (k,) and shares (n, r) of steps (r, k)."""
-    first = model.subject(middle)
-    out = first.vertices(poses, trans).astype(np.float64)
-    for share, step in zip(shares.T, steps, strict=True):
-        out += share[:, None, None] * model.operator(middle + step).plus(-1, first.operator).evaluate(poses)
     return out
 
 

@@ -10,7 +10,6 @@ from scipy.sparse.csgraph import connected_components
 
 from model.body import BodyModel
 from model.fitting.bodies import at_rest
-from model.linear import Subject
 from scanprep.console import Metric
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
@@ -23,8 +22,6 @@ from ...motion_pictures import bodies_in_a_row, seconds
 from ..files.motion_files import KEYS, write_glb
 from ..soft_tissue.soft_tissue import SoftTissue
 from .retarget import AT_ONCE, retarget, world_up
-
-SOLES = 60                           # points that may touch the ground
 
 
 def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyModel, factor: float = 1.0) -> SoftTissue:
@@ -63,20 +60,16 @@ def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyMode
     motion = retarget(soft.motion, model.subject(soft.motion.betas), target)
     moving = replace(soft.times(factor), motion=motion)
     up, sign = world_up(motion, target)
-    soles = _soles(target, motion.poses, up, sign)
+    # the soles: at most 60 vertices that are the lowest of some frame
+    lowest = [np.argmin(sign * target.vertices(motion.poses[i:i + AT_ONCE])[:, :, up], axis=1)
+              for i in range(0, len(motion.poses), AT_ONCE)]
+    ids, often = np.unique(np.concatenate(lowest), return_counts=True)
+    soles = np.sort(ids[np.argsort(-often, kind="stable")[:60]])
     trans = motion.trans.copy()
     fixed, changed = (sign * each.points(character, soles[:, None], np.ones((len(soles), 1)))[..., up]
                       for each in (moving.times(0.0), moving))
     trans[:, up] += sign * (fixed.min(axis=1) - changed.min(axis=1))
     return replace(moving, motion=replace(motion, trans=trans))
-
-
-def _soles(subject: Subject, poses: np.ndarray, up: int, sign: float) -> np.ndarray:
-    """The vertices that are the lowest of some frame, at most `SOLES`."""
-    found = [np.argmin(sign * subject.vertices(poses[i:i + AT_ONCE])[:, :, up], axis=1)
-             for i in range(0, len(poses), AT_ONCE)]
-    ids, often = np.unique(np.concatenate(found), return_counts=True)
-    return np.sort(ids[np.argsort(-often, kind="stable")[:SOLES]])
 
 
 def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np.ndarray:
@@ -97,8 +90,12 @@ def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np
 
     [MoSh]
     """
-    before, after = (_products(vertices, faces) for vertices in (fixed, changed))
-    (a, b, c), (p, q, r) = before, after
+    # the products of the two edges of every triangle: first with itself, with the second, second itself
+    products = []
+    for vertices in (fixed, changed):
+        e, f = (vertices[..., faces[:, k], :] - vertices[..., faces[:, 0], :] for k in (1, 2))
+        products.append(((e * e).sum(axis=-1), (e * f).sum(axis=-1), (f * f).sum(axis=-1)))
+    (a, b, c), (p, q, r) = products
     area = a * c - b * b
     safe = np.maximum(area, np.finfo(float).tiny)
     half, whole = (p * c - 2 * q * b + r * a) / safe / 2, (p * r - q * q) / safe
@@ -110,13 +107,6 @@ def deformation(faces: np.ndarray, fixed: np.ndarray, changed: np.ndarray) -> np
                         shape=(len(faces), fixed.shape[-2]))
     total, shares = ((a.reshape(-1, len(faces)) @ corners).reshape(fixed.shape[:-1]) for a in (weight * strain, weight))
     return np.asarray(total / np.maximum(shares, np.finfo(float).tiny))
-
-
-def _products(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The products (..., F) of the two edges of every triangle: first with itself, with the second, second itself."""
-    e = vertices[..., faces[:, 1], :] - vertices[..., faces[:, 0], :]
-    f = vertices[..., faces[:, 2], :] - vertices[..., faces[:, 0], :]
-    return (e * e).sum(axis=-1), (e * f).sum(axis=-1), (f * f).sum(axis=-1)
 
 
 def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,13 +8,43 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject, check_pose
-from scanprep.geometry import storage
+from scanprep.geometry import rotations, storage
+from scanprep.geometry.geodesics import SurfaceGraph
+from scanprep.geometry.mesh import Mesh
 
 from ...motion import Motion
-from .skin import SkinMovement
 
 CHANGES, MODES, MOVED = "shape_changes", "skin_modes", "skin_moved"       # in a motion file
 AT_ONCE = 32                         # bodies that are made together
+
+
+@dataclass(frozen=True, eq=False)
+class SkinMovement:
+    """A smooth displacement of the skin in every frame.
+
+    Attributes
+    ----------
+    modes : (N, R) float
+        What share every vertex has in the displacement of each of R places.
+    moved : (T, R, 3) float, metres
+        Displacements of the places, along the axes of the root.
+    """
+
+    modes: np.ndarray
+    moved: np.ndarray
+
+    def at(self, places: np.ndarray, poses: np.ndarray, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Displacements (n, L, 3), metres, of points with shares (L, R) in some frames with their poses (n, J, 3)."""
+        return np.asarray(places @ in_world(self.moved[frames], poses))
+
+    def times(self, factor: float) -> SkinMovement:
+        """The same, so many times as large."""
+        return SkinMovement(self.modes, factor * self.moved)
+
+    def squared(self) -> np.ndarray:
+        """(N,) square metres: how far every vertex moves, the mean square over time."""
+        moment = np.tensordot(self.moved, self.moved, axes=((0, 2), (0, 2))) / max(len(self.moved), 1)
+        return np.maximum(((self.modes @ moment) * self.modes).sum(axis=1), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +138,32 @@ class SoftTissue:
                 skin = SkinMovement(modes.astype(np.float64),
                                     storage.numbers(stored, MOVED, T, modes.shape[1], 3).astype(np.float64))
         return SoftTissue(motion, changes.astype(np.float64), skin)
+
+
+def in_world(moved: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Vectors (n, R, 3) along the axes of the root, turned into the world, in poses (n, J, 3)."""
+    return np.asarray(moved @ np.swapaxes(rotations.exp(poses[:, 0]), -1, -2))
+
+
+def in_root(moved: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Vectors (n, R, 3) in the world, turned into the axes of the root, in poses (n, J, 3)."""
+    return np.asarray(moved @ rotations.exp(poses[:, 0]))
+
+
+def smooth_modes(skin: Mesh, places: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """What displacements of some vertices (R,) tell of all others, (N, R), and a root (R, r) of their correlation.
+
+    The displacement is a Gaussian process over the skin: correlations fall with the distance along it as a bell does,
+    to exp(-1/2) at `reach`, metres. The modes are its mean, the displacements of the places given. Patterns over the
+    places that hardly occur are left out; distances along a curved surface make some impossible.
+    """
+    distances = SurfaceGraph(skin).distances(places, limit=4 * reach)              # beyond it the bell is 0.0003
+    bell = np.exp(-0.5 * (distances / reach)**2)
+    near = bell[:, places]
+    values, vectors = np.linalg.eigh(0.5 * (near + near.T))
+    # finer patterns are noise, or none of a process
+    values, vectors = values[values > 1e-2], vectors[:, values > 1e-2]
+    return bell.T @ (vectors / values) @ vectors.T, vectors * np.sqrt(values)
 
 
 def changing_bodies(model: BodyModel, poses: np.ndarray, betas: np.ndarray, trans: np.ndarray) -> np.ndarray:

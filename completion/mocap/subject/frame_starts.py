@@ -12,11 +12,9 @@ from scanprep.geometry import rotations
 
 from ..marker_sets.layout import MarkerLayout
 from ..pose.initialise import search
-from ..pose.marked_body import MarkedBody
-from ..pose.settings import AnimateConfig
+from ..pose.marked_body import AnimateConfig, MarkedBody
 
 MEAN_PERSON = AnimateConfig(marker_sd=0.03)     # metres: the mean person carries the markers only roughly
-LOST = 0.1                           # metres, median distance of a frame's markers above which it is searched anew
 
 
 def mean_person(mean: Subject, layout: MarkerLayout) -> MarkedBody:
@@ -30,7 +28,8 @@ def start_frames(body: MarkedBody, targets: np.ndarray, tell: Callable[[int], No
     order = np.argsort(np.isnan(targets[..., 0]).sum(axis=1), kind="stable")
     for i in order:
         x = _from_found(body, found, targets[i]) if found else search(body, targets[i], MEAN_PERSON)
-        if found and np.nanmedian(np.linalg.norm(body.positions(x) - targets[i], axis=1)) > LOST:
+        # metres, median distance of a frame's markers above which it is searched anew
+        if found and np.nanmedian(np.linalg.norm(body.positions(x) - targets[i], axis=1)) > 0.1:
             x = search(body, targets[i], MEAN_PERSON)
         found.append(x)
         tell(len(found))

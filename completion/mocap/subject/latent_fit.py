@@ -5,7 +5,7 @@ Unknowns that frames share are a row `z = (betas (K), coefficients of the latent
 """
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -186,23 +186,16 @@ def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
 
 
 @dataclass(frozen=True, eq=False)
-class Hung:
-    """Latent markers with their supports on the body, posed and of any shape, and in the latent pose."""
-
-    markers: LatentMarkers
-    points: ShapedPoints
-    supports: LatentPoints
-    corners: LatentPoints                # of the nearest triangles in the latent pose
-
-
-@dataclass(frozen=True, eq=False)
 class State:
     """Where the solution stands."""
 
     x: np.ndarray                        # (B, 3J + 3) pose and place in every frame
     betas: np.ndarray                    # (K,)
     coefficients: np.ndarray             # (L, 3) of the latent markers
-    hung: Hung                           # what they are coefficients of
+    markers: LatentMarkers               # what they are coefficients of
+    points: ShapedPoints                 # their supports on the body, posed and of any shape
+    supports: LatentPoints               # the same in the latent pose
+    corners: LatentPoints                # of the nearest triangles in the latent pose
     layout: MarkerLayout                 # where the markers usually are, loose ones where they were found
     least: np.ndarray                    # (L,) metres from the skin, between which the distance of each is unknown,
     greatest: np.ndarray                 # or that of the layout
@@ -216,7 +209,7 @@ class State:
     @property
     def places(self) -> np.ndarray:
         """The latent markers (L, 3) in the latent coordinate system, metres."""
-        return latent_places(self.hung.markers.kind, self.hung.supports, self.z).positions
+        return latent_places(self.markers.kind, self.supports, self.z).positions
 
     @property
     def rows(self) -> np.ndarray:
@@ -244,7 +237,8 @@ class LatentFit:
         self.reach = distance_reach(layout, config.wand)
         # weight of the usual place of a marker that the layout calls loose: 20 cm
         self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
-        self.pool = PointPool(model, self.n_betas)
+        self._column: dict[bytes, int] = {}
+        self._made: ShapedPoints | None = None
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses (B, J, 3) and places (B, 3) of unknowns (B, 3J + 3)."""
@@ -274,7 +268,7 @@ class LatentFit:
         free = state.least < state.greatest
         if not free.any():
             return state
-        corners = state.hung.corners.at(state.betas).reshape(-1, 3, 3)
+        corners = state.corners.at(state.betas).reshape(-1, 3, 3)
         r = np.clip(above_triangles(state.places, corners)[0], state.least, state.greatest)
         distances, given = np.where(free, r, np.asarray(state.layout.distances)), np.asarray(self.layout.distances)
         if last:
@@ -294,8 +288,20 @@ class LatentFit:
         vertices = self.latent.at(betas)
         markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
         corners = self.latent.combined(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
-        hung = Hung(markers, self.pool.points(markers), self.latent.combined(markers.ids, markers.weights), corners)
-        return State(x, betas, markers.coefficients(vertices, points), hung, layout, *reach, looked)
+        return State(x, betas, markers.coefficients(vertices, points), markers, self._supports(markers),
+                     self.latent.combined(markers.ids, markers.weights), corners, layout, *reach, looked)
+
+    def _supports(self, markers: LatentMarkers) -> ShapedPoints:
+        """Points of the skin with free shape, each made once: stitching them is what hanging markers anew costs."""
+        keys = [ids.tobytes() + weights.tobytes() for ids, weights in zip(markers.ids, markers.weights, strict=True)]
+        new = {key: row for row, key in enumerate(keys) if key not in self._column}
+        if new:
+            rows = np.array(list(new.values()))
+            made = self.model.points(markers.ids[rows], markers.weights[rows], self.n_betas)
+            self._column |= {key: len(self._column) + i for i, key in enumerate(new)}
+            self._made = made if self._made is None else self._made.joined(made)
+        assert self._made is not None, "at least one marker"
+        return self._made.combined(picked(self._made.count, np.array([self._column[key] for key in keys]), None))
 
     def usual_places(self, layout: MarkerLayout, betas: np.ndarray) -> np.ndarray:
         """Where a layout has the markers (L, 3) on a body of these betas in the latent pose, metres. [MoSh] Eq. 15"""
@@ -304,17 +310,17 @@ class LatentFit:
     def _usual(self, layout: MarkerLayout) -> LatentPoints:
         return self.latent.combined(*supports(self.model.template, layout))
 
-    def simulated(self, hung: Hung, x: np.ndarray, z: np.ndarray) -> MovingPoints:
+    def simulated(self, state: State, x: np.ndarray, z: np.ndarray) -> MovingPoints:
         """The markers in every frame for x (B, n) and z (K + 3L,), derivatives by both. [MoSh] Eq. 16"""
         K, (pose, trans) = self.n_betas, self.split(x)
-        positions, d_pose = hung.points.operator(z[:K]).jacobian(pose, trans)
-        moving = energy.moving_points(positions, d_pose, hung.points.shape_jacobian(pose))
-        found, frame = simulated(hung.markers.kind, moving, z[K:].reshape(-1, 3))
+        positions, d_pose = state.points.operator(z[:K]).jacobian(pose, trans)
+        moving = energy.moving_points(positions, d_pose, state.points.shape_jacobian(pose))
+        found, frame = simulated(state.markers.kind, moving, z[K:].reshape(-1, 3))
         return MovingPoints(found.positions, np.concatenate([found.jacobian, each_own(frame)], axis=-1))
 
     def residuals(self, state: State) -> np.ndarray:
         """(B, L) distances of simulated from observed markers, metres; NaN where one was not seen."""
-        return np.linalg.norm(self.simulated(state.hung, state.x, state.z).positions - self.targets, axis=2)
+        return np.linalg.norm(self.simulated(state, state.x, state.z).positions - self.targets, axis=2)
 
     def weights(self, state: State) -> np.ndarray:
         """(B, L) weights of the data, per square centimetre; outliers have less, as loose markers not yet found."""
@@ -342,15 +348,14 @@ class LatentFit:
                   ) -> dict[str, Residual]:
         """The terms of the frames, derivatives by (x, z)."""
         whole = np.concatenate([x, np.tile(z, (len(x), 1))], axis=1)
-        return {"data": data_term(self.simulated(state.hung, x, z), self.targets, weights),
+        return {"data": data_term(self.simulated(state, x, z), self.targets, weights),
                 "pose": energy.pose_prior(whole, self.prior, factor * self.config.pose)}            # [MoSh] Eq. 21
 
     def shared(self, state: State, usual: LatentPoints, z: np.ndarray, factor: float) -> dict[str, Residual]:
         """The terms of what frames share."""
-        c, hung = self.config, state.hung
-        markers = latent_places(hung.markers.kind, hung.supports, z)
+        c, markers = self.config, latent_places(state.markers.kind, state.supports, z)
         distances = np.asarray(state.layout.distances)
-        return {"surface": surface_term(markers, hung.corners.moving(z), state.least, state.greatest, c.surface),
+        return {"surface": surface_term(markers, state.corners.moving(z), state.least, state.greatest, c.surface),
                 "initial": place_term(markers, energy.above_skin(usual.moving(z), distances),
                                       factor * self.place_weight),
                 "shape": shape_term(z, self.n_betas, factor * c.shape)}
@@ -363,7 +368,7 @@ class LatentFit:
 
     def placed_layout(self, state: State) -> MarkerLayout:
         """The layout with every marker on the triangle it hangs on at its own distance, exact in the latent pose."""
-        vertices, points, hung = self.latent.at(state.betas), state.places, state.hung.markers
+        vertices, points, hung = self.latent.at(state.betas), state.places, state.markers
         if hung.kind != "triangle":
             hung = latent_markers(self.model.template.with_vertices(vertices), points)
         p = vertices[hung.corners]
@@ -376,25 +381,3 @@ class LatentFit:
         second = (c[:, 0] - third * first) / length
         return MarkerLayout(self.layout.labels, hung.corners, c[:, 2],
                             np.stack([1 - second - third, second, third], axis=1), self.layout.aliases)
-
-
-@dataclass
-class PointPool:
-    """Points of the skin with free shape, each made once: stitching them is what hanging markers anew costs."""
-
-    model: BodyModel
-    n_betas: int
-    column: dict[bytes, int] = field(default_factory=dict)
-    made: ShapedPoints | None = None
-
-    def points(self, markers: LatentMarkers) -> ShapedPoints:
-        """The supports of some markers."""
-        keys = [ids.tobytes() + weights.tobytes() for ids, weights in zip(markers.ids, markers.weights, strict=True)]
-        new = {key: row for row, key in enumerate(keys) if key not in self.column}
-        if new:
-            rows = np.array(list(new.values()))
-            made = self.model.points(markers.ids[rows], markers.weights[rows], self.n_betas)
-            self.column |= {key: len(self.column) + i for i, key in enumerate(new)}
-            self.made = made if self.made is None else self.made.joined(made)
-        assert self.made is not None, "at least one marker"
-        return self.made.combined(picked(self.made.count, np.array([self.column[key] for key in keys]), None))

@@ -19,15 +19,11 @@ from ...motion import Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .frame_starts import mean_person, start_frames
-from .latent_fit import ON_SKIN, LatentFit, PersonConfig, State
+from .latent_fit import ON_SKIN, LatentFit, PersonConfig
 
 __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
 HAND_WIDTH = 0.08                    # metres: a marker that is moved farther is to be looked at
-# share of them that moved so far from which on the result means nothing; on 4 recordings of actors, 5 of clinics and 16
-# of other laboratories with public files it is at most 0.1
-MOST = 0.25
-LOOK = (1, 3)                        # before these stages loose markers are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +93,9 @@ def judge_moves(moves: Mapping[str, float], count: int) -> Judgement:
     "check: moved by more than a hand's width: LKNE by 18 cm"
     """
     far = [f"{label} by {100 * moved:.0f} cm" for label, moved in moves.items() if moved > HAND_WIDTH]
-    if len(far) > MOST * count:
+    # share from which on the result means nothing; on 4 recordings of actors, 5 of clinics and 16 of other places
+    # it is at most 0.1
+    if len(far) > 0.25 * count:
         return Judgement.of(f"{len(far)} of {count} markers moved by more than a hand's width: another layout, or the "
                             "labels of other places?")
     return Judgement.of(check=[f"moved by more than a hand's width: {', '.join(far)}"] if far else [])
@@ -139,34 +137,29 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     if not config.annealing:
         raise ValueError("annealing: expected at least one factor, got none")
     known, positions = common_markers(sequences, layout)
-    return _find(model, known, positions, config, progress or (lambda done, total: None), step)
+    chosen, stages = choose_frames(positions, config), len(config.annealing)
+    targets, tell = np.concatenate(positions)[chosen], progress or (lambda done, total: None)
+    total, given = len(chosen) + stages, (model, known, targets, config)
 
-
-def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray], config: PersonConfig, tell: Progress,
-          step: Step) -> PersonFit:
-    chosen = choose_frames(positions, config)
-    targets = np.concatenate(positions)[chosen]
-    total, stages = len(chosen) + len(config.annealing), len(config.annealing)
-    given = model, known, targets, config
+    # the poses of the mean person in these frames, then everything together, stage by stage
     mean = mean_person(model.subject(np.zeros(min(config.n_betas, model.n_betas))), known)
     x = step("person, start", given, lambda: start_frames(mean, targets, lambda done: tell(done, total)))
     fit = LatentFit(model, known, targets, config)                                          # [MoSh] Eq. 15
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
         last = i == stages - 1
-        if i % 2 or (last and i):
-            state = fit.hung_anew(state, i in LOOK, last)                                   # [MoSh] Eq. 16
+        if i % 2 or (last and i):                        # loose markers are looked for before two of the stages
+            state = fit.hung_anew(state, i in (1, 3), last)                                 # [MoSh] Eq. 16
         rows, converged, taken = step(f"person, stage {i}", given,
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
         state, steps = state.moved(rows), steps + taken
         tell(len(chosen) + i + 1, total)
-    return _result(fit, state, _whose(positions, chosen), converged, steps)
 
-
-def _result(fit: LatentFit, state: State, frames: np.ndarray, converged: bool, steps: int) -> PersonFit:
-    pose, trans = fit.split(state.x)
+    ends, (pose, trans) = np.cumsum([len(each) for each in positions]), fit.split(state.x)
+    which = np.searchsorted(ends, chosen, side="right")
     moved = np.linalg.norm(state.places - fit.usual_places(fit.layout, state.betas), axis=1)
-    return PersonFit(state.betas.copy(), fit.placed_layout(state), frames, rotations.log(rotations.exp(pose)),
+    return PersonFit(state.betas.copy(), fit.placed_layout(state),
+                     np.stack([which, chosen - np.r_[0, ends][which]], axis=1), rotations.log(rotations.exp(pose)),
                      trans.copy(), fit.residuals(state), moved, fit.energies(state), converged, steps)
 
 
@@ -181,16 +174,13 @@ def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[Ma
 def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
                    ) -> tuple[MarkerLayout, list[np.ndarray]]:
     """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, NaN if it lacks one."""
-    columns = []
-    for sequence in sequences:
-        labels = layout.matched(sequence.labels)
-        columns.append({layout.aliases.get(label, label): sequence.labels.index(label) for label in labels})
+    columns = [{layout.aliases.get(label, label): sequence.labels.index(label)
+                for label in layout.matched(sequence.labels)} for sequence in sequences]
     known = layout.without([label for label in layout.labels if not any(label in mine for mine in columns)])
-    positions = []
-    for sequence, mine in zip(sequences, columns, strict=True):
-        missing = np.full((len(sequence.positions), 3), np.nan)
-        positions.append(np.stack([sequence.positions[:, mine[label]] if label in mine else missing
-                                   for label in known.labels], axis=1))
+    positions = [np.full((len(sequence.positions), len(known.labels), 3), np.nan) for sequence in sequences]
+    for out, sequence, mine in zip(positions, sequences, columns, strict=True):
+        rows = [i for i, label in enumerate(known.labels) if label in mine]
+        out[:, rows] = sequence.positions[:, [mine[known.labels[i]] for i in rows]]
     return known, positions
 
 
@@ -220,10 +210,3 @@ def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
     middle = np.where(there, apart, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
     apart = np.where(there, apart - middle, 0)
     return some[np.sort(farthest_points(apart, count, np.argmin((apart**2).sum(axis=1))))]
-
-
-def _whose(positions: Sequence[np.ndarray], chosen: np.ndarray) -> np.ndarray:
-    """(B, 2) the number of the sequence and the frame in it."""
-    ends = np.cumsum([len(each) for each in positions])
-    which = np.searchsorted(ends, chosen, side="right")
-    return np.stack([which, chosen - np.r_[0, ends][which]], axis=1)

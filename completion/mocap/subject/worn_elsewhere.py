@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -15,6 +16,7 @@ from model.body import BodyModel
 from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
+from scanprep.skeleton.roles import above
 from scanprep.words import number_of
 
 from ..files.markers import MarkerSequence
@@ -24,18 +26,8 @@ from .frame_starts import mean_person, stand_off, start_frames
 from .latent_fit import distance_reach
 from .person import PersonConfig, PersonFit, common_markers, find_person, judge_moves
 
-SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
-FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
-UNUSUAL = 4.0                        # times that of the median marker, at least: on a body that the model hardly knows
-NEAR = 0.02                          # metres within which another place explains a marker, at least
-USUAL = 1.5                          # times that of the other markers from their usual places, likewise
+FAR = 0.06                           # metres, RMS over frames, from its usual place: worn elsewhere
 GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
-LIMB = 0.2                           # metres along its part that a loose marker may be off its usual place
-FEW = 4                              # frames that must have seen a marker for anything to be told of it
-ROUNDS = 4                           # most times that the body is fitted without the suspects
-SEVERAL = 5                          # suspects from which on left and right are tried the other way round
-MOST = 0.25                          # share of the markers beyond which not they are at fault, but the body
-ROUGH_BETAS, ROUGH_STAGES = 20, (40.0, 10.0, 2.0, 1.0)  # of those fits: few betas do not follow a wrong marker
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +100,16 @@ class Worn:
             check.append(f"left and right of {len(self.exchanged)} of {number_of(sides, 'pair')} of markers were "
                          "exchanged and put back: labels of the other side, or a mirrored recording, which is to be "
                          "mirrored first?")
-        check += [_at_fault("most", part, names) for part, names, whole in self.lost if not whole]
+        parts, some = ([f"{share} markers of the {part} ({', '.join(names)}) are far from where the layout says: wrong "
+                        "labels there, another layout, or a model that knows no such body?"
+                        for part, names, whole in self.lost if whole == wanted]
+                       for share, wanted in (("all", True), ("most", False)))
+        check += some
         if self.unplaced:
             check.append(f"{', '.join(self.unplaced)} not worn where the layout says, and found nowhere: left out")
         if self.too_many:
             check.append(f"{', '.join(self.too_many)} far from where the layout says: the wrong layout, or the wrong "
                          "body?")
-        parts = [_at_fault("all", part, names) for part, names, whole in self.lost if whole]
         return judge_moves({m.label: m.before for m in self.moved}, len(labels)).joined(Judgement.of(parts, check))
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
@@ -140,12 +135,6 @@ class Worn:
         found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
                              np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
         return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
-
-
-def _at_fault(share: str, part: str, labels: Sequence[str]) -> str:
-    """What is told of a part whose markers are not where the layout says."""
-    return (f"{share} markers of the {part} ({', '.join(labels)}) are far from where the layout says: "
-            "wrong labels there, another layout, or a model that knows no such body?")
 
 
 class _Frames:
@@ -177,23 +166,25 @@ class _Frames:
         loose, least, greatest = self.layout.labels[of] in self.layout.loose, self.reach[0][of], self.reach[1][of]
         if not (loose or least < greatest) or not np.isfinite(self.targets[:, row, 0]).any():
             return float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
+        # a loose marker may be 20 cm along its part from its usual place
         centre = self.layout.nearest[of]
-        near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
+        near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < 0.2) \
             & (self.part == self.part[centre]) if loose else [centre]
         return float(self.off_skin(row, float(least), float(greatest))[0][near].min())
+
+    @cached_property
+    def off(self) -> np.ndarray:
+        """(L,) RMS distance of every marker from its own usual place, NaN for one seen in fewer than 4 frames."""
+        often = np.isfinite(self.targets[..., 0]).sum(axis=0) >= 4
+        return np.array([self.off_place(row, row) if seen else np.nan for row, seen in enumerate(often)])
 
     def far(self, least: float) -> float:
         """From how far off its usual place on a marker is suspected, at least so far, metres.
 
-        It is farther on a body that fits all markers badly, but where labels are mixed up no farther than twice `FAR`.
+        It is farther, four times the median marker's distance, on a body that the model hardly knows, but where labels
+        are mixed up no farther than twice `FAR`.
         """
-        off = self.off_usual()
-        return float(np.clip(UNUSUAL * np.nanmedian(off), least, 2 * FAR)) if np.isfinite(off).any() else least
-
-    def off_usual(self) -> np.ndarray:
-        """(L,) the same of every marker from its own, NaN for one that too few frames have seen."""
-        often = np.isfinite(self.targets[..., 0]).sum(axis=0) >= FEW
-        return np.array([self.off_place(row, row) if seen else np.nan for row, seen in enumerate(often)])
+        return float(np.clip(4.0 * np.nanmedian(self.off), least, 2 * FAR)) if np.isfinite(self.off).any() else least
 
 
 def _rms(apart: np.ndarray) -> np.ndarray:
@@ -222,29 +213,36 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 
     [MoSh]
     """
-    at = _Frames(model, person, sequences, layout, config.wand)
-    rough = replace(config, n_betas=ROUGH_BETAS, annealing=ROUGH_STAGES)
-    sides, sequences, at = _exchanged_sides(model, sequences, layout, at, rough)
-    suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else SUSPECT
-    for _ in range(ROUNDS):
-        off = dict(zip(at.layout.labels, np.nan_to_num(at.off_usual()).tolist(), strict=True))
-        limit = at.far(far)
+    # few betas do not follow a wrong marker
+    rough = replace(config, n_betas=20, annealing=(40.0, 10.0, 2.0, 1.0))
+    sides, sequences, at = _exchanged_sides(model, sequences, layout,
+                                            _Frames(model, person, sequences, layout, config.wand), rough)
+    # who is far off on the body of the others; at first, on one that all have drawn, 4 cm are enough
+    suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else 0.04
+    for _ in range(4):
+        off, limit = dict(zip(at.layout.labels, np.nan_to_num(at.off).tolist(), strict=True)), at.far(far)
         cleared |= {label for label in suspects if off[label] <= max(limit, FAR)}
         before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > limit)
-        if len(suspects) > MOST * len(off):
+        if len(suspects) > 0.25 * len(off):                             # not they are at fault, but the body
             return Worn(too_many=tuple(label for label in at.layout.labels if label in suspects))
         if suspects == before:
             break
-        far = FAR
-        at = _without(model, sequences, layout, suspects, rough)
+        at, far = _without(model, sequences, layout, suspects, rough), FAR
     if suspects:
         at = _without(model, sequences, layout, suspects, config)
     found = _explained(at, suspects)
+
+    # two exchanged names on a leg can draw all its markers away: what was found nowhere is sought on the body without
     if found.unplaced and (found.moved or found.exchanged):
-        found = _once_more(model, sequences, layout, found, config)
+        renamed, placed = [found.named(each, layout) for each in sequences], replace(found, unplaced=()).placed(layout)
+        again = _without(model, renamed, placed, (), config)
+        off, limit = dict(zip(again.layout.labels, again.off, strict=True)), again.far(FAR)
+        gone = [label for label in found.unplaced if off[label] > limit]
+        rest = _explained(_without(model, renamed, placed, gone, config), gone) if gone else Worn()
+        found = Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
     found = _with_whole_parts(at, found, model.skeleton.names)
-    again = set(sides) & set(found.exchanged)                           # exchanged, and put back
-    return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
+    back = set(sides) & set(found.exchanged)                            # exchanged, and put back
+    return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in back))
 
 
 def _with_whole_parts(at: _Frames, found: Worn, names: Sequence[str]) -> Worn:
@@ -262,22 +260,6 @@ def _with_whole_parts(at: _Frames, found: Worn, names: Sequence[str]) -> Worn:
                    unplaced=tuple(label for label in found.unplaced if label not in kept), lost=tuple(lost))
 
 
-def _once_more(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, found: Worn,
-               config: PersonConfig) -> Worn:
-    """What was found, with those that were found nowhere sought again on the body that it leads to.
-
-    Two exchanged names on a leg can draw all its markers away; without any of them, nothing would tell of the leg.
-    """
-    sequences = [found.named(each, layout) for each in sequences]
-    layout = replace(found, unplaced=()).placed(layout)
-    at = _without(model, sequences, layout, (), config)
-    off = dict(zip(at.layout.labels, at.off_usual(), strict=True))
-    limit = at.far(FAR)
-    far = [label for label in found.unplaced if off[label] > limit]
-    rest = _explained(_without(model, sequences, layout, far, config), far) if far else Worn()
-    return Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
-
-
 def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, suspects: Collection[str],
              config: PersonConfig) -> _Frames:
     """The body that is fitted without some markers, and all markers on it."""
@@ -291,104 +273,82 @@ def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layo
 
     Returned are the pairs, the sequences under their right names, and the body on them.
     """
-    labels, off = at.layout.labels, np.nan_to_num(at.off_usual())
+    def burden(off: np.ndarray) -> float:
+        """The sum of distances (L,), NaN for none; beyond some distance it does not matter how far a marker is."""
+        return float(np.minimum(np.nan_to_num(off), 2 * FAR).sum())
+
     best: tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames] = (), sequences, at
-    for tried in _promising(model, at) if (off > FAR).sum() >= SEVERAL else ():
-        names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in tried))
-        renamed = [names.named(each, layout) for each in sequences]
-        other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout, rough.wand)
-        if _burden(other) < 0.5 * _burden(at) and _burden(other) < _burden(best[2]):
-            best = names.exchanged, renamed, other
-    return best
+    if (np.nan_to_num(at.off) > FAR).sum() < 5:
+        return best
+    labels, mean = at.layout.labels, mean_person(model.subject(np.zeros(model.n_betas)), at.layout)
 
-
-def _promising(model: BodyModel, at: _Frames) -> list[list[tuple[int, int]]]:
-    """Those of `_limbs` that the mean person explains better than the names as they came: a fit of poses tells soon."""
-    mean = mean_person(model.subject(np.zeros(model.n_betas)), at.layout)
-
-    def burden(targets: np.ndarray) -> float:
+    def by_mean(targets: np.ndarray) -> float:
+        """How badly the mean person explains markers (B, L, 3): a fit of poses tells soon."""
         x = start_frames(mean, targets, lambda done: None)
-        return _capped(_rms(np.linalg.norm(mean.positions(x) - targets, axis=2)))
+        return burden(_rms(np.linalg.norm(mean.positions(x) - targets, axis=2)))
 
-    found, as_they_came = [], burden(at.targets)
+    as_they_came = by_mean(at.targets)
     for pairs in _limbs(model.skeleton.parents, at):
-        targets = at.targets.copy()
+        order = np.arange(len(labels))
         for i, j in pairs:
-            targets[:, [i, j]] = at.targets[:, [j, i]]
-        if burden(targets) < as_they_came:
-            found.append(pairs)
-    return found
+            order[[i, j]] = j, i
+        if by_mean(at.targets[:, order]) < as_they_came:
+            names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in pairs))
+            renamed = [names.named(each, layout) for each in sequences]
+            other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout, rough.wand)
+            if burden(other.off) < min(0.5 * burden(at.off), burden(best[2].off)):
+                best = names.exchanged, renamed, other
+    return best
 
 
 def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
     """The pairs of left and right: all, and those of each pair of limbs, which part where their bones do."""
-    def way(part: int) -> list[int]:
-        return [*(way(int(parents[part])) if part else []), part]
-
     pairs = [(i, int(j)) for i, j in enumerate(label_pairs(at.layout.labels)) if i < j]
     limbs: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in pairs:
-        fork = next((both for both in zip(*(way(int(at.part[at.layout.nearest[k]])) for k in (i, j)), strict=False)
-                     if both[0] != both[1]), None)
+        ways = (above(parents, int(at.part[at.layout.nearest[k]]))[::-1] for k in (i, j))
+        fork = next((both for both in zip(*ways, strict=False) if both[0] != both[1]), None)
         if fork:
             limbs.setdefault(fork, []).append((i, j))
     return [pairs, *limbs.values()] if pairs else []
-
-
-def _burden(at: _Frames) -> float:
-    """How badly a body explains its markers."""
-    return _capped(at.off_usual())
-
-
-def _capped(off: np.ndarray) -> float:
-    """The sum of distances (L,), NaN for none; beyond some distance it does not matter how far a marker is."""
-    return float(np.minimum(np.nan_to_num(off), 2 * FAR).sum())
 
 
 def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
     """What explains the suspects: a pair of exchanged names, or another place on the skin."""
     if not suspects:
         return Worn()
-    labels, usual = at.layout.labels, at.off_usual()
-    others = [i for i, label in enumerate(labels) if label not in suspects]
-    limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
-    far, exchanged = at.far(FAR), []
-    rows = {i for i, label in enumerate(labels) if label in suspects and usual[i] > far}
+    labels, far, exchanged = at.layout.labels, at.far(FAR), []
+    rows = {i for i, label in enumerate(labels) if label in suspects and at.off[i] > far}
     crossed = [(at.off_place(i, j), at.off_place(j, i), i, j) for i, j in combinations(sorted(rows), 2)]
     for one, other, i, j in sorted(crossed, key=lambda both: max(both[:2])):
-        if {i, j} <= rows and max(one, other) < FAR and one + other < GAIN * (usual[i] + usual[j]):
+        if {i, j} <= rows and max(one, other) < FAR and one + other < GAIN * (at.off[i] + at.off[j]):
             exchanged.append((labels[i], labels[j]))
             rows -= {i, j}
-    found = {row: _best_place(at, row, float(usual[row])) for row in sorted(rows)}
+    # another place explains a marker within 2 cm, or 1.5 times what the others are from their usual places
+    limit = max(0.02, 1.5 * float(np.nanmedian(at.off[[i for i, label in enumerate(labels) if label not in suspects]])))
+    found = {row: _best_place(at, row) for row in sorted(rows)}
     moved = {row: m for row, m in found.items() if m.after < limit and m.after < GAIN * m.before}
     return Worn(tuple(moved.values()), tuple(exchanged), tuple(labels[row] for row in found if row not in moved))
 
 
-def _best_place(at: _Frames, row: int, before: float) -> MovedMarker:
+def _best_place(at: _Frames, row: int) -> MovedMarker:
     """Where on the skin a marker is nearest, its distance from it being that of the layout, common or on a wand.
 
     [MoSh]
     """
-    own = float(np.asarray(at.layout.distances)[row])
-    least, greatest = min(own, DISTANCE), max(own, DISTANCE) + at.wand
-    tried = []
-    for low, high in {(own, own), (DISTANCE, DISTANCE), (least, greatest)}:
+    own, target = float(np.asarray(at.layout.distances)[row]), at.targets[:, row]
+    seen, tried = np.isfinite(target[:, 0]), []
+    for low, high in {(own, own), (DISTANCE, DISTANCE), (min(own, DISTANCE), max(own, DISTANCE) + at.wand)}:
         off, lift = at.off_skin(row, low, high)
         vertex = int(off.argmin())
         distance = float(lift[vertex])
-        tried += [MovedMarker(at.layout.labels[row], corners, weights, distance, before, after)
-                  for corners in at.template.faces[(at.template.faces == vertex).any(axis=1)]
-                  for weights, after in [_on_triangle(at, row, distance, corners)]]
+        for corners in at.template.faces[(at.template.faces == vertex).any(axis=1)]:
+            # the weights of the corners, lifted so far, that come nearest to the marker
+            lifted = at.vertices[:, corners] + distance * at.normals[:, corners]                      # (B, 3, 3)
+            sides = (lifted[seen, 1:] - lifted[seen, :1]).swapaxes(1, 2).reshape(-1, 2)
+            share = np.linalg.lstsq(sides, (target - lifted[:, 0])[seen].ravel(), rcond=None)[0]
+            weights = np.maximum([1 - share.sum(), *share], 0)
+            weights /= weights.sum()
+            after = float(_rms(np.linalg.norm(np.einsum("c,bcd->bd", weights, lifted) - target, axis=1)))
+            tried.append(MovedMarker(at.layout.labels[row], corners, weights, distance, float(at.off[row]), after))
     return min(tried, key=lambda m: m.after)
-
-
-def _on_triangle(at: _Frames, row: int, distance: float, corners: np.ndarray) -> tuple[np.ndarray, float]:
-    """The weights (3,) of a triangle's corners that come nearest to a marker, lifted so far, and its RMS distance."""
-    lifted = at.vertices[:, corners] + distance * at.normals[:, corners]                              # (B, 3, 3)
-    target = at.targets[:, row]
-    seen = np.isfinite(target[:, 0])
-    sides = (lifted[seen, 1:] - lifted[seen, :1]).swapaxes(1, 2).reshape(-1, 2)
-    share = np.linalg.lstsq(sides, (target - lifted[:, 0])[seen].ravel(), rcond=None)[0]
-    weights = np.maximum([1 - share.sum(), *share], 0)
-    weights /= weights.sum()
-    return weights, float(_rms(np.linalg.norm(np.einsum("c,bcd->bd", weights, lifted) - target, axis=1)))

@@ -5,8 +5,8 @@ solves it at the scan's vertices and interpolates, which is the same where the s
 """
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -20,11 +20,11 @@ from scanprep.geometry.surface import OrientedPoints, Rays, Surface
 from scanprep.ranges import FLAG, Positive, Range, Settings
 from scanprep.threads import search_threads
 
+from ...body import Progress
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from .normal_volume import Crossings, find_crossings, interpolate, limits, not_inverted, outer_layers
 from .texels import Lattice, Texels, find_texels
 
-Progress = Callable[[int, int], None]
 SPACING = 0.002                      # metres between the places of the scan that draw the surface over folds
 
 
@@ -56,15 +56,31 @@ def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = 
     [Statues] Eq. 19, 20, 21
     """
     config, tell = config or DisplacementConfig(), progress or (lambda done, total: None)
-    found = find_heights(control, scan, config)
+    ready = ReadyScan(scan)
+    found = find_heights(control, ready, config)
     tell(1, 2)
     texels, heights = found.texels, found.heights
     coverage = np.where(found.folded, FOLDED, np.where(found.known, MEASURED, HOLE)).astype(np.uint8)
     coverage[~texels.inside] = OUTSIDE
-    vectors = _vectors(control, scan, found, config.reach) if config.vectors else None
+    vectors = _vectors(control, ready, found, config.reach) if config.vectors else None
     tell(2, 2)
     return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE),
                            None if vectors is None else texels.image(vectors.astype(np.float32)))
+
+
+@dataclass(frozen=True, eq=False)
+class ReadyScan:
+    """A scan, and what is asked of it again and again."""
+
+    mesh: Mesh
+
+    @cached_property
+    def rays(self) -> Rays:
+        return Rays(self.mesh)
+
+    @cached_property
+    def surface(self) -> Surface:
+        return Surface(self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +93,10 @@ class Heights:
     folded: np.ndarray
 
 
-def find_heights(control: ControlModel, scan: Mesh, config: DisplacementConfig) -> Heights:
+def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementConfig) -> Heights:
     """Measured, sorted and filled heights; arguments and errors as of `bake`."""
-    if not len(scan.faces):
-        raise ValueError(f"scan: expected at least one triangle, got {scan}")
+    if not len(scan.mesh.faces):
+        raise ValueError(f"scan: expected at least one triangle, got {scan.mesh}")
     texels = find_texels(control.mesh, control.chart, config.size)
     if not texels.inside.any():
         raise ValueError(f"size: {config.size} pixels are too few, no pixel's centre lies in the chart")
@@ -101,26 +117,26 @@ def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig
     """
     config = config or DisplacementConfig()
     config = replace(config, size=min(config.size, 512))
-    best, before = control, np.inf
+    best, before, ready = control, np.inf, ReadyScan(scan)
     for number in range(rounds + 1):
-        found = find_heights(control, scan, config)
+        found = find_heights(control, ready, config)
         bad = (found.folded | ~found.known) & found.texels.inside
         without = float(texel_areas(control, found.texels)[bad].sum() / control.mesh.face_areas.sum())
         if without >= before:
             break
         best, before = control, without
         if number < rounds and without > 0:
-            drawn, u = _over_folds(Lattice(control), scan, found, config.reach)
+            drawn, u = _over_folds(Lattice(control), ready, found, config.reach)
             count = len(control.mesh.vertices)                   # the first of the lattice
             moved = np.where(drawn[:count, None], u[:count], 0)
             control = replace(control, mesh=control.mesh.with_vertices(control.mesh.vertices + moved))
     return best
 
 
-def _measure(mesh: Mesh, scan: Mesh, texels: Texels, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _measure(mesh: Mesh, scan: ReadyScan, texels: Texels, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Heights (n,) of pixels, NaN where there is none, and which (n,) had several to choose from."""
     points, normals = interpolate(mesh, texels.faces, texels.bary)
-    found = outer_layers(find_crossings(scan, Rays(scan), points, normals, reach))
+    found = outer_layers(find_crossings(scan.mesh, scan.rays, points, normals, reach))
     low, high = limits(mesh, points, normals, reach)
     of = found.normal
     far = found.heights * np.linalg.norm(normals[of], axis=1)
@@ -185,18 +201,17 @@ def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
     return (control.mesh.face_areas / np.maximum(pixel, 1e-12))[texels.faces]
 
 
-def _without_data(mesh: Mesh, scan: Mesh, texels: Texels, empty: np.ndarray, reach: float) -> np.ndarray:
+def _without_data(mesh: Mesh, scan: ReadyScan, texels: Texels, empty: np.ndarray, reach: float) -> np.ndarray:
     """(n of empty,) bool: the scan is out of reach, or ends at what is nearest, or that is another body part. A place
     inside the scan, however deep, is a fold; outside the surface is missing unless it passes close by.
     """
     import igl
 
     points, _ = interpolate(mesh, texels.faces[empty], texels.bary[empty])
-    nearest = Surface(scan).closest(points)
-    border = np.zeros(len(scan.vertices), dtype=bool)
-    border[scan.boundary_vertices] = True
-    inside = np.asarray(igl.fast_winding_number(scan.vertices, scan.faces, points)).ravel() > 0.5
-    return ((nearest.distances > reach) | border[scan.faces[nearest.faces]].any(axis=1)
+    nearest = scan.surface.closest(points)
+    ends = np.isin(scan.mesh.faces[nearest.faces], scan.mesh.boundary_vertices).any(axis=1)
+    inside = np.asarray(igl.fast_winding_number(scan.mesh.vertices, scan.mesh.faces, points)).ravel() > 0.5
+    return ((nearest.distances > reach) | ends
             | (~inside & (nearest.distances > 0.01)))
 
 
@@ -209,7 +224,7 @@ def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: n
     return out
 
 
-def _over_folds(lattice: Lattice, scan: Mesh, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Which vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all."""
     values, sure = lattice.gather(found.texels, found.heights, found.known)
     _, no_fold = lattice.gather(found.texels, found.heights, ~found.folded)
@@ -217,7 +232,7 @@ def _over_folds(lattice: Lattice, scan: Mesh, found: Heights, reach: float) -> t
     return bend_over_folds(lattice, scan, smooth, ~no_fold, reach)
 
 
-def _vectors(control: ControlModel, scan: Mesh, found: Heights, reach: float) -> np.ndarray:
+def _vectors(control: ControlModel, scan: ReadyScan, found: Heights, reach: float) -> np.ndarray:
     """What is to be added (n, 3) to the heights of pixels in and around folds."""
     lattice, texels = Lattice(control, 4), found.texels
     drawn, u = _over_folds(lattice, scan, found, reach)
@@ -230,7 +245,7 @@ def _vectors(control: ControlModel, scan: Mesh, found: Heights, reach: float) ->
     return out
 
 
-def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: np.ndarray, reach: float
+def bend_over_folds(lattice: Lattice, scan: ReadyScan, heights: np.ndarray, folded: np.ndarray, reach: float
                     ) -> tuple[np.ndarray, np.ndarray]:
     """Which fine vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all, metres in the
     axes of the world; from `heights` (n,), smooth across folds, and which of them are `folded` (n,).
@@ -254,7 +269,7 @@ def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: n
     held[free] = 0
     of_free = csc_array(L)[:, free]
     bending, pull = csc_array(of_free.T @ of_free), -of_free.T @ (L @ held)
-    places, facing = _places(scan, start[free], reach)
+    places, facing = _places(scan.mesh, start[free], reach)
     if not len(places):
         return drawn, start - p
     target = OrientedPoints(places, facing, 0.01)    # metres that a change of the normal by 60 degrees is worth
@@ -272,16 +287,16 @@ def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: n
     return drawn & better, np.where(better[:, None], surface, start) - p
 
 
-def _better(lattice: Lattice, scan: Mesh, before: np.ndarray, after: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+def _better(lattice: Lattice, scan: ReadyScan, before: np.ndarray, after: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     """(n,) bool: vertices of those patches of drawn ones that have come nearer to the scan, in the mean square."""
     only = diags_array(drawn.astype(float))
     _, patch = connected_components(only @ lattice.fine.vertex_adjacency @ only, directed=False)
     faces = lattice.fine.faces[drawn[lattice.fine.faces].all(axis=1)]
-    surface, of = Surface(scan), patch[faces[:, 0]]
+    of = patch[faces[:, 0]]
     error = []
     for vertices in (before, after):
         there = Mesh(vertices, faces)
-        far = surface.closest(there.corners.mean(axis=1)).distances
+        far = scan.surface.closest(there.corners.mean(axis=1)).distances
         area = np.bincount(of, there.face_areas, len(patch))
         error.append(np.bincount(of, there.face_areas * far**2, len(patch)) / np.maximum(area, 1e-30))
     return (error[1] < error[0])[patch]

@@ -1,0 +1,103 @@
+"""What motions from markers are worth: markers that are not believed, and frames that cannot be."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scanprep.console import Metric
+from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+
+from ...motion import Motion
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import MarkerLayout
+
+DOUBTFUL = 0.018                     # of the size, 25 mm on a man; good motions are 4 to 25 mm off, shuffled frames 31
+
+
+def markers_told(motions: Sequence[Motion]) -> Metric:
+    """Over which markers the mean distance of motions of one body is taken."""
+    seen = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)
+            if np.isfinite(column).any()}
+    out = sorted({label for motion in motions for label in motion.distrusted})
+    without = f", without {', '.join(out)}" if out else ""
+    return Metric("markers in the mean distance", f"{len(seen) - len(out)} of {len(seen)}{without}")
+
+
+def hardly_believed(motions: Sequence[Motion]) -> tuple[str, ...]:
+    """A reason to look at motions of one body: markers that are distrusted throughout."""
+    out = sorted({label for motion in motions for label in motion.distrusted})
+    return (f"{', '.join(out)} hardly ever believed: not worn where the layout says, and not in the mean distance",
+            ) if out else ()
+
+
+def hardly_seen(motions: Sequence[Motion]) -> tuple[str, ...]:
+    """A reason to look at motions: most of their frames show too few markers to place a body."""
+    few = sum(int((np.isfinite(motion.residuals).sum(axis=1) < 3).sum()) for motion in motions)
+    frames = sum(len(motion.residuals) for motion in motions)
+    return (f"{few} of {frames} frames show fewer than 3 markers: the body there is carried over from the others",
+            ) if few > frames / 2 else ()
+
+
+def judge_motions(person: Judgement, own: Judgement, motions: Sequence[Motion], body: Mesh) -> Judgement:
+    """What motions are worth, by themselves and by the `person` that was found from the same markers.
+
+    On a body that is nowhere near its markers, the size of the person is no cause but an effect, and told last.
+    """
+    return own.joined(person) if mean_off(motions) > HAND * size(body) else person.joined(own)
+
+
+def mean_off(motions: Sequence[Motion]) -> float:
+    """Mean distance of all markers from where the body has them, metres; 0 without any."""
+    found = [motion.residuals[np.isfinite(motion.residuals)] for motion in motions]
+    return float(np.concatenate(found).mean()) if any(map(len, found)) else 0.0
+
+
+def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], body: Mesh) -> tuple[str, ...]:
+    """Reasons to look at motions of one body, made from markers; `body` is the model's template."""
+    reasons = [*hardly_seen(motions), *hardly_believed(motions)]
+    off = mean_off(motions)
+    if off > DOUBTFUL * size(body):
+        reasons.append(f"the markers are {1000 * off:.0f} mm from where the body has them")
+    return (*filter(None, (haste(one, body) for one in markers)), *reasons)
+
+
+def haste(markers: MarkerSequence, body: Mesh) -> str | None:
+    """Why markers of a recording cannot have moved so, with the likely cause; None where they can."""
+    # Sizes a second at which the median marker moves, 7 m/s on a man. Walking has 1, running 4; a walk told ten times
+    # too fast 12, one with shuffled frames 15. Noise of a millimetre moves a marker by 0.05 m/s.
+    speed = marker_speed(markers)
+    return f"the markers move at {speed:.0f} m/s: frames in another order, or the wrong rate?" \
+        if speed > 5.0 * size(body) else None
+
+
+def marker_speed(markers: MarkerSequence) -> float:
+    """Median speed of all markers, metres per second, over steps of about a thirtieth of a second."""
+    step = max(1, round(markers.rate / 30))
+    moved = np.linalg.norm(markers.positions[step:] - markers.positions[:-step], axis=2)
+    known = moved[np.isfinite(moved)]
+    return float(np.median(known)) * markers.rate / step if len(known) else 0.0
+
+
+def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
+    """Why a motion from markers of a layout means nothing, and the likely cause; `body` is the model's template."""
+    seen = np.isfinite(motion.residuals)
+    if not seen.any():
+        return "no marker of the layout was ever seen: markers of another layout?"
+    known = layout.matched(markers.labels, 0)
+    columns = [markers.labels.index(label) for label in known]
+    some = markers.positions[:: max(1, len(seen) // 50), columns]
+    whole = np.isfinite(some[..., 0]).sum(axis=1)
+    # the median of frames that show most markers: a ghost of one frame makes its box as large as it likes
+    spans = [extent(frame) for frame in some[whole >= 0.9 * whole.max()]]
+    wrong = unit_problem(float(np.nanmedian(spans)), extent(layout.select(known).place(body)), "the markers span a box")
+    # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
+    off, far = float(motion.residuals[seen].mean()), 0.025 * size(body)
+    if wrong is None and off <= far:
+        return None
+    believed = 100 * float(motion.trusted[seen].mean())
+    return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
+            f"of the frames converged and {believed:.0f}% of the markers are believed; "
+            + (wrong or haste(markers, body)
+               or "labels mixed up, left and right exchanged, another layout, or another model?"))

@@ -1,0 +1,165 @@
+"""What a deformation graph resists and what draws it: terms with their value and what they add to the normal equations.
+
+All energies are areas times squared lengths, so their balance does not depend on how finely template, graph or scan are
+divided.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import bsr_array, csc_array
+
+from ..geometry import rotations
+from ..geometry.sparse import gatherer, sum_groups
+from .deformation_graph import DeformationGraph, NodeMotion, arms
+from .matches import Pull
+from .schedule import GraphStage
+
+UNKNOWNS = 7
+
+
+class NodePattern:
+    """Where the normal matrix of a graph has blocks, and which block every vertex and edge adds to."""
+
+    def __init__(self, graph: DeformationGraph) -> None:
+        M, K = len(graph.node_vertices), graph.carriers.shape[1]
+        i, j = graph.edges.T
+        of_vertices = (graph.carriers[:, :, None] * M + graph.carriers[:, None, :]).reshape(-1)
+        of_edges = np.concatenate([i * M + i, i * M + j, j * M + i, j * M + j])
+        keys, where = np.unique(np.concatenate([of_vertices, of_edges, np.arange(M) * (M + 1)]),
+                                return_inverse=True)
+        self.nodes = M
+        self.rows, self.columns = keys // M, keys % M
+        blocks = bsr_array((np.arange(len(keys) * UNKNOWNS**2).reshape(-1, UNKNOWNS, UNKNOWNS), self.columns,
+                            np.searchsorted(self.rows, np.arange(M + 1))), shape=(M * UNKNOWNS, M * UNKNOWNS))
+        self._entries = csc_array(blocks)            # of every entry its place in the blocks
+        self.vertex_slots = where[:len(of_vertices)].reshape(-1, K * K)
+        edge_slots = where[len(of_vertices):len(of_vertices) + len(of_edges)].reshape(4, -1)
+        self._gather = {count: (gatherer(edge_slots[:, :count].reshape(-1), len(keys)),
+                                gatherer(graph.edges[:count].T.reshape(-1), M))
+                        for count in (len(graph.edges), len(graph.edges) // 2)}
+
+    def of_edges(self, blocks: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Blocks (P, 7, 7) and half the gradient (M, 7) of all nodes from those of edges, or of their first half.
+
+        Of every edge the blocks (4, E, 7, 7) join the first node with itself, with the second, the second with the
+        first and with itself; the forces (2, E, 7) are on the first and the second.
+        """
+        to_blocks, to_nodes = self._gather[blocks.shape[1]]
+        return (sum_groups(to_blocks, blocks.reshape(-1, UNKNOWNS, UNKNOWNS)),
+                sum_groups(to_nodes, forces.reshape(-1, UNKNOWNS)))
+
+    def matrix(self, blocks: np.ndarray) -> csc_array:
+        """The sparse symmetric matrix of all blocks (P, 7, 7)."""
+        entries = self._entries
+        return csc_array((blocks.reshape(-1)[entries.data], entries.indices, entries.indptr), shape=entries.shape)
+
+
+node_pattern = lru_cache(maxsize=4)(NodePattern)          # all rounds of a stage, and a folder of scans, share it
+
+
+class Term(NamedTuple):
+    """One energy at one state: its value, and on demand the Gauss-Newton blocks (P, 7, 7) and half the gradient (M, 7)
+    that it adds to the normal equations.
+    """
+
+    value: float
+    normal: Callable[[NodePattern], tuple[np.ndarray, np.ndarray]]
+
+
+def _edge_term(r: np.ndarray, w: np.ndarray, jacobians: Callable[[], tuple[np.ndarray, np.ndarray]]) -> Term:
+    """`Σ w |r|²` over the edges of a graph, or their first half, for residuals r (E, d) with weights w (E,).
+
+    The Jacobians (E, d, 7) are by the unknowns of the first and of the second node.
+    """
+    def normal(pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = jacobians()
+        wi, wj = (w[:, None, None] * J.transpose(0, 2, 1) for J in (Ji, Jj))
+        return pattern.of_edges(np.stack([wi @ Ji, wi @ Jj, wj @ Ji, wj @ Jj]),
+                                np.stack([wi @ r[..., None], wj @ r[..., None]])[..., 0])
+
+    return Term(float(np.sum(w[:, None] * r**2)), normal)
+
+
+def data_term(graph: DeformationGraph, motion: NodeMotion, wanted: Pull) -> Term:
+    """What matches and landmarks ask of the nodes that carry the vertices."""
+    active = np.flatnonzero(np.einsum("nii->n", wanted.A) > 0)
+    A, b = wanted.A[active], wanted.b[active]
+    w, carriers = graph.weights[active], graph.carriers[active]
+    y = arms(graph, motion, active)
+    x = np.einsum("nk,nkd->nd", w, motion.positions[carriers] + y)
+    Ax = np.matmul(A, x[..., None])[..., 0]
+
+    def normal(pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        n, K = w.shape
+        J = np.empty((n, 3, K, UNKNOWNS))
+        J[..., :3] = -rotations.hat(y).transpose(0, 2, 1, 3)
+        J[..., 3] = y.transpose(0, 2, 1)
+        J[..., 4:] = np.eye(3)[:, None]
+        J *= w[:, None, :, None]
+        flat = J.reshape(n, 3, K * UNKNOWNS)
+        blocks = np.matmul(flat.transpose(0, 2, 1), np.matmul(A, flat)).reshape(n, K, UNKNOWNS, K, UNKNOWNS)
+        force = np.matmul(flat.transpose(0, 2, 1), (Ax - b)[..., None]).reshape(n * K, UNKNOWNS)
+        return (sum_groups(gatherer(pattern.vertex_slots[active].reshape(-1), len(pattern.rows)),
+                       blocks.transpose(0, 1, 3, 2, 4).reshape(n * K * K, UNKNOWNS, UNKNOWNS)),
+                sum_groups(gatherer(carriers.reshape(-1), pattern.nodes), force))
+
+    return Term(float(np.sum(x * (Ax - 2 * b)) + wanted.c), normal)
+
+
+def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
+    """Every node wants to see its neighbours where its own rotation and growth would put them.
+
+    A strain of one costs as much as `stiffness` metres from the data.
+    """
+    i, j = graph.edges.T
+    rest = graph.edge_vectors
+    y = np.matmul(motion.linear[i], rest[..., None])[..., 0]
+    squared = np.sum(rest**2, axis=1)
+    squared = np.maximum(squared, 1e-6 * squared.mean())           # nodes may coincide where sheets touch
+
+    def jacobians() -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
+        Ji[..., :3], Ji[..., 3], Ji[..., 4:], Jj[..., 4:] = -rotations.hat(y), y, np.eye(3), -np.eye(3)
+        return Ji, Jj
+
+    return _edge_term(y - (motion.positions[j] - motion.positions[i]), stiffness**2 * graph.edge_area / squared,
+                      jacobians)
+
+
+def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
+    """Neighbours want to rotate alike: one radian between them costs as much as `stiffness` metres from the data."""
+    i, j = graph.links.T
+    r = rotations.log(motion.R[j] @ motion.R[i].transpose(0, 2, 1))
+
+    def jacobians() -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
+        inverse = rotations.inverse_right_jacobian(r)
+        Ji[..., :3], Jj[..., :3] = -inverse, inverse.transpose(0, 2, 1)
+        return Ji, Jj
+
+    return _edge_term(r, stiffness**2 * graph.link_area, jacobians)
+
+
+def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
+    """Neighbours want to grow alike: a factor of e between them costs as much as `stiffness` metres from the data."""
+    i, j = graph.links.T
+
+    def jacobians() -> tuple[np.ndarray, np.ndarray]:
+        Ji, Jj = np.zeros((2, len(i), 1, UNKNOWNS))
+        Ji[..., 3], Jj[..., 3] = -1, 1
+        return Ji, Jj
+
+    return _edge_term((motion.log_scale[j] - motion.log_scale[i])[:, None], stiffness**2 * graph.link_area, jacobians)
+
+
+def terms(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stage: GraphStage, size: float
+          ) -> dict[str, Term]:
+    """All terms of the energy at one state, on a template of some size, metres."""
+    return {"data": data_term(graph, motion, wanted),
+            "stretch": stretch_term(graph, motion, stage.stretch * size),
+            "bend": bend_term(graph, motion, stage.bend * size),
+            "growth": growth_term(graph, motion, stage.growth * size)}
