@@ -14,7 +14,7 @@ from .bodies import FixedBody, Follow
 from .named_points import distinct, search
 from .scan import ScanPoints, spread
 from .scan_fit import EVIDENCE, ScanFit
-from .upright import SPREAD, SPREAD_OF_MANY, Upright
+from .upright import SPREAD, SPREAD_OF_MANY
 
 AXES = 4                             # directions of the training poses along which a search from landmarks starts
 CANDIDATES = 3                       # starts that are carried on from the landmarks to the scan
@@ -22,6 +22,7 @@ COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, 
 STEPS = 2                            # for each matching of them: they are too few to settle with one
 PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
 FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
+HALF = 0.65                          # of a body's length: a scan that is shorter is of a part of it
 ROTATIONS = 600                         # about 25 degrees between neighbours
 LEVELS = 5                           # heights at which a body that stands is laid on what is seen of it
 POSES = 100                          # tried at most
@@ -171,7 +172,7 @@ def all_rotations(count: int) -> np.ndarray:
 def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body, config = fit.body, fit.config
-    poses, turns, lift = starting_poses(fit), *placed_turns(fit.upright)
+    poses, (turns, lift, up) = starting_poses(fit), placed_turns(fit)
     scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.posed_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.data.cameras]).reshape(-1, 3)
@@ -179,8 +180,8 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     table, rough = fit.data.outside, np.swapaxes(turns, 1, 2).astype(np.float32)
     cost, shift = np.zeros((len(poses), len(turns))), np.empty((len(poses), len(turns), 3))
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
-        shift[a] = _laid(y, n, turns, toward, scan.points) if fit.upright is None else \
-            _stood(y, n, turns, lift, toward, scan.points, fit.upright)
+        shift[a] = _laid(y, n, turns, toward, scan.points) if up is None else \
+            _stood(y, n, turns, lift, toward, scan.points, up)
         if table is not None:
             out = table.at(y.astype(np.float32) @ rough + shift[a][:, None].astype(np.float32))
             cost[a] = config.free_space_weight * (out**2).mean(axis=1)
@@ -198,16 +199,26 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     return x, cost.ravel()[order]
 
 
-def placed_turns(upright: Upright | None) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (T, 3, 3) to try, and how high the body is placed in each (T,).
+def placed_turns(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Rotations (T, 3, 3) to try, how high the body is placed in each (T,), and along which direction (T, 3).
 
-    Of a body that stands as much as nothing may be beyond the picture: its upper end is laid on that of the scan at
-    0, its lower end at 1.
+    Its upper end is laid on that of the scan at 0, its lower end at 1. Of a body that stands as much as nothing may be
+    beyond the picture; a scan that is much shorter than a body, and that no camera explains, is of either half. Others
+    have no direction: their middle is laid on that of the scan.
     """
-    if upright is None:
-        return all_rotations(ROTATIONS), np.zeros(ROTATIONS)
-    turns = upright.rotations(all_rotations(SPREAD if len(upright.ups) == 1 else SPREAD_OF_MANY))
-    return np.repeat(turns, LEVELS, axis=0), np.tile(np.linspace(0, 1, LEVELS), len(turns))
+    upright, every = fit.upright, all_rotations(ROTATIONS)
+    if upright is not None:
+        turns = upright.rotations(all_rotations(SPREAD if len(upright.ups) == 1 else SPREAD_OF_MANY))
+        up = upright.ups[np.argmax(turns @ upright.of_body @ upright.ups.T, axis=1)]
+        lift = np.linspace(0, 1, LEVELS)
+    else:
+        extent = np.ptp(fit.body.template.vertices, axis=0)
+        off = fit.cloud.points - fit.cloud.points.mean(axis=0)
+        length = np.ptp(off @ np.linalg.svd(off[::1 + len(off) // 5000], full_matrices=False)[2][0])
+        if fit.data.cameras or length > HALF * extent.max():
+            return every, np.zeros(len(every)), None
+        turns, up, lift = every, every[:, :, extent.argmax()], np.array([0, 0.5, 1])
+    return np.repeat(turns, len(lift), axis=0), np.tile(lift, len(turns)), np.repeat(up, len(lift), axis=0)
 
 
 def _facing(n: np.ndarray, turns: np.ndarray, toward: np.ndarray) -> np.ndarray:
@@ -225,9 +236,9 @@ def _laid(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray, s
 
 
 def _stood(y: np.ndarray, n: np.ndarray, turns: np.ndarray, lift: np.ndarray, toward: np.ndarray, scan: np.ndarray,
-           upright: Upright) -> np.ndarray:
-    """Shifts (T, 3) that stand a body as high as `lift` (T,) says, and lay what is then level with the scan on it."""
-    up = upright.ups[np.argmax(turns @ upright.of_body @ upright.ups.T, axis=1)]
+           up: np.ndarray) -> np.ndarray:
+    """Shifts (T, 3) that raise a body along `up` (T, 3) as `lift` (T,) says, and lay what is level with the scan on it.
+    """
     high, own = (scan @ up.T).T, np.einsum("ld,tde,te->tl", y, np.swapaxes(turns, 1, 2), up)
     raised = ((1 - lift) * (high.max(axis=1) - own.max(axis=1)) + lift * (high.min(axis=1) - own.min(axis=1)))
     level = own + raised[:, None]

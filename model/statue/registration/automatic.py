@@ -4,21 +4,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.geometry.farthest_points import thin
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
+from scanprep.geometry.surface import Surface
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
-from scanprep.threads import one_thread
+from scanprep.threads import one_thread, search_threads
 from scanprep.words import number_of
 
 from ..control.model import ControlModel
 from .features import FeatureFit, fit_features
 from .person_search import find_person
 
-SHOWN = 0.3                      # share of the vertices around a joint or landmark that must have data
+SHOWN = 0.3                      # share of the vertices around a joint or landmark, or of a limb, that must have data
+OWN = 0.02                       # metres from the rest of the body: points that are nearer say nothing of a limb
 # How far, metres, the posed body stays off a scan at most, and how many times farther, at least, when it faces another
 # way. Six synthetic persons: 11 to 13 mm, 1.7 to 3.3 times; nine real ones, five of them bent: 18 to 21 mm, 1.5 to 2.9;
 # fronts and sides alone 21 mm, 1.35 to 1.6. A cylinder 47 mm, 1.13; a chair 56 mm; two people 65 and 70 mm.
@@ -63,7 +66,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     placed = data.with_vertices(metres * data.vertices) if isinstance(data, Mesh) else metres * data
     found = register(best.mesh, placed, config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]),
                      start=np.eye(4))
-    joints, points, missing = _features(control, found, metres)
+    joints, points, missing = _features(control, found, placed, metres)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(found.mesh.vertices / metres)
     problem = why_uncertain(best.off, margin, found.uncovered) if fit else (
@@ -104,7 +107,7 @@ def _length(points: np.ndarray) -> float:
     return float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
 
 
-def _features(control: ControlModel, found: Registration, metres: float
+def _features(control: ControlModel, found: Registration, scan: Mesh | np.ndarray, metres: float
               ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
     """Joints and points with data around them, in the unit of the scan, and the names of the others."""
     skeleton, near = control.skeleton, control.mesh.vertex_adjacency
@@ -112,9 +115,20 @@ def _features(control: ControlModel, found: Registration, metres: float
     centres = skeleton.joint_regressor(control.mesh) @ x / metres
     around = (near @ seen + seen) / (near.sum(axis=1) + 1)
     shown = np.array([seen[skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN for j in range(len(centres))])
-    for j, parent in enumerate(skeleton.parents):
-        shown[j] &= parent <= 0 or shown[parent]                # a hand on the thigh, where no elbow is, is the thigh
     part = control.weights.argmax(axis=1)
+    # a limb has data of its own where the nearest points of the scan are not near the rest of the body as well: a hand
+    # on the thigh, where no forearm was scanned, is the thigh
+    data = scan.vertices if isinstance(scan, Mesh) else scan
+    nearest = data[cKDTree(data).query(x, workers=search_threads(len(x)))[1]]
+    of_face = part[control.mesh.faces].min(axis=1)
+    for j, parent in enumerate(skeleton.parents):
+        limb = np.flatnonzero(skeleton.descends[:, j])
+        mine = np.isin(part, limb)
+        if parent >= 0 and mine.any():
+            rest = found.mesh.submesh(~np.isin(of_face, limb))[0]
+            own = Surface(rest).closest(nearest[mine]).distances > OWN
+            shown[j] &= bool((own * seen[mine]).mean() > SHOWN)
+        shown[j] &= parent <= 0 or shown[parent]
     joints = {name: centres[j] for j, name in enumerate(skeleton.names) if shown[j]}
     places = x / metres
     points = {name: places[v] for name, v in control.landmarks.items()
