@@ -201,10 +201,6 @@ BENCHMARKS = (
               "poses and 46 men; tuned on other bodies, cameras and clothes. A part is seen when a fifth of its "
               "vertices is. Where we lose: limbs that the body hides, and legs of which the picture shows nothing.",
               quick="depth_camera.py -m SCRATCH/model.npz --only 2 3 4 5 6 --marks up"),
-    Benchmark("searches", "Two searches for pose and shape", "searches.py -m MEN --fold FOLD_0", completion.searches,
-              "That of `complete` and that of co-registration, which ends with a non-rigid registration. Held-out "
-              "men and poses.",
-              quick=""),
     Benchmark("wrong_landmarks", "Landmarks at wrong places", "wrong_landmarks.py -m FOLD_0",
               completion.wrong_landmarks,
               "Half views of held-out poses, known subject: as they are, exchanged, or one of them at the place of "

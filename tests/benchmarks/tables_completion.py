@@ -104,13 +104,6 @@ def tracking(report: dict) -> str:
     return table(("frames", *(n if n in ("lost frames", "CPU s a frame") else f"{n} (mm)" for n in names)), rows)
 
 
-def searches(report: dict) -> str:
-    """Two searches on the same scans, case by case."""
-    names = ("mesh_mm", "model_mm", "worst_part_mm", "cpu_s")
-    rows: Rows = [(r["what"], r["landmarks"], r["way"], *(r[n] for n in names)) for r in report["rows"]]
-    return table(("scan", "landmarks", "way", "mesh (mm)", "model (mm)", "worst part (mm)", "time (s CPU)"), rows)
-
-
 def depth_camera(report: dict) -> str:
     """Shares of right results and errors by what was told: only the picture, the way up, four or seven landmarks."""
     mean, rows = report["mean"], []
