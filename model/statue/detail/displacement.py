@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, csr_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -95,17 +95,38 @@ class Heights:
 
 def find_heights(control: ControlModel, scan: ReadyScan, config: DisplacementConfig) -> Heights:
     """Measured, sorted and filled heights; arguments and errors as of `bake`."""
+    import igl
+
     if not len(scan.mesh.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan.mesh}")
-    texels = find_texels(control.mesh, control.chart, config.size)
+    mesh, reach, texels = control.mesh, config.reach, find_texels(control.mesh, control.chart, config.size)
     if not texels.inside.any():
         raise ValueError(f"size: {config.size} pixels are too few, no pixel's centre lies in the chart")
-    heights, several = _measure(control.mesh, scan, texels, config.reach)
+    # crossings of each pixel's normal with the scan that no other body part and no inverted triangle rules out
+    points, normals = interpolate(mesh, texels.faces, texels.bary)
+    found = outer_layers(find_crossings(scan.mesh, scan.rays, points, normals, reach))
+    low, high = limits(mesh, points, normals, reach)
+    of = found.normal
+    far = found.heights * np.linalg.norm(normals[of], axis=1)
+    found = found.pick((found.cosines > 0.1) & (far >= low[of]) & (far <= high[of])
+                       & not_inverted(mesh, texels.faces[of], texels.bary[of], found.heights))
+    several = np.bincount(found.normal, minlength=len(points)) > 1
+    heights = _choose(found, several, texels.neighbours())
     known, folded = _sort(control, texels, heights, several)
-    empty = ~known & ~folded
-    if empty.any():
-        folded[empty] = ~_without_data(control.mesh, scan, texels, empty, config.reach)
-    return Heights(texels, _filled(control, texels, heights, known), known, folded)
+    # Without a height: a place inside the scan, however deep, is a fold; outside the surface is missing unless it
+    # passes close by. It is missing too where the scan ends at what is nearest, or that is another body part.
+    empty = np.flatnonzero(~known & ~folded)
+    if len(empty):
+        nearest = scan.surface.closest(points[empty])
+        ends = np.isin(scan.mesh.faces[nearest.faces], scan.mesh.boundary_vertices).any(axis=1)
+        inside = np.asarray(igl.fast_winding_number(scan.mesh.vertices, scan.mesh.faces, points[empty])).ravel() > 0.5
+        folded[empty] = ~((nearest.distances > reach) | ends | (~inside & (nearest.distances > 0.01)))
+    # filled from around: harmonic on the control surface, so across seams too
+    lattice, filled = Lattice(control), heights.copy()
+    values, sure = lattice.gather(texels, heights, known)
+    values = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
+    filled[~known] = lattice.sample(values, texels.faces[~known], texels.bary[~known])
+    return Heights(texels, filled, known, folded)
 
 
 def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None, rounds: int = 2
@@ -126,24 +147,11 @@ def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig
             break
         best, before = control, without
         if number < rounds and without > 0:
-            drawn, u = _over_folds(Lattice(control), ready, found, config.reach)
+            drawn, u = bend_over_folds(Lattice(control), ready, found, config.reach)
             count = len(control.mesh.vertices)                   # the first of the lattice
             moved = np.where(drawn[:count, None], u[:count], 0)
             control = replace(control, mesh=control.mesh.with_vertices(control.mesh.vertices + moved))
     return best
-
-
-def _measure(mesh: Mesh, scan: ReadyScan, texels: Texels, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (n,) of pixels, NaN where there is none, and which (n,) had several to choose from."""
-    points, normals = interpolate(mesh, texels.faces, texels.bary)
-    found = outer_layers(find_crossings(scan.mesh, scan.rays, points, normals, reach))
-    low, high = limits(mesh, points, normals, reach)
-    of = found.normal
-    far = found.heights * np.linalg.norm(normals[of], axis=1)
-    found = found.pick((found.cosines > 0.1) & (far >= low[of]) & (far <= high[of])
-                       & not_inverted(mesh, texels.faces[of], texels.bary[of], found.heights))
-    several = np.bincount(found.normal, minlength=len(points)) > 1
-    return _choose(found, several, texels.neighbours()), several
 
 
 def _choose(found: Crossings, several: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -183,10 +191,8 @@ def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: n
     apart = np.linalg.norm(points[a] - points[b], axis=1)
     # steps of less than 3 mm are noise, or views that differ
     jump = np.abs(heights[a] - heights[b]) > np.maximum(3.0 * apart, 0.003)
-    count = len(heights)
-    joined = coo_array((np.ones((~jump).sum()), (a[~jump], b[~jump])), shape=(count, count))
-    _, patch = connected_components(joined, directed=False)
-    beside = np.zeros(count, dtype=bool)
+    patch = sparse.connected_pieces(a[~jump], b[~jump], len(heights))
+    beside = np.zeros(len(heights), dtype=bool)
     beside[a[jump]] = beside[b[jump]] = True
     area = np.bincount(patch, texel_areas(control, texels))
     torn = np.bincount(patch, beside) > 0
@@ -201,41 +207,10 @@ def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
     return (control.mesh.face_areas / np.maximum(pixel, 1e-12))[texels.faces]
 
 
-def _without_data(mesh: Mesh, scan: ReadyScan, texels: Texels, empty: np.ndarray, reach: float) -> np.ndarray:
-    """(n of empty,) bool: the scan is out of reach, or ends at what is nearest, or that is another body part. A place
-    inside the scan, however deep, is a fold; outside the surface is missing unless it passes close by.
-    """
-    import igl
-
-    points, _ = interpolate(mesh, texels.faces[empty], texels.bary[empty])
-    nearest = scan.surface.closest(points)
-    ends = np.isin(scan.mesh.faces[nearest.faces], scan.mesh.boundary_vertices).any(axis=1)
-    inside = np.asarray(igl.fast_winding_number(scan.mesh.vertices, scan.mesh.faces, points)).ravel() > 0.5
-    return ((nearest.distances > reach) | ends
-            | (~inside & (nearest.distances > 0.01)))
-
-
-def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Heights where none is known, from around them: harmonic on the control surface, so across seams too."""
-    lattice, out = Lattice(control), heights.copy()
-    values, sure = lattice.gather(texels, heights, known)
-    values = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
-    out[~known] = lattice.sample(values, texels.faces[~known], texels.bary[~known])
-    return out
-
-
-def _over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all."""
-    values, sure = lattice.gather(found.texels, found.heights, found.known)
-    _, no_fold = lattice.gather(found.texels, found.heights, ~found.folded)
-    smooth = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
-    return bend_over_folds(lattice, scan, smooth, ~no_fold, reach)
-
-
 def _vectors(control: ControlModel, scan: ReadyScan, found: Heights, reach: float) -> np.ndarray:
     """What is to be added (n, 3) to the heights of pixels in and around folds."""
     lattice, texels = Lattice(control, 4), found.texels
-    drawn, u = _over_folds(lattice, scan, found, reach)
+    drawn, u = bend_over_folds(lattice, scan, found, reach)
     near = np.unique(lattice.subdivision.face_parent[drawn[lattice.fine.faces].any(axis=1)])
     which = np.flatnonzero(np.isin(texels.faces, near))
     which = which[lattice.sample(drawn.astype(float), texels.faces[which], texels.bary[which]) > 0]
@@ -245,61 +220,63 @@ def _vectors(control: ControlModel, scan: ReadyScan, found: Heights, reach: floa
     return out
 
 
-def bend_over_folds(lattice: Lattice, scan: ReadyScan, heights: np.ndarray, folded: np.ndarray, reach: float
-                    ) -> tuple[np.ndarray, np.ndarray]:
+def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Which fine vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all, metres in the
-    axes of the world; from `heights` (n,), smooth across folds, and which of them are `folded` (n,).
+    axes of the world.
 
     Each vertex is drawn to the closest place whose normal agrees, held by the thin-plate energy of its displacement,
     which is solved for (implicit steps) and made softer from step to step. Around folds it stays where heights say.
     """
     fine = lattice.fine
+    near = fine.vertex_adjacency
+    # from heights that are smooth across folds
+    values, sure = lattice.gather(found.texels, found.heights, found.known)
+    heights = sparse.harmonic(near, values[:, None], sure)[:, 0]
     p, n = interpolate(lattice.control.mesh, lattice.subdivision.parent, lattice.subdivision.bary)
     start = p + heights[:, None] * n
-    near = fine.vertex_adjacency
-    drawn = folded
+    drawn = ~lattice.gather(found.texels, found.heights, ~found.folded)[1]
     for _ in range(5):    # vertices around a fold that are drawn with it
         drawn = drawn | (near @ drawn.astype(float) > 0)
     free = np.flatnonzero(drawn)
     if not len(free):
         return drawn, start - p
+    places, facing = _places(scan.mesh, start[free], reach)
+    if not len(places):
+        return drawn, start - p
+    # the thin plate of the free vertices, and what those around pull at them
     used = np.flatnonzero(drawn[fine.faces].any(axis=1))
     L = csr_array(diags_array(1 / near.sum(axis=1)) @ near - diags_array(np.ones(len(p))))
     held = start.copy()
     held[free] = 0
     of_free = csc_array(L)[:, free]
     bending, pull = csc_array(of_free.T @ of_free), -of_free.T @ (L @ held)
-    places, facing = _places(scan.mesh, start[free], reach)
-    if not len(places):
-        return drawn, start - p
     target = OrientedPoints(places, facing, 0.01)    # metres that a change of the normal by 60 degrees is worth
     surface = start.copy()
     for stiffness in (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03):    # of the thin plate
         for _ in range(3):
             normals = Mesh(surface, fine.faces[used]).vertex_normals[free]
             match = target.match(surface[free], normals, reach, 0.3)
-            onto = _onto(places[match.index], facing[match.index], surface[free])
+            # into the planes through the matches, and no farther than SPACING from these
+            q, m = places[match.index], facing[match.index]
+            slip = surface[free] - q
+            slip = slip - np.einsum("nd,nd->n", slip, m)[:, None] * m
+            onto = q + slip * np.minimum(1, SPACING / np.maximum(np.linalg.norm(slip, axis=1), 1e-12))[:, None]
             w = np.where(match.valid, 1.0, 0.001)[:, None]    # lightly held where nothing matches
             wanted = np.where(match.valid[:, None], onto, surface[free])
             solver = sparse.Factored(csc_array(stiffness * bending + diags_array(w[:, 0])))
             surface[free] = solver.solve(w * wanted + stiffness * pull)
-    better = _better(lattice, scan, start, surface, drawn)
-    return drawn & better, np.where(better[:, None], surface, start) - p
-
-
-def _better(lattice: Lattice, scan: ReadyScan, before: np.ndarray, after: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """(n,) bool: vertices of those patches of drawn ones that have come nearer to the scan, in the mean square."""
+    # kept: patches of drawn vertices that have come nearer to the scan, in the mean square
     only = diags_array(drawn.astype(float))
-    _, patch = connected_components(only @ lattice.fine.vertex_adjacency @ only, directed=False)
-    faces = lattice.fine.faces[drawn[lattice.fine.faces].all(axis=1)]
-    of = patch[faces[:, 0]]
-    error = []
-    for vertices in (before, after):
+    _, patch = connected_components(only @ near @ only, directed=False)
+    faces = fine.faces[drawn[fine.faces].all(axis=1)]
+    of, error = patch[faces[:, 0]], []
+    for vertices in (start, surface):
         there = Mesh(vertices, faces)
         far = scan.surface.closest(there.corners.mean(axis=1)).distances
         area = np.bincount(of, there.face_areas, len(patch))
         error.append(np.bincount(of, there.face_areas * far**2, len(patch)) / np.maximum(area, 1e-30))
-    return (error[1] < error[0])[patch]
+    better = (error[1] < error[0])[patch]
+    return drawn & better, np.where(better[:, None], surface, start) - p
 
 
 def _places(scan: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -313,13 +290,6 @@ def _places(scan: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, n
     count = int(np.ceil(around.face_areas.sum() / SPACING**2))
     places, faces, _ = around.sample(count, np.random.default_rng(0))
     return places, around.face_normals[faces]
-
-
-def _onto(q: np.ndarray, m: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points moved into the planes through their matches (n, 3), and no farther than SPACING from these."""
-    off = points - q
-    slip = off - np.einsum("nd,nd->n", off, m)[:, None] * m
-    return q + slip * np.minimum(1, SPACING / np.maximum(np.linalg.norm(slip, axis=1), 1e-12))[:, None]
 
 
 def coverage_shares(control: ControlModel, map: DisplacementMap) -> dict[str, float]:

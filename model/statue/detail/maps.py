@@ -58,15 +58,12 @@ def read_map(folder: str | Path, edited: str | Path | None = None) -> Displaceme
         size, scale = tuple(header["size"]), float(header["scale"])
         if not scale > 0:
             raise ValueError(f"scale: expected a length above 0, got {scale}")
-    heights = _checked(folder / HEIGHTS, _read_tiff(folder / HEIGHTS), size, np.float32)
-    coverage = _checked(folder / COVERAGE, _read_png(folder / COVERAGE), size, np.uint8)
-    vectors = None
-    if (folder / VECTORS).exists():
-        vectors = _checked(folder / VECTORS, _read_tiff(folder / VECTORS), (*size, 3), np.float32)
+    heights, coverage = _read(folder / HEIGHTS, size, np.float32), _read(folder / COVERAGE, size, np.uint8)
+    vectors = _read(folder / VECTORS, (*size, 3), np.float32) if (folder / VECTORS).exists() else None
     found = DisplacementMap(heights, coverage, vectors)
     if edited is None:
         return found
-    stored, changed = _checked(folder / IMAGE, _read_png(folder / IMAGE), size, np.uint16), read_edited(edited, size)
+    stored, changed = _read(folder / IMAGE, size, np.uint16), read_edited(edited, size)
     change = np.where(changed != stored, scale * (changed.astype(float) - stored), 0)
     return replace(found, heights=(heights + change).astype(np.float32))
 
@@ -102,21 +99,18 @@ def _write_tiff(path: Path, image: np.ndarray) -> None:
                          photometric="rgb" if image.ndim == 3 else "minisblack", metadata=None)
 
 
-def _read_tiff(path: Path) -> np.ndarray:
-    import tifffile
+def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:
+    """A TIFF or PNG image of this shape and kind of numbers, or StorageError."""
+    if path.suffix == ".tif":
+        import tifffile
 
-    with taking_apart(path, "a TIFF image of single-precision numbers"):
-        with tifffile.TiffFile(io.BytesIO(read_bytes(path))) as file:
+        with (taking_apart(path, "a TIFF image of single-precision numbers"),
+              tifffile.TiffFile(io.BytesIO(read_bytes(path))) as file):
             check_pixels(file.pages[0].shape[:2])
-            return np.asarray(file.pages[0].asarray())
-
-
-def _read_png(path: Path) -> np.ndarray:
-    with taking_apart(path, "a PNG image"):
-        return _decoded(path)[0]
-
-
-def _checked(path: Path, image: np.ndarray, size: tuple[int, ...], kind: Any) -> np.ndarray:
+            image = np.asarray(file.pages[0].asarray())
+    else:
+        with taking_apart(path, "a PNG image"):
+            image = _decoded(path)[0]
     if image.shape != tuple(size) or image.dtype != kind or not np.isfinite(image).all():
         raise StorageError(f"{path}: expected {np.dtype(kind).name} numbers of shape {tuple(size)}, all finite, "
                            f"got {image.dtype} of shape {image.shape}")

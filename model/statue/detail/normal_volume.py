@@ -51,7 +51,10 @@ def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoor
     which, triangle = _near(mesh, points, reach)
     pair, d, b = solve_triangles(mesh, triangle, points[which], reach)
     who, of = which[pair], triangle[pair]
-    solutions = _count_places(count, who, np.einsum("nc,ncd->nd", b, mesh.corners[of]), d)
+    # different places on the mesh per point: one on an edge is found in both triangles
+    places, order = np.einsum("nc,ncd->nd", b, mesh.corners[of]), np.lexsort((d, who))
+    again = (np.diff(who[order]) == 0) & (np.linalg.norm(np.diff(places[order], axis=0), axis=1) < 1e-7)
+    solutions = np.bincount(who, minlength=count) - np.bincount(who[order][1:][again], minlength=count)
     order = np.argsort(np.abs(d), kind="stable")
     _, first = np.unique(who[order], return_index=True)
     best = order[first]                                                 # of several the least height
@@ -125,17 +128,6 @@ def _near(mesh: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.
     which = np.fromiter(chain.from_iterable(near), np.int64, len(face))
     inside = ((points[which] > low[face]) & (points[which] < high[face])).all(axis=1)
     return which[inside], face[inside]
-
-
-def _count_places(count: int, who: np.ndarray, at: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(count,) different places on the mesh per point: one on an edge is found in both triangles."""
-    found = np.bincount(who, minlength=count)
-    several = found[who] > 1
-    who, at, d = who[several], at[several], d[several]
-    order = np.lexsort((d, who))
-    who, at = who[order], at[order]
-    same = (who[1:] == who[:-1]) & (np.linalg.norm(at[1:] - at[:-1], axis=1) < 1e-7)
-    return found - np.bincount(who[1:][same], minlength=count)
 
 
 @dataclass(frozen=True, eq=False)

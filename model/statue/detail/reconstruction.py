@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array, diags_array, hstack
 
-from scanprep.geometry import rotations
+from scanprep.geometry import rotations, sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import bilinear
@@ -20,44 +20,46 @@ class Reconstruction:
     """Vertices of the detailed surface for any vertices of the control mesh; what does not change is computed once.
 
     Heights follow the interpolated normal of the moved mesh. The rest of a vector displacement turns with the edges
-    around each control vertex. [Statues] Eq. 19, 20
+    around each control vertex, and with its normal, so that a ring of edges in a plane has one answer.
+    [Statues] Eq. 19, 20
     """
 
     def __init__(self, control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> None:
         self.faces, self.control = subdivision.faces, control
-        mesh, rows = control.mesh, np.arange(len(subdivision.parent))
-        uv = chart_places(control.chart, subdivision.parent, subdivision.bary)
-        heights, rest = _parts(control.mesh, map, subdivision.parent, subdivision.bary, uv)
-        size = (len(rows), len(mesh.vertices))
+        mesh, count = control.mesh, len(subdivision.parent)
+        heights, rest = _parts(control, map, subdivision.parent, subdivision.bary)
         corners = mesh.faces[subdivision.parent]
-        share = csr_array((subdivision.bary.ravel(), (np.repeat(rows, 3), corners.ravel())), shape=size)
+        share = csr_array((subdivision.bary.ravel(), (np.repeat(np.arange(count), 3), corners.ravel())),
+                          shape=(count, len(mesh.vertices)))
         share.eliminate_zeros()
         self._spread = csr_array(hstack([share, diags_array(heights) @ share]))
-        self._around = _around(mesh)
+        # control vertices that carry a vector displacement, and the edges around them at rest
         self._rotated = np.flatnonzero(rest.any(axis=1))
-        self._carriers = np.unique(corners[self._rotated])
-        self._rotations = VertexRotations(mesh, self._carriers)
-        self._rest = rest[self._rotated]
+        self._rest, self._carriers = rest[self._rotated], np.unique(corners[self._rotated])
         self._share = csr_array(share[self._rotated][:, self._carriers])
+        number = np.full(len(mesh.vertices), -1)
+        number[self._carriers] = np.arange(len(self._carriers))
+        ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
+        self._a, self._b = ends[number[ends[:, 0]] >= 0].T
+        self._edges = mesh.vertices[self._a] - mesh.vertices[self._b]
+        self._normals = mesh.vertex_normals[self._carriers] * mesh.mean_edge**2
+        self._sum = sparse.gatherer(number[self._a], len(self._carriers))
 
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
         """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
-        v = np.asarray(control_vertices, dtype=np.float64)
-        n = self._normals(v)
+        moved = self.control.mesh.with_vertices(control_vertices)
+        v, n = moved.vertices, moved.vertex_normals
         out = self._spread @ np.concatenate([v, n])
         if len(self._rotated):
-            R = self._rotations(v, n).reshape(-1, 9)
+            S = sparse.sum_groups(self._sum, (v[self._a] - v[self._b])[:, :, None] * self._edges[:, None])
+            S = S + n[self._carriers][:, :, None] * self._normals[:, None]
+            R = rotations.project(S).reshape(-1, 9)
             out[self._rotated] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
         return out
 
     def mesh(self, control_vertices: np.ndarray | None = None) -> Mesh:
         """The detailed surface, where the scan stood if no vertices are given."""
         return Mesh(self(self.control.mesh.vertices if control_vertices is None else control_vertices), self.faces)
-
-    def _normals(self, v: np.ndarray) -> np.ndarray:
-        a, b, c = (v[column] for column in self.control.mesh.faces.T)
-        total = self._around @ np.cross(b - a, c - a)
-        return total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
 
 
 def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
@@ -71,51 +73,23 @@ def displaced_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
     """Where the detailed surface is above any places of the control mesh, for `subdivide_adaptive`."""
     def displaced(faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
         p, n = interpolate(control.mesh, faces, bary)
-        heights, rest = _parts(control.mesh, map, faces, bary, chart_places(control.chart, faces, bary))
+        heights, rest = _parts(control, map, faces, bary)
         return p + heights[:, None] * n + rest
     return displaced
 
 
-def _parts(mesh: Mesh, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray, uv: np.ndarray
+def _parts(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray
            ) -> tuple[np.ndarray, np.ndarray]:
     """Heights (n,) along the interpolated normal and, where there are vectors, what is off it (n, 3)."""
+    uv = chart_places(control.chart, faces, bary)
     heights = bilinear(map.heights, uv)
     rest = np.zeros((len(uv), 3)) if map.vectors is None else bilinear(map.vectors, uv)
     some = np.flatnonzero(rest.any(axis=1))
-    _, n = interpolate(mesh, faces[some], bary[some])
+    _, n = interpolate(control.mesh, faces[some], bary[some])
     along = np.einsum("nd,nd->n", rest[some], n) / np.maximum(np.einsum("nd,nd->n", n, n), 1e-12)
     heights[some] += along
     rest[some] -= along[:, None] * n
     return heights, rest
-
-
-def _around(mesh: Mesh) -> csr_array:
-    """(N, F) sparse, 1 where a triangle has a vertex."""
-    faces = np.repeat(np.arange(len(mesh.faces)), 3)
-    return csr_array((np.ones(len(faces)), (mesh.faces.ravel(), faces)), shape=(len(mesh.vertices), len(mesh.faces)))
-
-
-class VertexRotations:
-    """Rotations that best turn the edges around some vertices (k,) of a mesh at rest to where they are now; the normals
-    are turned with them, so that a ring of edges in a plane has one answer.
-    """
-
-    def __init__(self, rest: Mesh, which: np.ndarray) -> None:
-        number = np.full(len(rest.vertices), -1)
-        number[which] = np.arange(len(which))
-        ends = np.concatenate([rest.edges, rest.edges[:, ::-1]])
-        self._a, self._b = ends[number[ends[:, 0]] >= 0].T
-        self._edges = rest.vertices[self._a] - rest.vertices[self._b]
-        self._normals, self._which = rest.vertex_normals[which] * rest.mean_edge**2, which
-        rows = np.arange(len(self._a))
-        self._sum = csr_array((np.ones(len(rows)), (number[self._a], rows)), shape=(len(which), len(rows)))
-
-    def __call__(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(k, 3, 3) for vertices (N, 3) with unit normals (N, 3)."""
-        edges = vertices[self._a] - vertices[self._b]
-        S = (self._sum @ (edges[:, :, None] * self._edges[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
-        S = S + normals[self._which][:, :, None] * self._normals[:, None]
-        return rotations.project(S)
 
 
 def pixels_at(map: DisplacementMap, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +132,7 @@ def adaptive_level(statue: Statue, scan: Mesh, tolerance: float = 0.0005, level:
 def _level(name: str, statue: Statue, fine: Subdivision, scan: Mesh) -> Level:
     mesh = Reconstruction(statue.control, statue.map, fine).mesh()
     shown = (coverage_at(statue.control, statue.map, fine.parent, fine.bary)[fine.faces] != HOLE).all(axis=1)
-    error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError(np.nan, np.nan)
+    error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError.of(np.zeros(0))
     return Level(name, mesh, error.mean, error.rms, shown)
 
 
@@ -169,12 +143,19 @@ class SurfaceError:
     mean: float
     rms: float
 
+    @staticmethod
+    def of(distances: np.ndarray) -> SurfaceError:
+        """That of distances (n,), NaN where there are none."""
+        if not len(distances):
+            return SurfaceError(np.nan, np.nan)
+        return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))))
+
 
 def surface_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
     """Distance from a reconstructed surface to the scan, one way, at so many places spread evenly. [Statues] Eq. 22, 23
     """
     points = reconstructed.sample(count, np.random.default_rng(14))[0]
-    return _error(Surface(scan).closest(points).distances)
+    return SurfaceError.of(Surface(scan).closest(points).distances)
 
 
 def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, count: int = 20_000,
@@ -188,10 +169,8 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
     faces = np.maximum(found.faces, 0)
     uv = chart_places(control.chart, faces, found.bary)
     good = found.inside & (found.solutions == 1) & (coverage_at(control, map, faces, found.bary) == MEASURED)
-    if not good.any():
-        return SurfaceError(np.nan, np.nan)
     stored = from_normal_volume(control.mesh, faces[good], found.bary[good], bilinear(map.heights, uv[good]))
-    return _error(np.linalg.norm(stored - points[good], axis=1))
+    return SurfaceError.of(np.linalg.norm(stored - points[good], axis=1))
 
 
 def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
@@ -218,7 +197,3 @@ def in_folds(control: ControlModel, map: DisplacementMap, subdivision: Subdivisi
     corners = subdivision.chart.uv[subdivision.chart.faces]
     uv = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1).reshape(-1, 2)
     return bad[pixels_at(map, uv)].reshape(-1, 4).any(axis=1)
-
-
-def _error(distances: np.ndarray) -> SurfaceError:
-    return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))))

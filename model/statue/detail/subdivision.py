@@ -109,7 +109,12 @@ def _split(now: _Corners, marked: np.ndarray, mesh: Mesh) -> _Corners:
     row, halved = _with_middles(now.row, marked)
     uv = np.concatenate([now.uv, 0.5 * now.uv[halved].sum(axis=1)])
     bary = np.concatenate([now.bary, middle], axis=1)
-    pattern = _pattern(marked, bary, now.parent, mesh)
+    pattern = marked @ np.array([1, 2, 4])
+    for number, ways in _DIAGONALS.items():                 # of two diagonals the shorter
+        which = np.flatnonzero(pattern == number)
+        points = np.einsum("fkc,fcd->fkd", bary[which], mesh.corners[now.parent[which]])
+        one, other = (np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in ways)
+        pattern[which] += 8 * (other < one)
     parts = []
     for number, triangles in _PATTERNS.items():
         which = np.flatnonzero(pattern == number)
@@ -130,17 +135,6 @@ def _with_middles(faces: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, np
     number = np.where(split, count + np.cumsum(split) - 1, -1)
     ends = np.stack([faces.ravel(), np.roll(faces, -1, axis=1).ravel()], axis=1)[first[split]]
     return np.concatenate([faces, number[edge]], axis=1), ends
-
-
-def _pattern(marked: np.ndarray, bary: np.ndarray, parent: np.ndarray, mesh: Mesh) -> np.ndarray:
-    """(f,) which of the patterns each triangle takes; of two diagonals the shorter."""
-    pattern = marked @ np.array([1, 2, 4])
-    for number, ways in _DIAGONALS.items():
-        which = np.flatnonzero(pattern == number)
-        points = np.einsum("fkc,fcd->fkd", bary[which], mesh.corners[parent[which]])
-        one, other = (np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in ways)
-        pattern[which] += 8 * (other < one)
-    return pattern
 
 
 def _bent(now: _Corners, displaced: Displaced, tolerance: float) -> np.ndarray:

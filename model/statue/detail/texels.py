@@ -15,8 +15,6 @@ from ..control.model import ControlModel, DisplacementMap
 from .normal_volume import interpolate
 from .subdivision import Subdivision, chart_places, subdivide
 
-FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
-
 
 @dataclass(frozen=True, eq=False)
 class Texels:
@@ -109,9 +107,12 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
 
 
 class Lattice:
-    """A control mesh subdivided evenly: `subdivision`, and `fine`, its vertices on the control mesh."""
+    """A control mesh subdivided evenly: `subdivision`, and `fine`, its vertices on the control mesh.
 
-    def __init__(self, control: ControlModel, level: int = FILL_LEVEL) -> None:
+    Holes are filled on three levels: edges of some 5 mm.
+    """
+
+    def __init__(self, control: ControlModel, level: int = 3) -> None:
         self.control, self.subdivision = control, subdivide(control.mesh, control.chart, level)
         self.fine = self.subdivision.mesh(control.mesh)
         self._surface = Surface(self.fine)
