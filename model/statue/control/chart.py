@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
@@ -34,12 +34,6 @@ def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
             seams.append(seam)
             tree = np.union1d(tree, seam)
     return seams
-
-
-def extended(mesh: Mesh, seams: Sequence[np.ndarray], vertex: int) -> list[np.ndarray]:
-    """Seams with one more, the shortest path from them to a vertex; the same where they pass it already."""
-    seam = join(_costs(mesh), np.unique(np.concatenate(list(seams))), vertex)
-    return [*seams, seam] if len(seam) > 1 else list(seams)
 
 
 def join(graph: csr_array, tree: np.ndarray, goal: int) -> np.ndarray:
@@ -86,9 +80,7 @@ def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray
             is_open[number[min(a, b), max(a, b)]] = True
     sides = np.argsort(mesh.face_edges.ravel(), kind="stable").reshape(-1, 2)[~is_open]    # the two at every edge
     begin, end = sides, sides - sides % 3 + (sides + 1) % 3            # corners; the two sides run in opposite ways
-    n = mesh.faces.size
-    pairs = (np.r_[begin[:, 0], end[:, 0]], np.r_[end[:, 1], begin[:, 1]])
-    _, fan = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=(n, n)), directed=False)
+    fan = sparse.connected_pieces(np.r_[begin[:, 0], end[:, 0]], np.r_[end[:, 1], begin[:, 1]], mesh.faces.size)
     _, first = np.unique(fan, return_index=True)
     return fan.reshape(-1, 3).astype(np.int64), mesh.faces.ravel()[first]
 
@@ -146,7 +138,15 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     if disk.vertex_component.max() > 0 or euler != 1 or len(disk.boundary_loops) != 1:
         raise ValueError(f"seams: expected a tree of edges that cuts the mesh into one disk, got "
                          f"{disk.vertex_component.max() + 1} pieces with Euler number {euler}")
-    chart = Chart(fill_square(flatten(disk)), faces)
+    uv = flatten(disk)
+    # turned and scaled so that the smallest square around it is the unit square, six pixels of 1,024 left free
+    angles = np.radians(np.arange(0, 90, 0.5))
+    cos, sin = np.cos(angles), np.sin(angles)
+    places = np.einsum("ija,nj->ani", np.array([[cos, -sin], [sin, cos]]), uv)
+    extent = np.ptp(places, axis=1).max(axis=1)
+    best = places[extent.argmin()]
+    middle = (best.min(axis=0) + best.max(axis=0)) / 2
+    chart = Chart(0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min(), faces)
     problem = chart_problem(mesh, chart)
     assert problem is None, problem
     return chart
@@ -154,26 +154,22 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
 
 def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
     """A chart whose seams go on to where it is crowded, such as the tips of fingers; `rounds` charts at most."""
-    seams = find_seams(mesh, skeleton)
+    seams, graph = find_seams(mesh, skeleton), _costs(mesh)
     chart = make_chart(mesh, seams)
     for _ in range(rounds - 1):
-        crowded = crowded_places(mesh, densities(mesh, chart))
-        longer = seams
-        for vertex in crowded:
-            longer = extended(mesh, longer, vertex)
+        # a seam more to the smallest triangle of every region that is drawn smaller than a third of the mean, in length
+        density, longer = densities(mesh, chart), list(seams)
+        crowded = np.flatnonzero(density < 1 / 3)
+        region = mesh.submesh(crowded)[0]
+        region_of = region.vertex_component[region.faces[:, 0]]
+        for k in np.unique(region_of):
+            mine = crowded[region_of == k]
+            seam = join(graph, np.unique(np.concatenate(longer)), int(mesh.faces[mine[density[mine].argmin()], 0]))
+            longer += [seam] if len(seam) > 1 else []
         if len(longer) == len(seams):
             break
         seams, chart = longer, make_chart(mesh, longer)
     return chart
-
-
-def crowded_places(mesh: Mesh, density: np.ndarray) -> list[int]:
-    """A vertex of the smallest triangle of every region that is drawn smaller than a third of the mean, in length."""
-    crowded = np.flatnonzero(density < 1 / 3)
-    region = mesh.submesh(crowded)[0]
-    region_of = region.vertex_component[region.faces[:, 0]]
-    return [int(mesh.faces[mine[density[mine].argmin()], 0])
-            for mine in (crowded[region_of == k] for k in np.unique(region_of))]
 
 
 def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
@@ -190,8 +186,13 @@ def flatten(mesh: Mesh) -> np.ndarray:
     """
     import igl
 
+    # Tutte: the border on a circle, every other vertex in the mean of its neighbours
     border = mesh.boundary_loops[0]
-    uv = tutte(mesh, border)
+    sides = np.linalg.norm(mesh.vertices[border] - np.roll(mesh.vertices[border], -1, axis=0), axis=1)
+    angle = 2 * np.pi * np.r_[0, np.cumsum(sides)[:-1]] / sides.sum()
+    uv = np.zeros((len(mesh.vertices), 2))
+    uv[border] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    uv = sparse.harmonic(mesh.vertex_adjacency, uv, np.isin(np.arange(len(uv)), border))
     uv *= np.sqrt(2 * mesh.face_areas.sum() / _twice_area(*uv[mesh.faces].swapaxes(0, 1)).sum())
     vertices, faces = np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces.astype(np.int32))
     for _ in range(100):
@@ -204,26 +205,6 @@ def flatten(mesh: Mesh) -> np.ndarray:
         if np.linalg.norm(step, axis=1).max() < 1e-3 * mesh.mean_edge:
             break
     return uv
-
-
-def tutte(mesh: Mesh, border: np.ndarray) -> np.ndarray:
-    """The embedding (N, 2) with the border on a circle and every other vertex in the mean of its neighbours."""
-    sides = np.linalg.norm(mesh.vertices[border] - np.roll(mesh.vertices[border], -1, axis=0), axis=1)
-    angle = 2 * np.pi * np.r_[0, np.cumsum(sides)[:-1]] / sides.sum()
-    uv = np.zeros((len(mesh.vertices), 2))
-    uv[border] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return sparse.harmonic(mesh.vertex_adjacency, uv, np.isin(np.arange(len(uv)), border))
-
-
-def fill_square(uv: np.ndarray) -> np.ndarray:
-    """Turned and scaled so that the smallest square around it is the unit square without its margin."""
-    angles = np.radians(np.arange(0, 90, 0.5))
-    cos, sin = np.cos(angles), np.sin(angles)
-    places = np.einsum("ija,nj->ani", np.array([[cos, -sin], [sin, cos]]), uv)
-    extent = np.ptp(places, axis=1).max(axis=1)
-    best = places[extent.argmin()]
-    middle = (best.min(axis=0) + best.max(axis=0)) / 2
-    return 0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min()    # six pixels of 1,024 are left free around it
 
 
 def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
@@ -269,15 +250,10 @@ def crossings(loop: np.ndarray) -> bool:
     i, j = np.nonzero(np.triu(near, 2))
     apart = (j - i) % n != n - 1
     i, j = i[apart], j[apart]
-
-    met = _across(a[i], b[i], a[j], b[j]) <= 0
-    i, j = i[met], j[met]
-    return bool((_across(a[j], b[j], a[i], b[i]) <= 0).any())
-
-
-def _across(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(n,) -1 where c and d lie on different sides of the line ab, 0 where one of them lies on it, else 1."""
-    return orientation(a, b, c) * orientation(a, b, d)
+    for _ in range(2):              # sides whose ends do not lie on one side of the other's line, both ways round
+        met = orientation(a[i], b[i], a[j]) * orientation(a[i], b[i], b[j]) <= 0
+        i, j = j[met], i[met]
+    return bool(len(i))
 
 
 def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

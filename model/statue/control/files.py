@@ -91,70 +91,57 @@ def _read_skinned(path: Path) -> ControlModel:
     data = storage.read_bytes(path, WHAT, MeshFileError)
     tree, binary = glb.chunks_of(path, data)
     with storage.taking_apart(path, WHAT, MeshFileError):
-        mesh_node, skin = _skinned(tree)
-        places = {number: matrix for number, _, matrix in glb.nodes_of(tree)}
+        # the one node with a mesh on joints, and its skin
+        nodes = list(glb.nodes_of(tree))
+        skinned = [node for _, node, _ in nodes if "mesh" in node and "skin" in node]
+        if len(skinned) != 1:
+            names = ", ".join(str(node.get("name", "unnamed")) for node in skinned)
+            meshes = sum("mesh" in node for _, node, _ in nodes)
+            raise ValueError(f"found {len(skinned)} meshes that hang on joints{f' ({names})' if names else ''}, "
+                             f"{meshes} meshes in all")
+        skin = glb.item(tree["skins"], skinned[0]["skin"])
+        places = {number: matrix for number, _, matrix in nodes}
+        joints = skin["joints"]
+        # its surface in the pose of the file
         motion = glb.joint_matrices(tree, binary, skin, places)
-        matrices = np.stack([places[number] for number in skin["joints"]])
-        corners = _corners(tree, binary, glb.item(tree["meshes"], mesh_node["mesh"]), len(matrices))
+        joint_places = np.stack([places[number] for number in joints])[:, :3, 3]
+        corners = _corners(tree, binary, glb.item(tree["meshes"], skinned[0]["mesh"]), len(joints))
         points = glb.skinned(corners.points, corners.weights, motion)
         if not np.isfinite(points).all():
             raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
-        return _control(replace(corners, points=points),
-                        matrices[:, :3, 3], _parents(tree, skin["joints"]),
-                        [_name(tree, number) for number in skin["joints"]])
-
-
-def _skinned(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The one node with a mesh on joints, and its skin."""
-    found = [node for _, node, _ in glb.nodes_of(tree) if "mesh" in node and "skin" in node]
-    if len(found) != 1:
-        names = ", ".join(str(node.get("name", "unnamed")) for node in found)
-        meshes = sum("mesh" in node for _, node, _ in glb.nodes_of(tree))
-        raise ValueError(f"found {len(found)} meshes that hang on joints{f' ({names})' if names else ''}, "
-                         f"{meshes} meshes in all")
-    return found[0], glb.item(tree["skins"], found[0]["skin"])
+        # the joint next above every joint, -1 where there is none
+        above = {child: number for number, node in enumerate(tree["nodes"]) for child in node.get("children", [])}
+        parents = []
+        for number in joints:
+            up = above.get(number)
+            while up is not None and up not in joints:
+                up = above.get(up)
+            parents.append(-1 if up is None else joints.index(up))
+        return _control(replace(corners, points=points), joint_places, np.array(parents),
+                        [str(glb.item(tree["nodes"], number).get("name", f"joint{number}")) for number in joints])
 
 
 def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: int) -> _Corners:
     """All primitives of a mesh one after the other: materials do not part a control mesh."""
-    found = [_primitive(tree, binary, primitive, joints) for primitive in mesh["primitives"]]
-    uv = [part.uv for part in found if part.uv is not None]
-    if 0 < len(uv) < len(found):
+    points, weights, uv, faces, start = [], [], [], [], 0
+    for primitive in mesh["primitives"]:
+        if primitive.get("mode", 4) != 4:    # the mode of triangles
+            raise ValueError(f"expected triangles, found a primitive of mode {primitive['mode']}")
+        attributes = primitive["attributes"]
+        points.append(glb.accessor(tree, binary, attributes["POSITION"], "VEC3").astype(np.float64))
+        if "TEXCOORD_0" in attributes:       # glTF counts from the upper left
+            uv.append(glb.accessor(tree, binary, attributes["TEXCOORD_0"], "VEC2").astype(np.float64) * [1, -1]
+                      + [0, 1])
+        count, own = len(points[-1]), glb.triangles_of(tree, binary, primitive, len(points[-1]))
+        if len(own) and (own.min() < 0 or own.max() >= count):
+            raise ValueError(f"a triangle refers to vertex {own.max()}, expected 0..{count - 1}")
+        weights.append(glb.weights_of(tree, binary, primitive, joints))
+        faces.append(own + start)
+        start += count
+    if 0 < len(uv) < len(points):
         raise ValueError("some of its primitives have texture coordinates and some have none")
-    points, weights = (np.concatenate([getattr(part, name) for part in found]) for name in ("points", "weights"))
-    starts = np.cumsum([0] + [len(part.points) for part in found])
-    faces = np.concatenate([part.faces + start for part, start in zip(found, starts, strict=False)])
-    return _Corners(points, weights, np.concatenate(uv) if uv else None, faces)
-
-
-def _primitive(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], joints: int) -> _Corners:
-    if primitive.get("mode", 4) != 4:    # the mode of triangles
-        raise ValueError(f"expected triangles, found a primitive of mode {primitive['mode']}")
-    attributes = primitive["attributes"]
-    points = glb.accessor(tree, binary, attributes["POSITION"], "VEC3").astype(np.float64)
-    uv = None
-    if "TEXCOORD_0" in attributes:       # glTF counts from the upper left
-        uv = glb.accessor(tree, binary, attributes["TEXCOORD_0"], "VEC2").astype(np.float64) * [1, -1] + [0, 1]
-    faces = glb.triangles_of(tree, binary, primitive, len(points))
-    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
-        raise ValueError(f"a triangle refers to vertex {faces.max()}, expected 0..{len(points) - 1}")
-    return _Corners(points, glb.weights_of(tree, binary, primitive, joints), uv, faces)
-
-
-def _parents(tree: dict[str, Any], joints: list[int]) -> np.ndarray:
-    """(J,) the joint next above every joint, -1 where there is none."""
-    above = {child: number for number, node in enumerate(tree["nodes"]) for child in node.get("children", [])}
-    out = []
-    for number in joints:
-        up = above.get(number)
-        while up is not None and up not in joints:
-            up = above.get(up)
-        out.append(-1 if up is None else joints.index(up))
-    return np.array(out)
-
-
-def _name(tree: dict[str, Any], number: int) -> str:
-    return str(glb.item(tree["nodes"], number).get("name", f"joint{number}"))
+    return _Corners(np.concatenate(points), np.concatenate(weights), np.concatenate(uv) if uv else None,
+                    np.concatenate(faces))
 
 
 def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: list[str]) -> ControlModel:
@@ -170,9 +157,7 @@ def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: 
     kept, parents, weights, part_of_face = _with_triangles(mesh, weights, parents)
     joints, names = places[kept], [names[j] for j in kept]
     distinct = tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))
-    in_root = Skeleton(part_of_face, parents, joints).part_of_vertex(mesh) == 0
-    joints[0] = mesh.vertices[in_root].mean(axis=0)
-    skeleton, J = Skeleton(part_of_face, parents, joints, distinct), len(parents)
+    skeleton, J = Skeleton(part_of_face, parents, joints, distinct).with_root_centred(mesh), len(parents)
     control = ControlModel(mesh, skeleton, strongest(weights), chart or automatic_chart(mesh, skeleton), {},
                            (np.eye(3),) * J, (np.array([[-np.pi, np.pi]] * 3),) * J, skeleton.names, np.arange(J))
     problem = control_problem(control)
