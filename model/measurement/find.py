@@ -16,11 +16,6 @@ from .section import Carried, Curve, direction, mean_of, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
 
 BAND = 0.10                          # how far from its place on the template a tape may run, along the surface
-LIMB_BAND = 0.07
-BELOW_BUST, BELOW_CROTCH = 0.085, 0.04
-PAST_ARMPIT = (0.5, 0.56, 0.62, 0.68)                  # of the way from the shoulder to the elbow
-APART = 0.12                         # metres from the middle of a section to where its part is sought
-TRIED = 25                           # sections among which the widest or the narrowest is sought
 
 
 class _NotThere(ValueError):
@@ -77,12 +72,12 @@ class _Finder:
         yield "neck_height", lambda: Height(self.point("neck back"))
         yield "shoulder_height", lambda: Height(self.point("left shoulder", "right shoulder"))
         crown = self.floor + self.stature
-        yield "head_girth", lambda: self.widest("head_girth", lambda t: self.level(
+        yield "head_girth", lambda: self.extreme("head_girth", 1, lambda t: self.level(
             p.at("top of head", "left ear", "right ear"), crown - (0.045 + 0.045 * t) * self.stature))
         yield "neck_girth", self.neck
         yield "chest_girth", lambda: self.trunk("chest_girth", p.height("left nipple", "right nipple"))
         yield "under_bust_girth", lambda: self.trunk(
-            "under_bust_girth", p.height("left nipple", "right nipple") - BELOW_BUST * self.scale)
+            "under_bust_girth", p.height("left nipple", "right nipple") - 0.085 * self.scale)
         yield "waist_girth", self.waist
         yield "waist_height", lambda: Height(self.girth("waist_girth").centre)
         yield "hip_girth", self.hips
@@ -101,9 +96,9 @@ class _Finder:
         """Of one leg, from above."""
         p, knee, heel = self.places, (f"{side} knee", f"{side} knee inside"), f"{side} heel"
         yield f"thigh_girth_{side}", lambda: self.keep(f"thigh_girth_{side}", self.level(
-            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - BELOW_CROTCH * self.scale), None, BAND)
-        yield f"knee_girth_{side}", lambda: self.across(f"knee_girth_{side}", self.shin(side), 0.0)
-        yield f"calf_girth_{side}", lambda: self.widest(f"calf_girth_{side}", lambda t: self.along(
+            0.5 * (p.at(*knee) + p.at(f"{side} hip")), p.height("crotch") - 0.04 * self.scale), None, BAND)
+        yield f"knee_girth_{side}", lambda: self.keep(f"knee_girth_{side}", None, self.shin(side))
+        yield f"calf_girth_{side}", lambda: self.extreme(f"calf_girth_{side}", 1, lambda t: self.along(
             p.at(*knee), p.at(heel), 0.12 + 0.4 * t), self.shin(side))
         yield f"foot_length_{side}", lambda: self.foot(side)
 
@@ -111,8 +106,8 @@ class _Finder:
         """Of one arm, from above."""
         p, elbow = self.places, (f"{side} elbow outside", f"{side} elbow inside")
         shoulder, tip = f"{side} shoulder", f"{side} middle finger"
-        yield f"upper_arm_girth_{side}", lambda: self.across(f"upper_arm_girth_{side}", self.upper_arm(side), 0.0)
-        yield f"wrist_girth_{side}", lambda: self.narrowest(f"wrist_girth_{side}", lambda t: self.along(
+        yield f"upper_arm_girth_{side}", lambda: self.keep(f"upper_arm_girth_{side}", None, self.upper_arm(side))
+        yield f"wrist_girth_{side}", lambda: self.extreme(f"wrist_girth_{side}", -1, lambda t: self.along(
             p.at(*elbow), p.at(tip), 0.42 + 0.26 * t), self.limb(
                 f"{side} forearm", p.at(*elbow), p.at(tip), 0.12, 0.45))
         yield f"arm_length_{side}", lambda: self.way(shoulder, elbow[0], self.nearest(
@@ -126,10 +121,10 @@ class _Finder:
         return mean_of(*(self.places.of[name] for name in names))
 
     def loop(self, origin: np.ndarray, normal: np.ndarray) -> Curve:
-        """The closed section by a plane that is nearest to a point (3,) of it."""
+        """The closed section by a plane that is nearest to a point (3,) of it, at most 12 cm away."""
         curves = section(self.mesh.vertices, self.mesh.faces, origin, normal)
         far = [np.linalg.norm(curve.at(self.mesh.vertices).mean(axis=0) - origin) for curve in curves]
-        if not curves or min(far) > APART * self.scale:
+        if not curves or min(far) > 0.12 * self.scale:
             raise _NotThere("the template has no section there")
         best = curves[int(np.argmin(far))]
         if not best.closed:
@@ -145,21 +140,20 @@ class _Finder:
         """The plane across the line between two points (3,)."""
         return start + share * (end - start), (end - start) / np.linalg.norm(end - start)
 
-    def length(self, curve: Curve, normal: np.ndarray) -> float:
-        """Of the tape, metres."""
-        points = curve.at(self.mesh.vertices)
-        hull = points[tape(points, normal)]
-        return float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
-
-    def keep(self, name: str, plane: tuple[np.ndarray, np.ndarray], axis: tuple[Carried, Carried] | None,
-             band: float = LIMB_BAND, under_arms: bool = False) -> Girth:
-        """The girth in a plane (a point of it, its normal), carried by its centroid."""
-        ring = self.loop(*plane)
-        centre = ring.centroid(self.mesh.vertices)
-        normal = self.places.up if axis is None else direction(axis, self.mesh.vertices)
-        if axis is not None:
-            ring = self.loop(centre.at(self.mesh.vertices), normal)
-            centre = ring.centroid(self.mesh.vertices)
+    def keep(self, name: str, plane: tuple[np.ndarray, np.ndarray] | None, axis: tuple[Carried, Carried] | None,
+             band: float = 0.07, under_arms: bool = False) -> Girth:
+        """The girth in a plane (a point of it, its normal), or across an axis where that begins; carried by its
+        centroid.
+        """
+        vertices = self.mesh.vertices
+        if axis is None:
+            assert plane is not None, "a girth without an axis has a plane"
+            ring = self.loop(*plane)
+        else:
+            normal = direction(axis, vertices)
+            first = self.loop(*(plane or (axis[0].at(vertices), normal)))
+            ring = self.loop(first.centroid(vertices).at(vertices), normal)
+        centre = ring.centroid(vertices)
         far, _ = self.graph.nearest(np.unique(ring.edges))
         near = (far <= band * self.scale)[self.mesh.faces].any(axis=1)
         if under_arms:
@@ -185,22 +179,15 @@ class _Finder:
             raise _NotThere(f"the template has no {name.replace('_', ' ')}")
         return self.done[name]
 
-    def best(self, plane: Callable[[float], tuple[np.ndarray, np.ndarray]], sign: int
-             ) -> tuple[np.ndarray, np.ndarray]:
-        """The plane of the longest (1) or shortest (-1) tape, over t from 0 to 1."""
-        lengths = []
-        for t in np.linspace(0, 1, TRIED):
-            origin, normal = plane(float(t))
-            lengths.append(sign * self.length(self.loop(origin, normal), normal))
-        return plane(float(np.linspace(0, 1, TRIED)[int(np.argmax(lengths))]))
-
-    def widest(self, name: str, plane: Callable[[float], tuple[np.ndarray, np.ndarray]],
-               axis: tuple[Carried, Carried] | None = None) -> Girth:
-        return self.keep(name, self.best(plane, 1), axis)
-
-    def narrowest(self, name: str, plane: Callable[[float], tuple[np.ndarray, np.ndarray]],
-                  axis: tuple[Carried, Carried] | None = None) -> Girth:
-        return self.keep(name, self.best(plane, -1), axis)
+    def extreme(self, name: str, sign: int, plane: Callable[[float], tuple[np.ndarray, np.ndarray]],
+                axis: tuple[Carried, Carried] | None = None, band: float = 0.07) -> Girth:
+        """The girth of the longest (1) or shortest (-1) tape among 25 planes, over t from 0 to 1."""
+        planes, lengths = [plane(float(t)) for t in np.linspace(0, 1, 25)], []
+        for origin, normal in planes:
+            points = self.loop(origin, normal).at(self.mesh.vertices)
+            hull = points[tape(points, normal)]
+            lengths.append(sign * np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
+        return self.keep(name, planes[int(np.argmax(lengths))], axis, band)
 
     def trunk(self, name: str, height: float) -> Girth:
         """A level girth of the trunk."""
@@ -219,35 +206,35 @@ class _Finder:
         if {"left waist", "right waist"} <= set(p.of):
             return self.trunk("waist_girth", p.height("left waist", "right waist"))
         low, high = p.height("crotch"), p.height("left nipple", "right nipple")
-        plane = self.best(lambda t: self.level(self.middle(), low + (0.35 + 0.5 * t) * (high - low)), -1)
-        return self.keep("waist_girth", plane, None, BAND)
+        return self.extreme("waist_girth", -1, lambda t: self.level(
+            self.middle(), low + (0.35 + 0.5 * t) * (high - low)), None, BAND)
 
     def hips(self) -> Girth:
         """The widest from the crotch up to two thirds of the way to the waist."""
         p = self.places
-        low = p.height("crotch")
-        high = p.height("left waist", "right waist", "navel")
-        plane = self.best(lambda t: self.level(self.middle(), low + (0.12 + 0.55 * t) * (high - low)), 1)
-        return self.keep("hip_girth", plane, None, BAND)
+        low, high = p.height("crotch"), p.height("left waist", "right waist", "navel")
+        return self.extreme("hip_girth", 1, lambda t: self.level(
+            self.middle(), low + (0.12 + 0.55 * t) * (high - low)), None, BAND)
 
     def neck(self) -> Girth:
         """The narrowest across the neck."""
         p = self.places
         foot, head = p.at("neck front", "neck back"), p.at("left ear", "right ear")
         axis = (self.point("neck front", "neck back"), self.point("left ear", "right ear"))
-        return self.narrowest("neck_girth", lambda t: self.along(foot, head, 0.1 + 0.6 * t), axis)
+        return self.extreme("neck_girth", -1, lambda t: self.along(foot, head, 0.1 + 0.6 * t), axis)
 
     def limb(self, name: str, start: np.ndarray, end: np.ndarray, first: float, second: float
              ) -> tuple[Carried, Carried]:
         """The axis of a limb: centroids of two sections between its ends."""
-        rings = [self.loop(*self.along(start, end, share)) for share in (first, second)]
-        self.limbs[name] = (rings[0].centroid(self.mesh.vertices), rings[1].centroid(self.mesh.vertices))
-        return self.limbs[name]
+        low, high = (self.loop(*self.along(start, end, share)).centroid(self.mesh.vertices)
+                     for share in (first, second))
+        self.limbs[name] = low, high
+        return low, high
 
     def upper_arm(self, side: str) -> tuple[Carried, Carried]:
         """From its middle, or as soon as the armpit is passed, to the elbow."""
         p = self.places
-        for share in PAST_ARMPIT:
+        for share in (0.5, 0.56, 0.62, 0.68):
             with contextlib.suppress(_NotThere):
                 return self.limb(f"{side} upper arm", p.at(f"{side} shoulder"),
                                  p.at(f"{side} elbow outside", f"{side} elbow inside"), share, 0.95)
@@ -256,11 +243,6 @@ class _Finder:
     def shin(self, side: str) -> tuple[Carried, Carried]:
         p = self.places
         return self.limb(f"{side} shin", p.at(f"{side} knee", f"{side} knee inside"), p.at(f"{side} heel"), 0.0, 0.7)
-
-    def across(self, name: str, axis: tuple[Carried, Carried], share: float) -> Girth:
-        """The girth at a share of the way along an axis."""
-        start, end = (point.at(self.mesh.vertices) for point in axis)
-        return self.keep(name, self.along(start, end, share), axis)
 
     def span(self, girth: str, axis: int) -> Span:
         self.girth(girth)

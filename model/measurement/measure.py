@@ -13,7 +13,6 @@ from .reading import NotMeasured, Reading, Standing, read
 from .tapes import Tapes
 
 TURNED = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}       # degrees from the standard pose that change little
-ROUNDS = 20                          # of laying a template on a body
 # Chosen on half views of the ten even people of `tests/benchmarks/measures.py`, which tells how far the odd ones agree.
 REACH = 0.10                         # metres, over which errors of the surface go together
 MOST, SHARE = 0.010, 0.02            # metres, and of the value: more is an error of the pose, which repose takes away
@@ -95,7 +94,7 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
 def laid_on(template: Mesh, vertices: np.ndarray) -> np.ndarray:
     """The turn (3, 3) that lays the template on a body (N, 3): of trunk and legs, as limbs that moved lose weight."""
     weights, R = template.vertex_areas, np.eye(3)
-    for _ in range(ROUNDS):
+    for _ in range(20):
         here, there = (points - np.average(points, axis=0, weights=weights)
                        for points in (template.vertices, vertices))
         R = rotations.project((weights[:, None] * there).T @ here)

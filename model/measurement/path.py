@@ -5,9 +5,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 
-from .section import Curve
-
-GRID = np.linspace(0, 1, 17)          # places tried on an edge
+from .section import Curve, chain_length
 
 
 def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> tuple[float, Curve]:
@@ -25,6 +23,7 @@ def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> 
         No way leads there.
     """
     import igl
+    from scipy.optimize import minimize
 
     used, few = np.unique(faces, return_inverse=True)
     few, vertices = few.reshape(-1, 3), np.ascontiguousarray(body[used])
@@ -35,8 +34,17 @@ def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> 
     far = igl.exact_geodesic(vertices, few, places[:1], none, np.arange(len(used)), none)
     if not 0 < far[places[1]] < 1e6:                                       # 0, or a huge number, where no way leads
         raise ValueError(f"vertices {start} and {end}: no way along the surface joins them, there is a gap")
-    edges, share = _straightened(vertices, *_descent(Mesh(vertices, few), far, int(places[0]), int(places[1])))
-    return float(far[places[1]]), Curve(used[edges], share, False)
+    edges, share = _descent(Mesh(vertices, few), far, int(places[0]), int(places[1]))
+    # the shortest way across the same edges: a convex problem in the places on them
+    first, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
+
+    def length(s: np.ndarray) -> tuple[float, np.ndarray]:
+        total, pull = chain_length(first + s[:, None] * along)
+        return total, np.einsum("md,md->m", pull, along)
+
+    best = minimize(length, share, jac=True, method="L-BFGS-B", bounds=[(0, 1)] * len(share),
+                    options={"maxiter": 200, "ftol": 1e-14})
+    return float(far[places[1]]), Curve(used[edges], np.asarray(best.x), False)
 
 
 def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +53,7 @@ def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndar
     for face, corners in enumerate(mesh.faces.tolist()):
         for corner in corners:
             of_vertex.setdefault(corner, []).append(face)
-    edges, share = [(end, end)], [0.0]
+    edges, share, grid = [(end, end)], [0.0], np.linspace(0, 1, 17)      # places tried on an edge
     for _ in range(len(far)):
         (a, b), s = edges[-1], share[-1]
         around = set(of_vertex[a]) & set(of_vertex[b])
@@ -59,11 +67,11 @@ def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndar
             for c, d in ((three[0], three[1]), (three[1], three[2]), (three[2], three[0])):
                 if {c, d} == {a, b} or (a == b and a in (c, d)):
                     continue
-                ahead = np.outer(1 - GRID, mesh.vertices[c]) + np.outer(GRID, mesh.vertices[d])
-                level = (1 - GRID) * far[c] + GRID * far[d]
+                ahead = np.outer(1 - grid, mesh.vertices[c]) + np.outer(grid, mesh.vertices[d])
+                level = (1 - grid) * far[c] + grid * far[d]
                 cost = np.where(level < below - 1e-12, level + np.linalg.norm(ahead - here, axis=1), np.inf)
                 k = int(cost.argmin())
-                best = min(best, (float(cost[k]), c, d, float(GRID[k])))
+                best = min(best, (float(cost[k]), c, d, float(grid[k])))
         if not np.isfinite(best[0]):
             break
         _, c, d, s = best
@@ -71,21 +79,3 @@ def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndar
         edges.append((c, d))
         share.append(s if c != d else 0.0)
     return np.array([*edges, (start, start)]), np.array([*share, 0.0])
-
-
-def _straightened(vertices: np.ndarray, edges: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The shortest way across the same edges: a convex problem in the places on them."""
-    from scipy.optimize import minimize
-
-    first, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
-
-    def length(s: np.ndarray) -> tuple[float, np.ndarray]:
-        steps = np.diff(first + s[:, None] * along, axis=0)
-        far = np.linalg.norm(steps, axis=1)
-        ways = steps / np.maximum(far, 1e-12)[:, None]
-        force = np.concatenate([np.zeros((1, 3)), ways]) - np.concatenate([ways, np.zeros((1, 3))])
-        return float(far.sum()), np.einsum("md,md->m", force, along)
-
-    found = minimize(length, share, jac=True, method="L-BFGS-B", bounds=[(0, 1)] * len(share),
-                     options={"maxiter": 200, "ftol": 1e-14})
-    return edges, np.asarray(found.x)

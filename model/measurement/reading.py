@@ -9,11 +9,10 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 
 from .path import shortest_path
-from .section import Carried, Curve, around, bulge, direction, section, tape
+from .section import Carried, Curve, around, bulge, chain_length, direction, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
 
 ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
-STATURE, STEP, STEPS = 1.75, 0.004, 12    # metres: of somebody so tall, steps in which a plane moves on if it must
 
 
 class NotMeasured(ValueError):
@@ -87,32 +86,30 @@ class _Cut:
 def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     """The section of a girth, cut anew by its carried plane; NotMeasured where it is not closed.
 
-    A thigh or an upper arm is measured as near to the trunk as it is on its own.
+    A thigh or an upper arm is measured as near to the trunk as it is on its own: its plane moves on in twelve steps, of
+    4 mm for somebody of 1.75 m. Where arms are left out the pieces of the section are taken together.
     """
     vertices, normal = body.vertices, body.axes[0]
     origin = found.centre.at(vertices)
     if found.axis is not None:
         normal = direction(found.axis, vertices)
-    step = STEP * (np.ptp(vertices @ body.axes[0]) / STATURE) * found.aside * normal
-    for tried in range(STEPS if found.aside else 1):
-        curve = _curve(found, body, origin + tried * step, normal)
+    step = 0.004 * (np.ptp(vertices @ body.axes[0]) / 1.75) * found.aside * normal
+    for place in (origin + tried * step for tried in range(12 if found.aside else 1)):
+        curves = section(vertices, found.faces, place, normal)
+        if not curves:
+            raise NotMeasured("its plane meets nothing there")
+        ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
+        if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
+            raise NotMeasured("a hole of the mesh crosses it")
+        if found.under_arms and not any(curve.closed for curve in curves):
+            curve = Curve(np.concatenate([c.edges for c in curves]), np.concatenate([c.share for c in curves]), True)
+        else:
+            far = [float(np.linalg.norm(c.at(vertices).mean(axis=0) - place)) for c in curves]
+            curve = curves[int(np.argmin(far))]
         if curve.closed:
             points = curve.at(vertices) + bulge(vertices, body.mesh.vertex_normals, curve)
-            return _Cut(curve, origin + tried * step, normal, points, tape(points, normal))
+            return _Cut(curve, place, normal, points, tape(points, normal))
     raise NotMeasured("its plane runs out of the part it goes around")
-
-
-def _curve(found: Girth, body: Standing, origin: np.ndarray, normal: np.ndarray) -> Curve:
-    """The section of a girth by a plane: where arms are left out its pieces together; NotMeasured at a hole."""
-    curves = section(body.vertices, found.faces, origin, normal)
-    if not curves:
-        raise NotMeasured("its plane meets nothing there")
-    ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
-    if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
-        raise NotMeasured("a hole of the mesh crosses it")
-    if found.under_arms and not any(curve.closed for curve in curves):
-        return Curve(np.concatenate([c.edges for c in curves]), np.concatenate([c.share for c in curves]), True)
-    return min(curves, key=lambda c: float(np.linalg.norm(c.at(body.vertices).mean(axis=0) - origin)))
 
 
 def _moved(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: Standing
@@ -203,9 +200,7 @@ def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
         except ValueError as problem:
             raise NotMeasured(str(problem)) from None
         points = curve.at(body.vertices)
-        steps = np.diff(points, axis=0)
-        ways = steps / np.maximum(np.linalg.norm(steps, axis=1), 1e-12)[:, None]
-        pull = np.concatenate([np.zeros((1, 3)), ways]) - np.concatenate([ways, np.zeros((1, 3))])
+        _, pull = chain_length(points)
         total += length
         drawn.append(points[::-1])                                        # the way is found from its end
         ids += [curve.edges[:, 0], curve.edges[:, 1]]

@@ -131,6 +131,14 @@ def around(points: np.ndarray, near: np.ndarray | None = None) -> tuple[float, n
     return float((arc * lengths).sum()), pull - np.roll(pull, -1, axis=0)
 
 
+def chain_length(points: np.ndarray) -> tuple[float, np.ndarray]:
+    """Length of an open chain of points (m, 3), metres, and its gradient (m, 3) by them."""
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    ways = np.pad(steps / np.maximum(lengths, 1e-12)[:, None], ((1, 1), (0, 0)))
+    return float(lengths.sum()), ways[:-1] - ways[1:]
+
+
 def bulge(body: np.ndarray, normals: np.ndarray, curve: Curve) -> np.ndarray:
     """How far (m, 3), metres, the smooth surface lies from a curve's points on edges: coarse triangles cut corners.
 

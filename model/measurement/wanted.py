@@ -8,12 +8,10 @@ import numpy as np
 
 from ..body import BodyModel
 from .catalogue import CATALOGUE, named
-from .measure import Measurements, measure
+from .measure import measure
 from .tapes import Tapes
 
 EXACT = 2e-4                         # metres: a measurement that is met
-ROUNDS = 40
-FARTHEST = 8.0                       # standard deviations, of all betas together: what no model is asked to reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,33 +94,31 @@ def body_with_measurements(model: BodyModel, tapes: Tapes, given: Mapping[str, f
     base = model.vertices(pose, np.zeros(model.n_betas))
     goal = np.array(list(wanted.values()))
 
-    def there(betas: np.ndarray) -> Measurements:
-        return measure(base + moves @ betas, tapes, tapes.axes, only=wanted)
+    def readings_at(betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is measured there, and its derivative by the betas."""
+        found = measure(base + moves @ betas, tapes, tapes.axes, only=wanted)
+        for name in wanted:
+            if name not in found.readings:
+                raise ValueError(f"{name}: cannot be measured on the body with these measurements: "
+                                 f"{found.missing[name]}")
+        return (np.array([found.values[name] for name in wanted]),
+                np.stack([found.readings[name].along(moves) for name in wanted]))
 
     betas, best, least = np.zeros(model.n_betas), np.zeros(model.n_betas), np.inf
-    for _ in range(ROUNDS):
-        found = _all_there(there(betas), wanted)
-        off = goal - np.array([found.values[name] for name in wanted])
+    for _ in range(40):
+        values, slopes = readings_at(betas)
+        off = goal - values
         if np.abs(off).max() < least:
             best, least = betas, float(np.abs(off).max())
         if np.abs(off).max() < 0.1 * EXACT:
             break
-        slopes = np.stack([found.readings[name].along(moves) for name in wanted])
         ahead = slopes.T @ np.linalg.solve(slopes @ slopes.T + (0.1 * EXACT)**2 * np.eye(len(goal)),
                                            off + slopes @ betas)
-        ahead *= min(1.0, FARTHEST / max(float(np.linalg.norm(ahead)), 1e-12))
+        # 8 standard deviations, of all betas together: what no model is asked to reach
+        ahead *= min(1.0, 8.0 / max(float(np.linalg.norm(ahead)), 1e-12))
         step = ahead - betas
         betas = betas + step * min(1.0, 3.0 / max(float(np.linalg.norm(step)), 1e-12))
-    found = _all_there(there(best), wanted)
-    far = float(np.linalg.norm(best))
-    slopes = np.stack([found.readings[name].along(moves) for name in wanted])
+    (values, slopes), far = readings_at(best), float(np.linalg.norm(best))
     free = int(np.linalg.matrix_rank(slopes, tol=0.05 * np.linalg.norm(slopes, 2)))     # left and right say the same
-    return WantedBody(best, base + moves @ best, wanted, {name: found.values[name] for name in wanted}, far,
+    return WantedBody(best, base + moves @ best, wanted, dict(zip(wanted, values.tolist(), strict=True)), far,
                       float(chi2.sf(far**2, free)))
-
-
-def _all_there(found: Measurements, wanted: Mapping[str, float]) -> Measurements:
-    for name in wanted:
-        if name not in found.readings:
-            raise ValueError(f"{name}: cannot be measured on the body with these measurements: {found.missing[name]}")
-    return found
