@@ -15,10 +15,7 @@ from scanprep.geometry.storage import LARGEST, StorageError, read_bytes, taking_
 
 from .moving import MovingSkeleton
 
-_DEEPEST = 500                       # joints below each other: more is no skeleton
 USUAL_RATE = 30.0                    # frames a second of a file that does not say: what most programs play it with
-# numbers of a line between which a program left no blank, the later one of each pair negative
-_GLUED = re.compile(r"(?<=[\d.])(?=-)")
 
 
 def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSkeleton:
@@ -154,8 +151,8 @@ def _read_hierarchy(words: _Words) -> tuple[list[_Joint], dict[int, list[float]]
         else:
             joints.append(_read_joint(words, above[-1], names))
             above.append(len(joints) - 1)
-            if len(above) > _DEEPEST:
-                raise words.wrong(f"at most {_DEEPEST} joints below each other", "more")
+            if len(above) > 500:                                  # more is no skeleton
+                raise words.wrong("at most 500 joints below each other", "more")
     if words.look("MOTION").lower() == "root":
         more = [line.split()[1] for line in words.lines[words.line - 1:] if re.match(r"\s*root\s+\S", line, re.I)]
         raise StorageError(f"{words.path}, line {words.line}: expected the skeleton of one person, found several: "
@@ -186,33 +183,16 @@ def _read_joint(words: _Words, parent: int, names: set[str]) -> _Joint:
 
 
 def _posed(joints: list[_Joint], table: np.ndarray, metre: float) -> tuple[np.ndarray, np.ndarray]:
-    """World rotations (T, J, 3, 3) and places (T, J, 3), metres, of the joints by their channels (T, C)."""
-    T, J = len(table), len(joints)
-    R, y = np.empty((T, J, 3, 3)), np.empty((T, J, 3))
-    values, start = [], 0
-    for joint in joints:
-        values.append(table[:, start:start + len(joint.channels)])
-        start += len(joint.channels)
-    steps = metre * _steps(joints, values)
-    for j, (_, p, _, channels) in enumerate(joints):
-        turned = [k for k, (kind, _) in enumerate(channels) if kind == "rotation"]
-        mine = np.broadcast_to(np.eye(3), (T, 3, 3))
-        if turned:
-            order = "".join("XYZ"[channels[k][1]] for k in turned)
-            mine = Rotation.from_euler(order, values[j][:, turned], degrees=True).as_matrix().reshape(T, 3, 3)
-        R[:, j] = mine if p < 0 else R[:, p] @ mine
-        y[:, j] = steps[:, j] if p < 0 else y[:, p] + np.einsum("tab,tb->ta", R[:, p], steps[:, j])
-    return R, y
+    """World rotations (T, J, 3, 3) and places (T, J, 3), metres, of the joints by their channels (T, C).
 
-
-def _steps(joints: list[_Joint], values: list[np.ndarray]) -> np.ndarray:
-    """(T, J, 3) from the parent to each joint, in the unit of the file, some axes of whose place may have channels.
-
-    They are the offset itself or its change. Bones tell which: their length is that of the offset. The joints that
-    carry the body through the room, the root and those to the first with several below it, are no bones: theirs mean
-    what those of most bones do, the place itself where no bone has any. A channel there that is always 0 is no place.
+    Channels of position are the offset itself or its change. Bones tell which: their length is that of the offset. The
+    joints that carry the body through the room, the root and those to the first with several below it, are no bones:
+    theirs mean what those of most bones do, the place itself where no bone has any. A channel there that is always 0 is
+    no place.
     """
-    T = len(values[0])
+    T, J = len(table), len(joints)
+    values = np.split(table, np.cumsum([len(joint.channels) for joint in joints])[:-1], axis=1)
+    # (T, J, 3) from the parent to each joint, both ways, in the unit of the file
     added = np.tile(np.array([joint.offset for joint in joints], dtype=float), (T, 1, 1))
     instead = added.copy()
     for j, joint in enumerate(joints):
@@ -225,14 +205,24 @@ def _steps(joints: list[_Joint], values: list[np.ndarray]) -> np.ndarray:
         carriers.add(next(j for j, joint in enumerate(joints) if joint.parent == max(carriers)))
     length = np.linalg.norm([joint.offset for joint in joints], axis=1)
     off = [np.abs(np.linalg.norm(steps, axis=2) - length).mean(axis=0) for steps in (instead, added)]
-    bones = [j for j, joint in enumerate(joints)
-             if j not in carriers and any(kind == "position" for kind, _ in joint.channels)]
+    places = [[k for k, (kind, _) in enumerate(joint.channels) if kind == "position"] for joint in joints]
+    bones = [j for j in range(J) if j not in carriers and places[j]]
     changes = off[1] < off[0]                                     # of each joint by itself
     most = 2 * changes[bones].sum() > len(bones)
     for j in carriers:
-        places = [k for k, (kind, _) in enumerate(joints[j].channels) if kind == "position"]
-        changes[j] = most or not values[j][:, places].any()
-    return np.where(changes[:, None], added, instead)
+        changes[j] = most or not values[j][:, places[j]].any()
+    steps = metre * np.where(changes[:, None], added, instead)
+    # down the tree
+    R, y = np.empty((T, J, 3, 3)), np.empty((T, J, 3))
+    for j, (_, p, _, channels) in enumerate(joints):
+        turned = [k for k, (kind, _) in enumerate(channels) if kind == "rotation"]
+        mine = np.broadcast_to(np.eye(3), (T, 3, 3))
+        if turned:
+            order = "".join("XYZ"[channels[k][1]] for k in turned)
+            mine = Rotation.from_euler(order, values[j][:, turned], degrees=True).as_matrix().reshape(T, 3, 3)
+        R[:, j] = mine if p < 0 else R[:, p] @ mine
+        y[:, j] = steps[:, j] if p < 0 else y[:, p] + np.einsum("tab,tb->ta", R[:, p], steps[:, j])
+    return R, y
 
 
 def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tuple[np.ndarray, float]:
@@ -249,7 +239,9 @@ def _read_motion(words: _Words, joints: list[_Joint], rate: float | None) -> tup
         raise StorageError(f"{words.path}: expected joints with channels, found {len(joints)} joints without")
     first = words.line                                           # numbers begin on a line of their own
     rows = [(first + k + 1, line.split()) for k, line in enumerate(words.lines[first:]) if line.strip()]
-    rows = [(number, row if len(row) >= wanted else _GLUED.sub(" ", " ".join(row)).split()) for number, row in rows]
+    # programs may leave no blank between two numbers, the later one negative
+    rows = [(number, row if len(row) >= wanted else re.sub(r"(?<=[\d.])(?=-)", " ", " ".join(row)).split())
+            for number, row in rows]
     flat = [word for _, row in rows for word in row]
     frames = len(flat) // wanted
     if frames * len(joints) > 10**6 + 4 * sum(map(len, words.lines)):

@@ -8,6 +8,7 @@ import numpy as np
 from scanprep.geometry import rotations
 
 from .retarget import Pairing
+from .trunks import swing
 
 # Segments from the hips outwards; "hips" and "shoulders" are the middle between both sides.
 _ENDS = (("hips", "shoulders"), ("shoulders", "skullbase"),
@@ -55,27 +56,16 @@ def followed(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
     for a, b in ends:
         theirs, bone = there[b] - there[a], rest[b] - rest[a]
         if a in frames:
-            C = _between(their_rest[b] - their_rest[a], bone)
+            C = swing(np.eye(3)[None], their_rest[b] - their_rest[a], bone[None])[0]
             theirs = np.einsum("tab,bc,tdc,td->ta", frames[a], C, frames[a], theirs)
             lean = float(np.degrees(np.linalg.norm(rotations.log(C)))) if b == "shoulders" else lean
         still = np.linalg.norm(their_rest[b] - their_rest[a])              # a trunk that bends is shorter
         wanted[b] = wanted[a] + np.linalg.norm(bone) / max(float(still), 1e-12) * theirs
-        angles.append(_angles(theirs, here[b] - here[a]))
+        own = here[b] - here[a]
+        angles.append(np.degrees(np.arctan2(np.linalg.norm(np.cross(theirs, own), axis=1), (theirs * own).sum(axis=1))))
     places = np.stack([wanted[b] for _, b in ends], axis=1)
     off = np.linalg.norm(np.stack([here[b] for _, b in ends], axis=1) - places, axis=2)
     return Followed(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places, lean)
-
-
-def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(T,) degrees between directions (T, 3)."""
-    return np.asarray(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))))
-
-
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation (3, 3) that brings one direction (3,) to another; none where one has no length."""
-    axis = np.cross(a, b)
-    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
-    return rotations.exp(np.arctan2(sine, cosine) * axis / sine) if sine > 1e-9 else np.eye(3)
 
 
 def _nodes(joints: np.ndarray, roles: dict[str, int]) -> dict[str, np.ndarray]:

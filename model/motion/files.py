@@ -33,7 +33,6 @@ OTHER_MOTIONS = {
     ".amc": "the motion of an ASF/AMC pair: amc2bvh or Blender makes BVH of both, for scape animate",
     ".mvnx": f"a file of Xsens MVN, which {_ROTATIONS}", ".htr": f"HTR of Motion Analysis, which {_ROTATIONS}",
     ".gtr": f"GTR of Motion Analysis, which {_ROTATIONS}"}
-_TEXTS = ("gender", "surface_model_type")            # of which some files hold objects; then they are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +86,7 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
     what, wanted = "a motion (.npz)", (
         "poses", *_PLACES, "betas", *RATES, *(name for piece in _PIECES for name in piece), *more)
     a = storage.load_arrays(path, what, wanted)
-    for name in _TEXTS:
+    for name in ("gender", "surface_model_type"):        # of which some files hold objects; then they are left out
         try:
             a |= storage.load_arrays(path, what, (name,))
         except StorageError:
@@ -124,7 +123,16 @@ def _restored(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts
     made_for = storage.text(a, "surface_model_type", "")
     if not made_for.lower().startswith((*OURS, *FAMILY)) and made_for:
         raise StorageError(f"{path}: expected surface_model_type '{OURS[0]}', found '{made_for}'")
-    rate = _frame_rate(path, a) if rate is None else rate
+    name = next((name for name in RATES if name in a), None)
+    if rate is None and name is None:
+        warnings.warn(f"{path}: it does not say its frames a second ({RATES[0]}), {USUAL_RATE:g} are assumed; "
+                      "say rate=", stacklevel=3)
+        rate = USUAL_RATE
+    elif rate is None:
+        if np.size(a[name]) != 1:
+            raise ValueError(f"{name}: expected one number, found shape {np.shape(a[name])}")
+        rate = float(a[name].item())
+        Range(TINY).check(rate, name)
     T, shape = len(np.atleast_1d(a["poses"])), a["poses"].shape[1:]
     poses = storage.numbers(a, "poses", T, *shape)
     if not T or poses[0].size % 3 or not poses[0].size:
@@ -142,19 +150,6 @@ def _restored(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts
     return StoredMotion(poses, storage.numbers(a, "trans", T, 3).astype(np.float64), betas if betas.size else None,
                         rate, storage.text(a, "gender", "neutral"),
                         made_for, {name: a[name] for name in more if name in a})
-
-
-def _frame_rate(path: Path, a: dict[str, np.ndarray]) -> float:
-    """Frames a second as the file says, or as most programs assume."""
-    name = next((name for name in RATES if name in a), None)
-    if name is None:
-        warnings.warn(f"{path}: it does not say its frames a second ({RATES[0]}), {USUAL_RATE:g} are assumed; "
-                      "say rate=", stacklevel=4)
-        return USUAL_RATE
-    if np.size(a[name]) != 1:
-        raise ValueError(f"{name}: expected one number, found shape {np.shape(a[name])}")
-    Range(TINY).check(float(a[name].item()), name)
-    return float(a[name].item())
 
 
 def check_ours(path: str | Path, stored: StoredMotion, where: str = "") -> None:

@@ -17,12 +17,10 @@ from ..linear import Subject
 from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
 from .error import Followed, followed
-from .files import StoredMotion, betas_for, check_ours, read_motion_file
+from .files import betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
 from .retarget import Pairing, Retargeted, retargeted
 from .same import copied
-
-UPRIGHT = 0.8                        # cosine between segments and the vertical, from which on somebody stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,17 +85,19 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
     """
     path = Path(path)
     if path.suffix.lower() == ".bvh":
-        return _onto(path, read_bvh(path, unit or "cm", rate), subject or _mean_person(model), "")
+        return _onto(path, read_bvh(path, unit or "cm", rate), model, subject)
     J = len(model.skeleton.parents)
     stored = read_motion_file(path, parts=J, rate=rate)
     family = bool(model.info.get("family"))
     if stored.of_family and (stored.made_for or stored.poses.shape[1] != J or family):
-        if family:
-            return _of_family(path, stored, model, subject)
+        if family:                                    # a model that was imported from it
+            betas = betas_for(path, stored.betas, model) if subject is None else subject.betas
+            return BodyMotion(with_joints(stored.poses, J), stored.trans, betas, stored.rate, stored.gender,
+                              "pose by pose, of the same family")
         if stored.poses.shape[1] < BODY:
             raise StorageError(f"{path}: expected at least the {BODY} joints of the body, "
                                f"found {stored.poses.shape[1]}")
-        return _onto(path, moving_body(stored)[0], subject or _mean_person(model), UNCERTAIN, stored.gender)
+        return _onto(path, moving_body(stored)[0], model, subject, UNCERTAIN, stored.gender)
     check_ours(path, stored)
     if stored.poses.shape[1] != J:
         raise StorageError(f"{path}: expected frames of the model's {J} parts, found {stored.poses.shape[1]} parts; "
@@ -106,20 +106,10 @@ def read_motion(path: str | Path, model: BodyModel, subject: Subject | None = No
     return BodyMotion(stored.poses, stored.trans, betas, stored.rate, stored.gender)
 
 
-def _mean_person(model: BodyModel) -> Subject:
-    return model.subject(np.zeros(1) if model.n_betas else None)
-
-
-def _of_family(path: Path, stored: StoredMotion, model: BodyModel, subject: Subject | None) -> BodyMotion:
-    """A motion of the family on a model that was imported from it."""
-    betas = betas_for(path, stored.betas, model) if subject is None else subject.betas
-    return BodyMotion(with_joints(stored.poses, len(model.skeleton.parents)), stored.trans, betas, stored.rate,
-                      stored.gender, "pose by pose, of the same family")
-
-
-def _onto(path: Path, moving: MovingSkeleton, subject: Subject, uncertain: str, gender: str = "neutral"
-          ) -> BodyMotion:
-    """A motion of another skeleton on a body."""
+def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject | None, uncertain: str = "",
+          gender: str = "neutral") -> BodyMotion:
+    """A motion of another skeleton on a body, if none is given the mean person's."""
+    subject = subject or model.subject(np.zeros(1) if model.n_betas else None)
     skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
     same = copied(skeleton, subject.template, subject.vertices, moving)
     if same is not None:
@@ -148,22 +138,17 @@ def standing_rest(moving: MovingSkeleton) -> tuple[MovingSkeleton, int | None]:
     chains = [[roles.get(f"{side}_{name}") for name in ("shoulder", "hip", "knee", "ankle")] for side in "lr"]
     if any(j is None for chain in chains for j in chain):
         return moving, None
-    joints = np.array(chains)
-    if _upright(moving.rest[None], joints).max() > UPRIGHT / 2:
+    # (2, 1 + T): the least cosine between y, or z, and the segments from shoulders to ankles, at rest and in each frame
+    steps = np.diff(np.concatenate([moving.rest[None], moving.places])[:, np.array(chains)], axis=2)
+    size = np.linalg.norm(steps, axis=3)
+    cosine = np.stack([(-steps[..., axis] / np.maximum(size, 1e-12)).min(axis=(1, 2)) for axis in (1, 2)])
+    if cosine[:, 0].max() > 0.4:                     # it is nearly upright at rest
         return moving, None
-    along = _upright(moving.places, joints)
-    told = along[int(along[0].max() < UPRIGHT)]
-    best = int(told.argmax())
-    if told[best] < UPRIGHT:
+    along = cosine[int(cosine[0, 1:].max() < 0.8), 1:]
+    best = int(along.argmax())
+    if along[best] < 0.8:                            # from where on somebody stands
         return moving, None
     rest = moving.places[best]
     offsets = rest - np.where(moving.parents[:, None] < 0, 0, rest[moving.parents])
     R = moving.rotations @ np.swapaxes(moving.rotations[best], -1, -2)
     return replace(moving, offsets=offsets, rotations=R), best
-
-
-def _upright(places: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """(2, T) the least cosine between y, or z, and the segments from shoulders to ankles, (2, 4) joints."""
-    steps = np.diff(places[:, joints], axis=2)
-    size = np.linalg.norm(steps, axis=3)
-    return np.stack([(-steps[..., axis] / np.maximum(size, 1e-12)).min(axis=(1, 2)) for axis in (1, 2)])

@@ -22,7 +22,6 @@ from .moving import MovingSkeleton
 from .trunks import grouped, heights, nearest_starts, spread
 
 Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres
-AT_ONCE = 200                        # frames whose meshes are held at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,8 @@ class Pairing:
         The smallest rotation that brings our bone to theirs, after that of the part above. Feet stand flat, but where
         the legs are far apart at rest (as in the CMU files) they are taken to be square to the shanks from the front.
         """
-        whole = self.whole(aligned)
+        # from the axes of the generic model to those of the motion, both standing at rest
+        whole = self.standing(aligned) @ self.standing(True).T
         A = dict.fromkeys(range(len(self.joints)), whole)
         for side in "lr" if not aligned else "":
             for chain in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
@@ -149,10 +149,6 @@ class Pairing:
         """
         return _upright(self.P[0] @ self.axes[:, 2], self.up) @ self.standing(aligned).T
 
-    def whole(self, aligned: bool) -> np.ndarray:
-        """The rotation (3, 3) from the axes of the generic model to those of the motion, both standing at rest."""
-        return self.standing(aligned) @ self.standing(True).T
-
     def standing(self, ours: bool) -> np.ndarray:
         """(3, 3) to the left, upwards and forwards in the rest of the generic model or of the motion.
 
@@ -188,16 +184,7 @@ def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: 
         else:
             lacking.append(name)
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
-    _raise_clavicles(pair, M, girdle)
-    V = pair.world(aligned)
-    R = V @ M @ np.swapaxes(pair.P, -1, -2)
-    poses = skeleton.pose_of(R)
-    scale = _leg(skeleton.joints, pair.ours, pair.theirs) / _leg(moving.rest, pair.theirs, pair.ours)
-    return Retargeted(poses, _travel(pair, V, poses, scale, here), moving.rate, matched, tuple(lacking), scale)
-
-
-def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
-    """Where the motion has no clavicles, raise ours by a share of what the upper arms are above the horizontal."""
+    # clavicles that the motion has not: raised by a share of what the upper arms are above the horizontal
     left, high, _ = pair.axes.T
     for side, outwards in (("l", left), ("r", -left)):
         parts = [pair.ours.get(f"{side}_{name}") for name in ("sternoclavicular", "shoulder", "elbow")]
@@ -207,27 +194,26 @@ def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
         own = pair.joints[elbow] - pair.joints[arm]
         own = own / np.linalg.norm(own)
         sine = np.einsum("tab,a,tbc,c->t", np.swapaxes(M[:, clavicle], -1, -2), high, M[:, arm], own)
-        angle = share * np.maximum(np.arcsin(np.clip(sine, -1, 1)), 0)
+        angle = girdle * np.maximum(np.arcsin(np.clip(sine, -1, 1)), 0)
         M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
-
-
-def _travel(pair: Pairing, V: np.ndarray, poses: np.ndarray, scale: float, here: bool) -> np.ndarray:
-    """(T, 3) travel of the root's joint, with the middle between the hips where that of the motion is, scaled."""
-    skeleton, joints = pair.skeleton, pair.skeleton.joints
-    ours = [pair.ours["l_hip"], pair.ours["r_hip"]]
-    theirs = [pair.theirs["l_hip"], pair.theirs["r_hip"]]
-    place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
+    V = pair.world(aligned)
+    poses = skeleton.pose_of(V @ M @ np.swapaxes(pair.P, -1, -2))
+    # travel: the middle between the hips is where that of the motion is, scaled
+    scale = _leg(skeleton.joints, pair.ours, pair.theirs) / _leg(moving.rest, pair.theirs, pair.ours)
+    ours, theirs = ([roles["l_hip"], roles["r_hip"]] for roles in (pair.ours, pair.theirs))
+    place = scale * moving.places[:, theirs].mean(axis=1) @ V.T
     if here:
-        place = place - place[0] + joints[ours].mean(axis=0)
+        place = place - place[0] + skeleton.joints[ours].mean(axis=0)
     trans = place - joint_places(skeleton, poses)[:, ours].mean(axis=1)
-    return trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
+    trans = trans + lift(pair.vertices, poses, trans, pair.up) * pair.up
+    return Retargeted(poses, trans, moving.rate, matched, tuple(lacking), scale)
 
 
 def lift(vertices: Vertices, poses: np.ndarray, trans: np.ndarray, up: np.ndarray) -> float:
     """How far a motion must rise for its lowest points to be where those of the body at rest are, metres."""
     still = (vertices(np.zeros((1, *poses.shape[1:])), np.zeros((1, 3))) @ up).min()
-    lowest = np.concatenate([(vertices(poses[k:k + AT_ONCE], trans[k:k + AT_ONCE]) @ up).min(axis=1)
-                             for k in range(0, len(poses), AT_ONCE)])
+    lowest = np.concatenate([(vertices(poses[k:k + 200], trans[k:k + 200]) @ up).min(axis=1)
+                             for k in range(0, len(poses), 200)])       # the meshes of 200 frames are held at a time
     return float(still - np.percentile(lowest, 5))                      # percentile: some frames may err
 
 

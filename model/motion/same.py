@@ -12,9 +12,6 @@ from ..rig import joint_places, turn_up
 from .moving import MovingSkeleton
 from .retarget import Retargeted, Vertices, lift
 
-ALIKE = 10.0                         # degrees between the bones of two skeletons that rest alike
-SAME = 1e-3                          # metres that the bones of one person may differ
-
 
 def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
     """The motion of the same parts, which rest alike in axes of another name; None where it is another skeleton.
@@ -32,22 +29,8 @@ def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSke
     if not bones or len(bones) < (len(names) - 1) / 2:
         return None
     ours, theirs = skeleton.joints[bones] - skeleton.joints[skeleton.parents[bones]], moving.offsets[order][bones]
-    Q = _turn(ours, theirs, turn_up(upright(rest)[0]))
-    if Q is None:
-        return None
-    scale = np.linalg.norm(ours, axis=1).sum() / np.linalg.norm(theirs, axis=1).sum()
-    poses = skeleton.pose_of(Q.T @ moving.rotations[:, order] @ Q)
-    trans = scale * moving.places[:, order[shared[0]]] @ Q - joint_places(skeleton, poses)[:, shared[0]]
-    if np.abs(scale * theirs @ Q - ours).max() > SAME:                  # another person: soles where theirs would be
-        trans = trans + lift(vertices, poses, trans, Q.T @ [0, 1, 0]) * (Q.T @ [0, 1, 0])
-    return Retargeted(poses, trans, moving.rate, dict(zip(names, names, strict=True)), (), float(scale))
-
-
-def _turn(ours: np.ndarray, theirs: np.ndarray, usual: np.ndarray) -> np.ndarray | None:
-    """The rotation that swaps axes and brings bones (n, 3) nearest to others, the usual one where it is as near; None
-    where they do not rest alike.
-    """
-    turns = np.concatenate([usual[None], Rotation.create_group("O").as_matrix().round()])
+    # the rotation that swaps axes and brings our bones nearest to theirs, the usual one where it is as near
+    turns = np.concatenate([turn_up(upright(rest)[0])[None], Rotation.create_group("O").as_matrix().round()])
     sizes = np.linalg.norm(ours, axis=1) * np.linalg.norm(theirs, axis=1)
     kept = sizes > 1e-9
     if not kept.any():
@@ -55,4 +38,12 @@ def _turn(ours: np.ndarray, theirs: np.ndarray, usual: np.ndarray) -> np.ndarray
     cosine = np.einsum("na,kab,nb->kn", theirs[kept], turns, ours[kept]) / sizes[kept]
     off = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
     best = int(np.flatnonzero(off < off.min() + 1e-3)[0])
-    return turns[best] if off[best] < ALIKE else None
+    if off[best] >= 10:                         # degrees: they do not rest alike
+        return None
+    Q = turns[best]
+    scale = np.linalg.norm(ours, axis=1).sum() / np.linalg.norm(theirs, axis=1).sum()
+    poses = skeleton.pose_of(Q.T @ moving.rotations[:, order] @ Q)
+    trans = scale * moving.places[:, order[shared[0]]] @ Q - joint_places(skeleton, poses)[:, shared[0]]
+    if np.abs(scale * theirs @ Q - ours).max() > 1e-3:          # metres: another person, soles where theirs would be
+        trans = trans + lift(vertices, poses, trans, Q.T @ [0, 1, 0]) * (Q.T @ [0, 1, 0])
+    return Retargeted(poses, trans, moving.rate, dict(zip(names, names, strict=True)), (), float(scale))

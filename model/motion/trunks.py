@@ -26,7 +26,7 @@ def grouped(moving: MovingSkeleton, joints: Sequence[int], starts: Sequence[int]
             out[part] = R[:, low]
         elif after < len(joints):
             mean = rotations.project(R[:, joints[first:after]].mean(axis=1))
-            out[part] = _swung(mean, rest[joints[after]] - rest[low], y[:, joints[after]] - y[:, low])
+            out[part] = swing(mean, rest[joints[after]] - rest[low], y[:, joints[after]] - y[:, low])
         else:
             points = rest[carried]
             there = np.einsum("tab,kb->tka", R[:, top], points - rest[top]) + (y[:, top] - y[:, low])[:, None]
@@ -67,7 +67,7 @@ def spread(moving: MovingSkeleton, steps: Sequence[int], parts: Sequence[int]
     return out, told
 
 
-def _swung(R: np.ndarray, before: np.ndarray, now: np.ndarray) -> np.ndarray:
+def swing(R: np.ndarray, before: np.ndarray, now: np.ndarray) -> np.ndarray:
     """Rotations (T, 3, 3) after the smallest ones that bring `R @ before` (3,) to the directions `now` (T, 3)."""
     was = R @ before
     if np.linalg.norm(before) < 1e-6:
