@@ -23,25 +23,20 @@ from scanprep.skeleton.tree import Skeleton
 
 from .features import Lift, QuaternionLift, RotationLift, part_features
 from .human_poses import human_poses, is_held, with_human_poses
+from .motion.amass import PARENTS
 from .skinning import SkinningModel
 
 NEEDED = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 WANTED = (*NEEDED, "posedirs", "J_regressor")
-SHAPES = 300                         # of so many directions and more the first are of shape, the others of expression
 
 BODY = ("pelvis", "thigh_left", "thigh_right", "abdomen", "shin_left", "shin_right", "abdomen2", "foot_left",
         "foot_right", "chest", "toes_left", "toes_right", "neck", "shoulder_left", "shoulder_right", "head",
         "upper_arm_left", "upper_arm_right", "forearm_left", "forearm_right", "hand_left", "hand_right")
-BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 FINGERS = {side: tuple(f"{finger}{i}_{side}" for finger in ("index", "middle", "pinky", "ring", "thumb")
                        for i in (1, 2, 3)) for side in ("left", "right")}
 NAMES = {24: (*BODY, "fingers_left", "fingers_right"), 52: (*BODY, *FINGERS["left"], *FINGERS["right"]),
          55: (*BODY, "jaw", "eye_left", "eye_right", *FINGERS["left"], *FINGERS["right"])}
 FAMILY = {24: "smpl", 52: "smplh", 55: "smplx"}
-
-CONVERT = ("convert it once where the library it came with is installed: python -c \"import pickle, numpy as np; "
-           "m = pickle.load(open('{0}', 'rb'), encoding='latin1'); np.savez('{1}', **{{k: np.array(m[k].todense() if "
-           "hasattr(m[k], 'todense') else m[k]) for k in {2}}})\"")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +110,7 @@ def _skeleton(found: Published) -> Skeleton:
         part[np.where(shared, best, -np.inf).argmax()] = j
     plain = Skeleton(part, found.parents, joints, found.names)
     known = NAMES.get(J, ())
-    if not found.names and tuple(found.parents[:22]) == BODY_PARENTS and known:
+    if not found.names and np.array_equal(found.parents[:22], PARENTS) and known:
         return Skeleton(part, found.parents, joints, known)
     return plain if found.names else Skeleton(part, found.parents, joints,
                                               name_parts(mesh, plain, find_symmetry(mesh)))
@@ -144,13 +139,16 @@ def _poses(mesh: Mesh, skeleton: Skeleton, hands: dict[str, np.ndarray]) -> tupl
 
 def read_published(path: str | Path) -> Published:
     """The arrays of a file of the SMPL family's layout, checked; as for `import_model`."""
+    convert = ("convert it once where the library it came with is installed: python -c \"import pickle, numpy as np; "
+               f"m = pickle.load(open('{path}', 'rb'), encoding='latin1'); np.savez('{Path(path).stem}.npz', **{{k: "
+               f"np.array(m[k].todense() if hasattr(m[k], 'todense') else m[k]) for k in {WANTED}}})\"")
     check_regular(path, what="a body model as .npz")
     with taking_apart(path, "a body model as .npz"):
         with open(path, "rb") as file:
             start = file.read(4)
         if start[:2] != b"PK" or not zipfile.is_zipfile(path):
             if start[:1] == b"\x80" or Path(path).suffix == ".pkl":
-                raise StorageError(f"{path}: a pickle can run any program, so it is not opened; {_convert(path)}")
+                raise StorageError(f"{path}: a pickle can run any program, so it is not opened; {convert}")
             raise StorageError(f"{path}: expected a body model as .npz, found another kind of file")
         wanted = [name for name in names_in(path) if name in WANTED or name in ("part_names", "header")
                   or name.startswith(("J_regressor_", "hands_mean"))]
@@ -158,16 +156,11 @@ def read_published(path: str | Path) -> Published:
             arrays = load_arrays(path, "a body model as .npz", wanted)
         except StorageError as problem:
             if isinstance(problem.__cause__, ObjectsError):
-                raise StorageError(f"{problem}; {_convert(path)}") from None
+                raise StorageError(f"{problem}; {convert}") from None
             raise
         if "header" in arrays:
             raise ValueError("it is a model of ours already: nothing to import")
         return _checked(arrays)
-
-
-def _convert(path: str | Path) -> str:
-    stem = Path(path).with_suffix("")
-    return CONVERT.format(path, f"{stem.name}.npz", WANTED)
 
 
 def _checked(a: dict[str, np.ndarray]) -> Published:
@@ -192,8 +185,8 @@ def _checked(a: dict[str, np.ndarray]) -> Published:
                          f"{weights.min():.2g}")
     weights = np.maximum(weights, 0)
     shapes = _numbers(a, "shapedirs", N, 3, None)
-    if shapes.shape[2] > SHAPES:
-        notes.append(f"betas from number {SHAPES + 1} on are taken for expressions")
+    if shapes.shape[2] > 300:            # SMPL-X: the first are of shape, the others of expression
+        notes.append("betas from number 301 on are taken for expressions")
     bends, kinds = np.zeros((N, 3, 0), np.float32), {9 * (J - 1), 4 * (J - 1) + 1}
     if "posedirs" in a:
         bends = _numbers(a, "posedirs", N, 3, None)
@@ -202,8 +195,22 @@ def _checked(a: dict[str, np.ndarray]) -> Published:
                              f"for {J} joints, found {bends.shape[2]}")
     hands = {side: a[name].ravel().astype(np.float64) for side, name in (("left", "hands_meanl"),
                                                                          ("right", "hands_meanr")) if name in a}
+    # (J, N) the regressor, dense or in the parts of a sparse matrix: data with row and col, or indices and indptr
+    part = {name: a[f"J_regressor_{name}"] for name in ("data", "row", "col", "indices", "indptr")
+            if f"J_regressor_{name}" in a}
+    if "J_regressor" in a:
+        regressor = csr_array(_numbers(a, "J_regressor", J, N).astype(np.float64))
+    elif {"data", "row", "col"} <= set(part):
+        regressor = csr_array(coo_array((part["data"], (part["row"], part["col"])), shape=(J, N)))
+    elif {"data", "indices", "indptr"} <= set(part):
+        kind = csc_array if len(part["indptr"]) == N + 1 else csr_array
+        regressor = csr_array(kind((part["data"], part["indices"], part["indptr"]), shape=(J, N)))
+    else:
+        raise KeyError("J_regressor")
+    if not np.allclose(regressor.sum(axis=1), 1, rtol=0, atol=1e-3):
+        raise ValueError("J_regressor: expected rows that sum to 1")
     names = tuple(map(str, a["part_names"])) if len(a.get("part_names", ())) == J else ()
-    return Published(Mesh(vertices, faces.astype(np.int64)), shapes, bends, _regressor(a, J, N),
+    return Published(Mesh(vertices, faces.astype(np.int64)), shapes, bends, csr_array(regressor.astype(np.float64)),
                      weights / weights.sum(axis=1, keepdims=True), parents, names, hands, tuple(notes))
 
 
@@ -235,22 +242,3 @@ def _parents(table: np.ndarray) -> np.ndarray:
         raise ValueError(f"kintree_table: joint {wrong[0]} has parent {parents[wrong[0]]}, expected a joint listed "
                          "before it")
     return parents
-
-
-def _regressor(a: dict[str, np.ndarray], J: int, N: int) -> csr_array:
-    """J_regressor (J, N), dense or in the parts of a sparse matrix: data with row and col, or indices and indptr."""
-    if "J_regressor" in a:
-        found = csr_array(_numbers(a, "J_regressor", J, N).astype(np.float64))
-    else:
-        part = {name: a[f"J_regressor_{name}"] for name in ("data", "row", "col", "indices", "indptr")
-                if f"J_regressor_{name}" in a}
-        if {"data", "row", "col"} <= set(part):
-            found = csr_array(coo_array((part["data"], (part["row"], part["col"])), shape=(J, N)))
-        elif {"data", "indices", "indptr"} <= set(part):
-            kind = csc_array if len(part["indptr"]) == N + 1 else csr_array
-            found = csr_array(kind((part["data"], part["indices"], part["indptr"]), shape=(J, N)))
-        else:
-            raise KeyError("J_regressor")
-    if not np.allclose(found.sum(axis=1), 1, rtol=0, atol=1e-3):
-        raise ValueError("J_regressor: expected rows that sum to 1")
-    return csr_array(found.astype(np.float64))

@@ -3,27 +3,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array, eye_array
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array, vstack
 
 from scanprep.correspondence.correlated import find_correspondences
-from scanprep.geometry import rotations
+from scanprep.geometry import rotations, sparse
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, save_arrays, taking_apart
 from scanprep.geometry.surface import OrientedPoints, Surface
-from scanprep.registration.nonrigid import Registration, register, registration_problem
-from scanprep.skeleton.tree import Skeleton
+from scanprep.registration.nonrigid import register, registration_problem
 
 from ...body import BodyModel
 from ...fitting.vertices import fit_shape
 from ...linear import Subject
 from ...motion.amass import moving_body
 from ...motion.bvh import read_bvh
-from ...motion.files import read_motion_file
+from ...motion.files import StoredMotion, read_motion_file
 from ...motion.moving import MovingSkeleton
 from ...motion.retarget import Pairing, Retargeted, retargeted
 from ...motion.same import copied
@@ -44,7 +42,7 @@ def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) ->
     stored = read_motion_file(path, rate=rate)
     count, own = stored.poses.shape[1], len(control.skeleton.parents)
     if count == own:
-        return own_motion(control, path, rate)
+        return _own(control, path, stored)
     if stored.of_family:
         return _named(path, bvh_motion, control, statue.pose, moving_body(stored)[0])
     if count != people:
@@ -67,8 +65,11 @@ def own_motion(control: ControlModel, path: str | Path, rate: float | None = Non
     In such files trans is the travel of the middle of part 0, as body models place themselves; here that of the root's
     joint, as in a rig. Skinning moves the one a little against the other.
     """
+    return _own(control, path, read_motion_file(path, rate=rate))
+
+
+def _own(control: ControlModel, path: str | Path, stored: StoredMotion) -> Retargeted:
     J, names = len(control.skeleton.parents), control.skeleton.names
-    stored = read_motion_file(path, rate=rate)
     with taking_apart(path, f"a motion of the statue's {J} parts"):
         poses, trans = check_motion(control.skeleton, stored.poses, stored.trans, stored.rate)
         return Retargeted(poses, trans - middle_drift(control, poses), stored.rate,
@@ -97,7 +98,9 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
 
     The generic control model rests as they do, so the rotations of the parts in the world carry over.
     """
-    skeleton = _average_person()
+    from scanprep.synthetic.people import Person
+
+    skeleton = Person().skeleton
     poses, trans = check_motion(skeleton, poses, trans, rate)
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
@@ -118,13 +121,6 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> 
     return same or retargeted(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
 
 
-@lru_cache(maxsize=1)
-def _average_person() -> Skeleton:
-    from scanprep.synthetic.people import Person
-
-    return Person().skeleton
-
-
 class Follower:
     """A control mesh bound to the surface of a learned model's person, in the pose and place of the scan.
 
@@ -140,14 +136,16 @@ class Follower:
             raise ValueError(f"registered: expected shape {body.vertices.shape}, got {registered.shape}")
         near = body if registered is None else body.with_vertices(registered)
         self._bind = _bound(mesh, near)
-        self._around = csr_array(self._bind @ _averaging(body))
+        # how much the turn of each edge counts around each vertex of the body: over four rings
+        N, edges = len(body.vertices), body.edges
+        ends = sparse.gatherer(edges.T.ravel(), N) @ vstack([eye_array(len(edges))] * 2)
+        ring = (body.vertex_adjacency != 0).astype(float) + eye_array(N)
+        ring = csr_array(diags_array(1 / ring.sum(axis=1)) @ ring)
+        self._around = csr_array(self._bind @ (ring @ (ring @ (ring @ ends))))
         used = np.unique(self._around.indices)
-        self._around, self._edges = self._around[:, used], body.edges[used]
-        self._before = self._edge(body.vertices)
+        self._around, self._edges = self._around[:, used], edges[used]
+        self._before = np.diff(body.vertices[self._edges], axis=1)[:, 0]
         self._offset = mesh.vertices - self._bind @ body.vertices
-
-    def _edge(self, vertices: np.ndarray) -> np.ndarray:
-        return vertices[self._edges[:, 1]] - vertices[self._edges[:, 0]]
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """The control mesh (..., n, 3), metres, in poses (..., J, 3) of the model."""
@@ -159,7 +157,7 @@ class Follower:
 
     def _moved(self, body: np.ndarray) -> np.ndarray:
         body = np.asarray(body, dtype=np.float64)
-        outer = np.einsum("ea,eb->eab", self._edge(body), self._before).reshape(-1, 9)
+        outer = np.einsum("ea,eb->eab", np.diff(body[self._edges], axis=1)[:, 0], self._before).reshape(-1, 9)
         R = rotations.project((self._around @ outer).reshape(-1, 3, 3))
         return np.asarray(self._bind @ body + np.einsum("nab,nb->na", R, self._offset))
 
@@ -180,42 +178,24 @@ def _bound(mesh: Mesh, body: Mesh) -> csr_array:
                                shape=(n, len(body.vertices))))
 
 
-def _averaging(body: Mesh) -> csr_array:
-    """(N, E) how much the turn of each edge counts around each vertex."""
-    N, edges = len(body.vertices), body.edges
-    ends = csr_array(coo_array((np.ones(2 * len(edges)), (edges.T.ravel(), np.tile(np.arange(len(edges)), 2))),
-                               shape=(N, len(edges))))
-    ring = (body.vertex_adjacency != 0).astype(float) + eye_array(N)
-    ring = csr_array(diags_array(1 / ring.sum(axis=1)) @ ring)
-    for _ in range(4 - 1):
-        ends = ring @ ends
-    return csr_array(ends)
-
-
 def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None = None,
                 progress: Callable[[int, int], None] | None = None) -> Follower:
     """The control mesh bound to a learned model, whose template, if not `registered`, is registered first."""
+    control, pairs, hints = statue.control, None, None
     if registered is None:
-        surface = Reconstruction(statue.control, statue.map,
-                                 subdivide(statue.control.mesh, statue.control.chart, 2)).mesh()
-        registered = _registered(statue, model, surface, progress).mesh.vertices
+        surface = Reconstruction(control, statue.map, subdivide(control.mesh, control.chart, 2)).mesh()
+        places = {name: control.mesh.vertices[vertex] for name, vertex in control.landmarks.items()}
+        try:
+            pairs = match_landmarks(model.info.get("landmarks") or {}, places, minimum=8)[1:]
+            pairs = pairs[0].astype(np.int64), pairs[1]
+        except ValueError:                   # other names, or none
+            hints = find_correspondences(model.template, surface)
+        found = register(model.template, surface, pairs, progress=progress, correspondences=hints)
+        problem = registration_problem(model.template, surface, found, pairs is not None)
+        if problem:
+            raise ValueError(f"model: its template could not be brought onto the statue, {problem}; register it to the "
+                             "scan with landmarks (scape prep register) and name the result with --registered")
+        registered = found.mesh.vertices
     fit = fit_shape(model, registered)
     subject = model.subject(fit.betas if model.n_betas else None)
-    return Follower(statue.control.mesh, subject, fit.pose, fit.trans, registered)
-
-
-def _registered(statue: Statue, model: BodyModel, surface: Mesh, progress: Callable[[int, int], None] | None
-                ) -> Registration:
-    control, pairs, hints = statue.control, None, None
-    places = {name: control.mesh.vertices[vertex] for name, vertex in control.landmarks.items()}
-    try:
-        pairs = match_landmarks(model.info.get("landmarks") or {}, places, minimum=8)[1:]
-        pairs = pairs[0].astype(np.int64), pairs[1]
-    except ValueError:                   # other names, or none
-        hints = find_correspondences(model.template, surface)
-    fit = register(model.template, surface, pairs, progress=progress, correspondences=hints)
-    problem = registration_problem(model.template, surface, fit, pairs is not None)
-    if problem:
-        raise ValueError(f"model: its template could not be brought onto the statue, {problem}; register it to the "
-                         "scan with landmarks (scape prep register) and name the result with --registered")
-    return fit
+    return Follower(control.mesh, subject, fit.pose, fit.trans, registered)
