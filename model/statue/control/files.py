@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -77,16 +76,6 @@ def _load(path: Path) -> ControlModel:
     return control
 
 
-@dataclass(frozen=True, eq=False)
-class _Corners:
-    """Vertices as a file has them, repeated where normals or texture coordinates part."""
-
-    points: np.ndarray
-    weights: np.ndarray
-    uv: np.ndarray | None
-    faces: np.ndarray
-
-
 def _read_skinned(path: Path) -> ControlModel:
     data = storage.read_bytes(path, WHAT, MeshFileError)
     tree, binary = glb.chunks_of(path, data)
@@ -105,8 +94,8 @@ def _read_skinned(path: Path) -> ControlModel:
         # its surface in the pose of the file
         motion = glb.joint_matrices(tree, binary, skin, places)
         joint_places = np.stack([places[number] for number in joints])[:, :3, 3]
-        corners = _corners(tree, binary, glb.item(tree["meshes"], skinned[0]["mesh"]), len(joints))
-        points = glb.skinned(corners.points, corners.weights, motion)
+        points, weights, uv, faces = _corners(tree, binary, glb.item(tree["meshes"], skinned[0]["mesh"]), len(joints))
+        points = glb.skinned(points, weights, motion)
         if not np.isfinite(points).all():
             raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
         # the joint next above every joint, -1 where there is none
@@ -117,12 +106,15 @@ def _read_skinned(path: Path) -> ControlModel:
             while up is not None and up not in joints:
                 up = above.get(up)
             parents.append(-1 if up is None else joints.index(up))
-        return _control(replace(corners, points=points), joint_places, np.array(parents),
+        return _control(_welded(points, weights, uv, faces), joint_places, np.array(parents),
                         [str(glb.item(tree["nodes"], number).get("name", f"joint{number}")) for number in joints])
 
 
-def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: int) -> _Corners:
-    """All primitives of a mesh one after the other: materials do not part a control mesh."""
+def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: int
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
+    """Points (n, 3), weights (n, joints), texture coordinates (n, 2) and triangles of all primitives of a mesh, one
+    after the other: materials do not part a control mesh. Points come again where normals or texture coordinates part.
+    """
     points, weights, uv, faces, start = [], [], [], [], 0
     for primitive in mesh["primitives"]:
         if primitive.get("mode", 4) != 4:    # the mode of triangles
@@ -140,12 +132,13 @@ def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: 
         start += count
     if 0 < len(uv) < len(points):
         raise ValueError("some of its primitives have texture coordinates and some have none")
-    return _Corners(np.concatenate(points), np.concatenate(weights), np.concatenate(uv) if uv else None,
-                    np.concatenate(faces))
+    return (np.concatenate(points), np.concatenate(weights), np.concatenate(uv) if uv else None,
+            np.concatenate(faces))
 
 
-def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: list[str]) -> ControlModel:
-    mesh, weights, chart = _welded(corners)
+def _control(surface: tuple[Mesh, np.ndarray, Chart | None], places: np.ndarray, parents: np.ndarray, names: list[str]
+             ) -> ControlModel:
+    mesh, weights, chart = surface
     problem = surface_problem(mesh)
     if problem:
         raise ValueError(f"not usable as a control mesh: {problem}")
@@ -165,23 +158,24 @@ def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: 
     return control
 
 
-def _welded(corners: _Corners) -> tuple[Mesh, np.ndarray, Chart | None]:
+def _welded(points: np.ndarray, weights: np.ndarray, uv: np.ndarray | None, corners: np.ndarray
+            ) -> tuple[Mesh, np.ndarray, Chart | None]:
     """Mesh, weights and chart with one vertex at every place."""
-    _, first, place = np.unique(corners.points.astype(np.float32), axis=0, return_index=True, return_inverse=True)
+    _, first, place = np.unique(points.astype(np.float32), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))                              # vertices in the order of the file
     first, place = np.sort(first), order[place.reshape(-1)]
-    faces = place[corners.faces]
+    faces = place[corners]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    faces, at_corners = faces[whole], corners.faces[whole]
+    faces, at_corners = faces[whole], corners[whole]
     used, number = np.unique(faces, return_inverse=True)
-    mesh = Mesh(corners.points[first[used]], number.reshape(-1, 3))
+    mesh = Mesh(points[first[used]], number.reshape(-1, 3))
     chart = None
-    if corners.uv is not None:
-        rows = np.column_stack([place, np.round(corners.uv * 2**20)])
+    if uv is not None:
+        rows = np.column_stack([place, np.round(uv * 2**20)])
         _, once, row = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         kept, number = np.unique(row.reshape(-1)[at_corners], return_inverse=True)
-        chart = Chart(corners.uv[once[kept]], number.reshape(-1, 3))
-    return mesh, corners.weights[first[used]], chart
+        chart = Chart(uv[once[kept]], number.reshape(-1, 3))
+    return mesh, weights[first[used]], chart
 
 
 def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray

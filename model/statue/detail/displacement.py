@@ -62,10 +62,20 @@ def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = 
     texels, heights = found.texels, found.heights
     coverage = np.where(found.folded, FOLDED, np.where(found.known, MEASURED, HOLE)).astype(np.uint8)
     coverage[~texels.inside] = OUTSIDE
-    vectors = _vectors(control, ready, found, config.reach) if config.vectors else None
+    vectors = None
+    if config.vectors:                           # what is to be added to the heights in and around folds
+        lattice = Lattice(control, 4)
+        drawn, u = bend_over_folds(lattice, ready, found, config.reach)
+        near = np.unique(lattice.subdivision.face_parent[drawn[lattice.fine.faces].any(axis=1)])
+        which = np.flatnonzero(np.isin(texels.faces, near))
+        which = which[lattice.sample(drawn.astype(float), texels.faces[which], texels.bary[which]) > 0]
+        faces, bary = texels.faces[which], texels.bary[which]
+        more = np.zeros((len(heights), 3))
+        more[which] = (lattice.sample(u, faces, bary)
+                       - found.heights[which, None] * interpolate(control.mesh, faces, bary)[1])
+        vectors = texels.image(more.astype(np.float32))
     tell(2, 2)
-    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE),
-                           None if vectors is None else texels.image(vectors.astype(np.float32)))
+    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE), vectors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,19 +215,6 @@ def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
     """(n,) square metres of the control mesh that each pixel stands for."""
     pixel = control.chart.flat.face_areas * texels.size**2
     return (control.mesh.face_areas / np.maximum(pixel, 1e-12))[texels.faces]
-
-
-def _vectors(control: ControlModel, scan: ReadyScan, found: Heights, reach: float) -> np.ndarray:
-    """What is to be added (n, 3) to the heights of pixels in and around folds."""
-    lattice, texels = Lattice(control, 4), found.texels
-    drawn, u = bend_over_folds(lattice, scan, found, reach)
-    near = np.unique(lattice.subdivision.face_parent[drawn[lattice.fine.faces].any(axis=1)])
-    which = np.flatnonzero(np.isin(texels.faces, near))
-    which = which[lattice.sample(drawn.astype(float), texels.faces[which], texels.bary[which]) > 0]
-    faces, bary = texels.faces[which], texels.bary[which]
-    out = np.zeros((len(found.heights), 3))
-    out[which] = lattice.sample(u, faces, bary) - found.heights[which, None] * interpolate(control.mesh, faces, bary)[1]
-    return out
 
 
 def bend_over_folds(lattice: Lattice, scan: ReadyScan, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:

@@ -67,27 +67,23 @@ def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: fl
     """Heights at which points (n, 3) lie in given triangles (n,), displaced; only where these are not inverted.
     Which pair each solution is of (k,), its height (k,) in metres, its bary (k, 3).
     """
-    v = mesh.corners[faces] - points[:, None]
-    n = mesh.vertex_normals[mesh.faces[faces]]
-    pair, d = _roots(_cubic(v, n * reach))
-    w = v[pair] + (reach * d)[:, None, None] * n[pair]
-    N = np.cross(w[:, 1] - w[:, 0], w[:, 2] - w[:, 0])
-    b = np.stack([np.einsum("nd,nd->n", np.cross(w[:, i - 2], w[:, i - 1]), N) for i in range(3)], axis=1)
-    b /= np.maximum(b.sum(axis=1), 1e-300)[:, None]
-    upright = np.einsum("nd,nd->n", N, np.einsum("nc,ncd->nd", b, n[pair])) > 0
-    good = upright & (b >= -1e-9).all(axis=1)    # a little below zero is still in the triangle
-    b = np.clip(b[good], 0, None)
-    return pair[good], reach * d[good], b / b.sum(axis=1, keepdims=True)
-
-
-def _cubic(v: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """(k, 4) coefficients of det[v_r + x n_r, v_s + x n_s, v_t + x n_t], the constant first."""
     def det(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
         return np.einsum("nd,nd->n", a, np.cross(b, c))
 
-    (a, b, c), (p, q, r) = v.transpose(1, 0, 2), n.transpose(1, 0, 2)
-    return np.stack([det(a, b, c), det(p, b, c) + det(a, q, c) + det(a, b, r),
-                     det(p, q, c) + det(p, b, r) + det(a, q, r), det(p, q, r)], axis=1)
+    v = mesh.corners[faces] - points[:, None]
+    n = mesh.vertex_normals[mesh.faces[faces]]
+    # coefficients (n, 4) of det[v_r + x n_r, v_s + x n_s, v_t + x n_t], the constant first; x is the height by reach
+    (a, b, c), (p, q, r) = v.transpose(1, 0, 2), (n * reach).transpose(1, 0, 2)
+    pair, d = _roots(np.stack([det(a, b, c), det(p, b, c) + det(a, q, c) + det(a, b, r),
+                               det(p, q, c) + det(p, b, r) + det(a, q, r), det(p, q, r)], axis=1))
+    w = v[pair] + (reach * d)[:, None, None] * n[pair]
+    N = np.cross(w[:, 1] - w[:, 0], w[:, 2] - w[:, 0])
+    bary = np.stack([np.einsum("nd,nd->n", np.cross(w[:, i - 2], w[:, i - 1]), N) for i in range(3)], axis=1)
+    bary /= np.maximum(bary.sum(axis=1), 1e-300)[:, None]
+    upright = np.einsum("nd,nd->n", N, np.einsum("nc,ncd->nd", bary, n[pair])) > 0
+    good = upright & (bary >= -1e-9).all(axis=1)    # a little below zero is still in the triangle
+    bary = np.clip(bary[good], 0, None)
+    return pair[good], reach * d[good], bary / bary.sum(axis=1, keepdims=True)
 
 
 def _roots(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
