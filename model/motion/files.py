@@ -123,8 +123,8 @@ def _restored(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts
     made_for = storage.text(a, "surface_model_type", "")
     if not made_for.lower().startswith((*OURS, *FAMILY)) and made_for:
         raise StorageError(f"{path}: expected surface_model_type '{OURS[0]}', found '{made_for}'")
-    name = next((name for name in RATES if name in a), None)
-    if rate is None and name is None:
+    name = next((name for name in RATES if name in a), "")
+    if rate is None and not name:
         warnings.warn(f"{path}: it does not say its frames a second ({RATES[0]}), {USUAL_RATE:g} are assumed; "
                       "say rate=", stacklevel=3)
         rate = USUAL_RATE
