@@ -181,7 +181,8 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
         while end - start - frames * width < BLOCK and not any(data[start + (frames - 1) * width:][:width]):
             frames -= 1
     labels = [label or f"point{i}" for i, label in enumerate((_lists(parameters, "LABELS") + [""] * count)[:count])]
-    computed = {label for key in ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # among the points, but no places
+    # stored among the points, but no positions
+    computed = {label for key in ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
                 for label in parameters.get(("POINT", key), ())}
     kept = tuple(i for i, label in enumerate(labels) if label not in computed)
     described = [str(text) for text in _lists(parameters, "DESCRIPTIONS")]

@@ -229,7 +229,8 @@ def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int =
         for sequence, color, width in ((markers, "#9aa3ab", 1.3), (found.repaired, "black", 0.7)):
             off = np.linalg.norm(sequence.positions[:, sequence.labels.index(label)] - found.simulated[:, row], axis=1)
             axis.plot(times, np.clip(MM * off, 1.0, most), color=color, linewidth=width)
-        axis.set(yscale="log", ylim=(1.0, most), xlim=(0, times[-1] + step), yticks=[10, 100], yticklabels=["10", "100"])
+        axis.set(yscale="log", ylim=(1.0, most), xlim=(0, times[-1] + step), yticks=[10, 100],
+                 yticklabels=["10", "100"])
         axis.minorticks_off()
         axis.tick_params(labelsize=7)
         axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
