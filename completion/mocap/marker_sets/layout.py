@@ -136,13 +136,14 @@ class MarkerLayout:
             labels, places, distances, owners = zip(*rows, strict=True)
             loose, wands = (tuple(label for label, of in zip(labels, owners, strict=True) if of.get(kind, False))
                             for kind in ("loose", "wand"))
-            vertices, weights = places, None
+            weights = None
             if not all(isinstance(place, int) for place in places):
                 pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"])
                          for p in places]
-                vertices, weights = zip(*pairs, strict=True)
-            layout = MarkerLayout(labels, np.array(vertices), np.array(distances), weights,
-                                  dict(tree.get("aliases", {})), loose, wands)
+                places, weights = zip(*pairs, strict=True)
+            layout = MarkerLayout(labels, np.array(places), np.array(distances),
+                                  None if weights is None else np.array(weights), dict(tree.get("aliases", {})), loose,
+                                  wands)
         if n_vertices is not None:
             layout._check(n_vertices, str(path))
         return layout
