@@ -15,14 +15,13 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, stance
 from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots, Moving, Shape, Solid, render, side_by_side
+from scanprep.pictures.shading import Dots, Moving, Solid, render, side_by_side
 
 from .motion import Motion
 
 MARKER, LOST = (0.85, 0.25, 0.2), (0.78, 0.78, 0.78)
 LIGHT = 7000                         # triangles of a body in small pictures and in motion
 PLAYED, MOST_PLAYED = 30, 2000       # frames a second, and in all, that a page plays
-AT_ONCE = 128                        # frames made at a time
 TURN = 35.0                          # degrees from the front of the body where the camera stands
 
 
@@ -42,8 +41,7 @@ def facing(subject: Subject, pose: np.ndarray, vertices: np.ndarray, turn: float
 
 def worst_frames(motion: Motion, count: int) -> np.ndarray:
     """At most so many frames, in order: those with the largest mean residual, at least a quarter of a second apart."""
-    off = np.where(np.isfinite(motion.residuals), motion.residuals, 0).sum(axis=1)
-    off /= np.maximum(np.isfinite(motion.residuals).sum(axis=1), 1)
+    off = np.nan_to_num(mean_over(motion.residuals, 1))
     return frames_apart(np.argsort(-off), count, motion.rate / 4)
 
 
@@ -95,8 +93,9 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
     frames, rate = played(motion)
     light = light or LightMesh.of(subject.template)
     make = bodies or (lambda some: motion.vertices(subject, some))
-    shown = np.concatenate([make(frames[i:i + AT_ONCE])[:, light.vertex_ids].astype(np.float32)
-                            for i in range(0, len(frames), AT_ONCE)])
+    # 128 bodies are held at a time
+    shown = np.concatenate([make(frames[i:i + 128])[:, light.vertex_ids].astype(np.float32)
+                            for i in range(0, len(frames), 128)])
     vertical = upwards(motion, subject)
     middle = shown.mean(axis=1, keepdims=True) * (1 - np.abs(vertical)).astype(np.float32)
     shown -= middle
@@ -123,10 +122,9 @@ def frame_panes(motion: Motion, subject: Subject, markers: np.ndarray | None, fr
     """Some frames, the measured markers (T, L, 3), metres, as dots."""
     panes, light, vertical = [], LightMesh.of(subject.template), upwards(motion, subject)
     for t, vertices, told in zip(frames, motion.vertices(subject, frames), seconds(motion, frames), strict=True):
-        shapes: list[Shape] = [light.mesh(vertices)]
-        if markers is not None:
-            shapes.append(Dots(markers[t], MARKER, radius=0.013))
-        panes.append(Pane(shapes, facing(subject, motion.poses[t], vertices, turn, vertical), told))
+        dots = [] if markers is None else [Dots(markers[t], MARKER, radius=0.013)]
+        camera = facing(subject, motion.poses[t], vertices, turn, vertical)
+        panes.append(Pane([light.mesh(vertices), *dots], camera, told))
     return panes
 
 
@@ -185,12 +183,17 @@ def marker_rows(labels: Sequence[str], residuals: np.ndarray, soft: np.ndarray |
     return sorted(out, key=lambda row: -row[1])
 
 
-def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:
-    """A matplotlib figure: the distance of the markers from the body over time; `lost` frames shaded where wanted."""
+def chart(width: float, height: float) -> tuple[Any, Any]:
+    """A matplotlib figure of this size, inches, and its axes."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.5, 2.6))
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(width, height))
+    return figure, figure.add_subplot()
+
+
+def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:
+    """A matplotlib figure: the distance of the markers from the body over time; `lost` frames shaded where wanted."""
+    figure, axes = chart(7.5, 2.6)
     shown = np.isfinite(motion.residuals).any(axis=1)
     millimetres = 1000 * motion.residuals[shown]
     axes.fill_between(motion.times[shown], *np.nanpercentile(millimetres, [10, 90], axis=1), alpha=0.25,
@@ -211,13 +214,11 @@ def chart_states(state: np.ndarray, labels: Sequence[str], rate: float, colors: 
     Each state has a colour; of the names those that occur are shown below.
     """
     from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     steps = np.array_split(np.arange(len(state)), min(len(state), 600))
     shown = np.array([state[part].max(axis=0) for part in steps])
-    figure = Figure(figsize=(7.5, 0.6 + 0.13 * len(labels)))
-    axes = figure.add_subplot()
+    figure, axes = chart(7.5, 0.6 + 0.13 * len(labels))
     axes.imshow(shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=len(colors) - 1,
                 cmap=ListedColormap(list(colors)), extent=(0, len(state) / rate, len(labels) - 0.5, -0.5))
     axes.set_yticks(range(len(labels)), labels, fontsize=6)

@@ -21,7 +21,10 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
     """
     noise_usual, stray_usual, joined = 5.0, 4.0, 0.1        # times what is usual; seconds between spans that are one
     usual = known_median(np.linalg.norm(off - known_median(off, 0), axis=2))
-    jitter = [_jitter(off[:, i][np.isfinite(off[:, i, 0])]) for i in range(len(labels))]
+    tracks = [off[:, i][np.isfinite(off[:, i, 0])] for i in range(len(labels))]
+    # second differences, those at the ends repeated
+    jitter = [np.pad(np.linalg.norm(np.diff(track, 2, axis=0), axis=1), 1, mode="edge") if len(track) > 2
+              else np.zeros(len(track)) for track in tracks]
     known = [np.median(q) for q in jitter if len(q)]
     limit = max(config.noise, noise_usual * float(np.median(known))) if known else config.noise
     out: list[BadSpan] = []
@@ -58,13 +61,6 @@ def without_lost_limbs(spans: tuple[BadSpan, ...], near: np.ndarray, labels: tup
         if span.kind == "slipped" or (together & limb).sum() < max(3, 0.5 * limb.sum()):
             kept.append(span)
     return tuple(kept)
-
-
-def _jitter(off: np.ndarray) -> np.ndarray:
-    """Second differences (n,) of a track (n, 3), those at its ends repeated."""
-    if len(off) < 3:
-        return np.zeros(len(off))
-    return np.pad(np.linalg.norm(np.diff(off, 2, axis=0), axis=1), 1, mode="edge")
 
 
 def _noisy(jitter: np.ndarray, limit: float, rate: float) -> np.ndarray:

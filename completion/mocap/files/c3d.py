@@ -22,7 +22,6 @@ from .text import MarkerFileError, RawMarkers, distinct_labels
 
 BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
-_COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
 MOST_FRAMES = 65535                  # that the header can count: it means so many or more
 RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
@@ -124,7 +123,20 @@ def file_parameters(data: bytes, numbers: _Numbers) -> _Parameters:
         if group < 0:
             groups[-group] = name
             continue
-        values, size = _values(data, link + 2, numbers)
+        # type and dimensions, then text, stripped of blanks, or numbers
+        kind, count = struct.unpack_from("bB", data, link + 2)
+        begin = link + 4 + count
+        dims = list(data[link + 4:begin])
+        size = abs(kind) * math.prod(dims)
+        raw = data[begin:begin + size]
+        if len(raw) < size:
+            raise _Damaged("truncated: the C3D parameters end before they should")
+        values: list[Any]
+        if kind == -1:
+            width = (dims[0] if dims else 1) or 1
+            values = [raw[i:i + width].decode("latin-1").strip(" \0") for i in range(0, len(raw), width)]
+        else:
+            values = (numbers.floats(raw) if kind == 4 else numbers.words(raw, "i2" if kind == 2 else "i1")).tolist()
         found.append((group, name, values))
         room -= size
         if room < 0:
@@ -152,22 +164,6 @@ def parameter_records(data: bytes, numbers: _Numbers) -> Iterator[tuple[int, str
         place = link + step
 
 
-def _values(data: bytes, place: int, numbers: _Numbers) -> tuple[list[Any], int]:
-    """The values of one parameter, text stripped of blanks or numbers, and the bytes they take."""
-    kind, count = struct.unpack_from("bB", data, place)
-    dims = list(data[place + 2:place + 2 + count])
-    size = abs(kind) * math.prod(dims)
-    raw = data[place + 2 + count:place + 2 + count + size]
-    if len(raw) < size:
-        raise _Damaged("truncated: the C3D parameters end before they should")
-    if kind == -1:
-        width = dims[0] if dims else 1
-        return [raw[i:i + width].decode("latin-1").strip(" \0") for i in range(0, len(raw), width or 1)], size
-    if kind == 4:
-        return numbers.floats(raw).tolist(), size
-    return numbers.words(raw, {1: "i1", 2: "i2"}[kind] if kind in (1, 2) else "i1").tolist(), size
-
-
 def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTable:
     """Where the points stand, by the header, the parameters and the size of the file."""
     start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * BLOCK
@@ -185,7 +181,9 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
         while end - start - frames * width < BLOCK and not any(data[start + (frames - 1) * width:][:width]):
             frames -= 1
     labels = [label or f"point{i}" for i, label in enumerate((_lists(parameters, "LABELS") + [""] * count)[:count])]
-    computed = {label for key in _COMPUTED for label in parameters.get(("POINT", key), ())}
+    # stored among the points, but no positions
+    computed = {label for key in ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
+                for label in parameters.get(("POINT", key), ())}
     kept = tuple(i for i, label in enumerate(labels) if label not in computed)
     described = [str(text) for text in _lists(parameters, "DESCRIPTIONS")]
     names, twice = distinct_labels(labels, described)
@@ -206,7 +204,13 @@ def _counts(data: bytes, parameters: _Parameters, numbers: _Numbers, scale: floa
     """
     _, header_count, header_analog, first, last = (int(n) for n in numbers.words(data[:10], "u2"))
     counts = list(dict.fromkeys([header_count, *_whole(parameters, "POINT", "USED")]))
-    analogs = list(dict.fromkeys([header_analog, *_analog(data, parameters, numbers)]))
+    # analog values a frame are channels times samples of each
+    samples = [int(numbers.words(data[18:20], "u2")[0])]
+    rates = [parameters.get((group, "RATE"), [0.0])[0] for group in ("ANALOG", "POINT")]
+    if all(isinstance(rate, float | int) and 0 < rate < np.inf for rate in rates):
+        samples.append(round(rates[0] / rates[1]))
+    channels = _whole(parameters, "ANALOG", "USED")
+    analogs = list(dict.fromkeys([header_analog, *(each * one for each in channels for one in samples)]))
     own = float(next(iter(parameters.get(("POINT", "SCALE"), ())), scale))
     sizes = list(dict.fromkeys([4 if scale < 0 else 2, 4 if own < 0 else 2]))
     if not any(counts):
@@ -247,15 +251,6 @@ def rotations_start(parameters: _Parameters, start: int, size: int) -> int:
 def _whole(parameters: _Parameters, group: str, name: str) -> list[int]:
     """The first value of a parameter as a count, if it is there."""
     return [int(value) & 0xFFFF for value in parameters.get((group, name), ())[:1] if isinstance(value, float | int)]
-
-
-def _analog(data: bytes, parameters: _Parameters, numbers: _Numbers) -> list[int]:
-    """Analog values a frame by what is said besides their number: channels times samples of each."""
-    samples = [int(numbers.words(data[18:20], "u2")[0])]
-    rates = [parameters.get((group, "RATE"), [0.0])[0] for group in ("ANALOG", "POINT")]
-    if all(isinstance(rate, float | int) and 0 < rate < np.inf for rate in rates):
-        samples.append(round(rates[0] / rates[1]))
-    return [channels * each for channels in _whole(parameters, "ANALOG", "USED") for each in samples]
 
 
 def _frames(parameters: _Parameters, first: int, last: int, room: int) -> list[int]:

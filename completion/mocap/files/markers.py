@@ -153,8 +153,17 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
         most = Counter(label.rpartition(":")[0] for label in raw.labels if ":" in label).most_common(1)[0][0]
         notes.append(f"the labels of {', '.join(together[0])} are taken as those of one person; those of one only are "
                      f"taken with subject_prefix={most}")
-    places, filled = _without_fill(raw.positions[:, columns])
-    for note in (*notes, *filled):
+    # not seen: 0 0 0, or one number three times, as 9999999, that lies beyond all places
+    places = raw.positions[:, columns]
+    places = np.where((places == 0).all(axis=2, keepdims=True), np.nan, places)
+    same = (places == places[..., :1]).all(axis=2)
+    others = np.abs(places[~same & np.isfinite(places).all(axis=2)])
+    fill = same & (np.abs(places[..., 0]) > others.max(initial=0)) & bool(others.size)
+    if fill.any():
+        values = ", ".join(f"{value:.9g}" for value in np.unique(places[fill, 0])[:3])
+        notes.append(f"{number_of(int(fill.sum()), 'position')} of {values} three times taken as missing")
+        places = np.where(fill[..., None], np.nan, places)
+    for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=2)
     positions = UNITS[own_unit] * places
     if (np.abs(positions) > FARTHEST).any():
@@ -164,21 +173,6 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
         return MarkerSequence(positions, labels, rate or raw.rate or usual_rate or 0.0)
     except ValueError as error:
         raise MarkerFileError(f"{path}: {error}") from None
-
-
-def _without_fill(places: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Places (T, L, 3) with NaN for what stands where a marker was not seen: 0 0 0, or one number three times, as
-    9999999, that lies beyond all places; and a note of the latter.
-    """
-    places = np.where((places == 0).all(axis=2, keepdims=True), np.nan, places)
-    same = (places == places[..., :1]).all(axis=2)
-    others = np.abs(places[~same & np.isfinite(places).all(axis=2)])
-    fill = same & (np.abs(places[..., 0]) > others.max(initial=0)) & bool(others.size)
-    if not fill.any():
-        return places, []
-    values = ", ".join(f"{value:.9g}" for value in np.unique(places[fill, 0])[:3])
-    return np.where(fill[..., None], np.nan, places), [
-        f"{number_of(int(fill.sum()), 'position')} of {values} three times taken as missing"]
 
 
 def marker_subjects(path: str | Path) -> tuple[str, ...]:

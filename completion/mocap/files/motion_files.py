@@ -20,10 +20,9 @@ from scanprep.pictures.camera import upright
 
 from ...motion import Motion
 from .markers import MarkerSequence
-from .opensim import guessed_angles, known_centres, write_opensim
+from .opensim import known_centres, write_opensim
 
 KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
-MEASURED = 40                        # frames in which it is compared with the exact bodies
 
 
 def joint_angles(motion: Motion) -> np.ndarray:
@@ -56,7 +55,7 @@ def write_motion(folder: Path, motion: Motion, subject: Subject, markers: Marker
     skeleton, T, centres = subject.skeleton, len(motion.poses), joint_centres(motion, subject)
     names, angles = skeleton.names, joint_angles(motion)
     if told is not None:
-        angles[:, guessed_angles(skeleton, told)] = np.nan
+        angles[:, ~(told & told[np.maximum(skeleton.parents, 0)])] = np.nan     # a guess if either side of it is one
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
     write_table(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
@@ -96,7 +95,7 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
     else:
         extra = body_correctives(rig, motion.poses, motion.trans, bodies, spread_indices(T, KEYS))
     rig = replace(rig, mesh=replace(rig.mesh, colors=colors), correctives=extra)
-    up, measured = upright(subject.template)[0], spread_indices(T, MEASURED)
+    up, measured = upright(subject.template)[0], spread_indices(T, 40)      # compared with the exact bodies
     exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
     off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
     write_skinned_glb(path, aimed(rig, up), motion.poses, motion.trans, motion.rate, up)

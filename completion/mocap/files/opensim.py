@@ -78,11 +78,6 @@ def known_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | No
     return np.where((told | told[np.maximum(skeleton.parents, 0)])[:, None], centres, np.nan)
 
 
-def guessed_angles(skeleton: Skeleton, told: np.ndarray) -> np.ndarray:
-    """(J,) bool: joints whose angles are guesses, for parts `told` (J,) of which the markers tell."""
-    return ~(told & told[np.maximum(skeleton.parents, 0)])
-
-
 def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
     """(J - 1) names of the joints but the root's."""
     sided = {j: f"{role[2:]}_{role[0]}_joint" for role, j in

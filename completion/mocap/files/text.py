@@ -18,7 +18,6 @@ from scanprep.geometry.storage import StorageError
 from scanprep.words import number_of
 
 Rows = Sequence[tuple[int, Sequence[str]]]           # number and cells of each line of a table
-MOST_TOLD = 6                        # labels in one note
 
 
 class MarkerFileError(StorageError):
@@ -63,8 +62,8 @@ def distinct_labels(labels: Sequence[str], descriptions: Sequence[str] = ()) -> 
         out.append(name)
     if not changed:
         return tuple(out), ()
-    more = f" and {len(changed) - MOST_TOLD} more" if len(changed) > MOST_TOLD else ""
-    return tuple(out), (f"labels come again: {', '.join(changed[:MOST_TOLD])}{more}",)
+    more = f" and {len(changed) - 6} more" if len(changed) > 6 else ""
+    return tuple(out), (f"labels come again: {', '.join(changed[:6])}{more}",)
 
 
 def read_trc(path: Path, data: bytes) -> RawMarkers:

@@ -1,10 +1,12 @@
 """Symmetric places for markers, spread over the skin, of which a marker set may be chosen."""
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import coo_array, diags_array
+from scipy.spatial import cKDTree
 
 from model.fitting.bodies import at_rest
 from scanprep.geometry.geodesics import SurfaceGraph
@@ -18,8 +20,6 @@ from ..marker_sets.symmetry import SkinMirror, find_skin_mirror
 
 if TYPE_CHECKING:
     from model.body import BodyModel
-
-RAYS = 48                            # directions that are tried from every place
 
 
 def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 114,
@@ -84,13 +84,31 @@ def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.nda
     along = body.vertices @ axis
     near_end = np.minimum(along - along.min(), along.max() - along) < 0.025 * length
     at_end = near_end & (np.abs(body.vertex_normals @ axis) > 0.5)    # the soles and the crown face outwards there
-    reach = 0.06 * length                                             # skin that is nearer hides a marker from cameras
-    around = _around(body, thick * length)
-    flatness = np.einsum("nd,nd->n", body.vertex_normals, around @ body.vertex_normals)
-    # in armpits, the crotch and between fingers less than three quarters of the directions outwards are free
-    closed = np.flatnonzero(around @ _openness(body, reach) < 0.75)
+    reach, normals = 0.06 * length, body.vertex_normals               # skin that is nearer hides a marker from cameras
+
+    # weights (N, N) of the vertices around every vertex, by their areas
+    i, j = cKDTree(body.vertices).query_pairs(thick * length, output_type="ndarray").T
+    each = np.arange(len(body.vertices))
+    i, j = np.r_[i, j, each], np.r_[j, i, each]
+    near = coo_array((body.vertex_areas[j], (i, j)), shape=(len(each), len(each))).tocsr()
+    around = diags_array(1 / np.maximum(near.sum(axis=1), 1e-30)) @ near
+    flatness = np.einsum("nd,nd->n", normals, around @ normals)
+
+    # directions outwards, those along the normal weigh more: as many as the skin there sees of a lit sky; in armpits,
+    # the crotch and between fingers less than three quarters of them are free
+    rays, n = Rays(body), 48
+    origins, directions = _fans(body, np.sqrt((np.arange(n) + 0.5) / n))
+    lifted = origins + 1e-4 * reach * np.repeat(normals, n, axis=0)
+    openness = 1 - rays.occluded(lifted, directions, reach).reshape(-1, n).mean(axis=1)
+    closed = np.flatnonzero(around @ openness < 0.75)
     away = SurfaceGraph(body).nearest(closed)[0] if len(closed) else np.inf
-    return (away > 0.035 * length) & (_thickness(body, reach) >= thick * length) & (flatness >= 0.75) & ~at_end
+
+    # thickness: the median of a third as many directions inwards, to the skin on the other side, at most the reach
+    n = 16
+    origins, directions = _fans(body, 1 - (1 - 0.5) * (np.arange(n) + 0.5) / n)
+    hit = rays.cast(origins - 1e-4 * reach * np.repeat(normals, n, axis=0), -directions, reach)[1]
+    thickness = np.median(np.minimum(np.where(np.isfinite(hit), hit, reach), reach).reshape(-1, n), axis=1)
+    return (away > 0.035 * length) & (thickness >= thick * length) & (flatness >= 0.75) & ~at_end
 
 
 def _spread(body: Mesh, mirror: SkinMirror, across: np.ndarray, count: int, taken: np.ndarray
@@ -122,15 +140,13 @@ def _spread(body: Mesh, mirror: SkinMirror, across: np.ndarray, count: int, take
 def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]]) -> list[str]:
     """Labels of new markers: side, part, number."""
     parts = None if skeleton is None else skeleton.part_of_vertex(body)
-    counts: dict[str, int] = {}
-    labels = []
+    counts, labels = Counter[str](), list[str]()
     for place in places:
-        stem = ""
+        stem, sides = "", "M" if len(place) == 1 else "LR"
         if skeleton is not None and parts is not None:
             stem = split_side(skeleton.names[parts[place[0]]])[0].replace(".", "_").upper() + "."
-        key = f"{'M' if len(place) == 1 else 'LR'}.{stem}"
-        counts[key] = counts.get(key, 0) + 1
-        labels += [f"{side}.{stem}{counts[key]}" for side in ("M" if len(place) == 1 else "LR")]
+        counts[sides + stem] += 1
+        labels += [f"{side}.{stem}{counts[sides + stem]}" for side in sides]
     return labels
 
 
@@ -144,28 +160,8 @@ def _long_axis(body: Mesh, mirror: SkinMirror) -> tuple[np.ndarray, float]:
     return axis, float(np.ptp(body.vertices @ axis))
 
 
-def _openness(body: Mesh, reach: float) -> np.ndarray:
-    """(N,) the share of the directions outwards in which no skin is within reach, those along the normal weigh more."""
-    origins, directions = _fans(body)
-    rays = Rays(body)
-    lifted = origins + 1e-4 * reach * np.repeat(body.vertex_normals, RAYS, axis=0)
-    return 1 - rays.occluded(lifted, directions, reach).reshape(-1, RAYS).mean(axis=1)
-
-
-def _thickness(body: Mesh, reach: float) -> np.ndarray:
-    """(N,) how far the skin on the other side is, metres: the median of directions inwards, at most `reach`."""
-    k = np.arange(RAYS // 3)
-    z = 1 - (1 - 0.5) * (k + 0.5) / len(k)  # cosine of the directions inwards along which thickness is measured
-    origins, directions = _fans(body, z)
-    inward = np.repeat(body.vertex_normals, len(k), axis=0)
-    hit = Rays(body).cast(origins - 1e-4 * reach * inward, -directions, reach)[1]
-    return np.median(np.minimum(np.where(np.isfinite(hit), hit, reach), reach).reshape(-1, len(k)), axis=1)
-
-
-def _fans(body: Mesh, z: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _fans(body: Mesh, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions (N·n, 3) about the normal of every vertex; `z` (n,) their cosines with it."""
-    if z is None:
-        z = np.sqrt((np.arange(RAYS) + 0.5) / RAYS)                  # as many as the skin there sees of a lit sky
     turn = np.arange(len(z)) * np.pi * (3 - np.sqrt(5))
     local = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
     n, neighbour = body.vertex_normals, np.zeros(len(body.vertices), dtype=np.int64)
@@ -175,14 +171,3 @@ def _fans(body: Mesh, z: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarr
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     frames = np.stack([first, np.cross(n, first), n], axis=1)
     return np.repeat(body.vertices, len(z), axis=0), np.einsum("kc,ncd->nkd", local, frames).reshape(-1, 3)
-
-
-def _around(body: Mesh, radius: float) -> csr_array:
-    """(N, N) weights of the vertices within a radius of every vertex, by their areas; rows sum to 1."""
-    from scipy.spatial import cKDTree
-
-    i, j = cKDTree(body.vertices).query_pairs(radius, output_type="ndarray").T
-    each = np.arange(len(body.vertices))
-    i, j = np.r_[i, j, each], np.r_[j, i, each]
-    near = coo_array((body.vertex_areas[j], (i, j)), shape=(len(each), len(each))).tocsr()
-    return diags_array(1 / np.maximum(near.sum(axis=1), 1e-30)) @ near

@@ -26,9 +26,7 @@ def symmetric_groups(labels: Sequence[str], partners: np.ndarray | None = None) 
 
 
 Groups = Sequence[tuple[int, ...]]
-State = tuple[np.ndarray, ...]
 ADD, REMOVE = 1, -1
-LEAST_GAIN = 1e-6                    # share of the mean squared distance below which nothing is exchanged
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +129,11 @@ class MarkerSets:
         self._C -= sign * (np.swapaxes(U, -1, -2) @ M @ U)
         self.inside[group] = sign == ADD
 
-    def state(self) -> State:
+    def state(self) -> tuple[np.ndarray, ...]:
         """What `put_back` takes to undo steps: updates there and back again would lose digits."""
         return tuple(a.copy() for a in (self.inside, self.costs, self._C, self._S, self._F, self._rho, self._q))
 
-    def put_back(self, state: State) -> None:
+    def put_back(self, state: tuple[np.ndarray, ...]) -> None:
         """Be again what it was; the state is used up."""
         self.inside, self.costs, self._C, self._S, self._F, self._rho, self._q = state
 
@@ -191,13 +189,13 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
 
 def _exchanged(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
     """Let groups of the set go for what serves best in their place; put them back where nothing is better."""
-    before, cost = sets.state(), sets.costs.mean()
+    before, enough = sets.state(), sets.costs.mean() * (1 - 1e-6)    # nothing is exchanged for a millionth less
     for group in out:
         sets.take(group, REMOVE)
     new = _filled(sets, movable, int(sets.sizes[out].sum()))
-    if set(new) != set(out) and sets.costs.mean() < cost * (1 - LEAST_GAIN):
+    if set(new) != set(out) and sets.costs.mean() < enough:
         sets.renew()
-        if sets.costs.mean() < cost * (1 - LEAST_GAIN):
+        if sets.costs.mean() < enough:
             return True
     sets.put_back(before)
     return False

@@ -1,7 +1,7 @@
 """Bodies estimated from markers, linearised around the fit to their whole surface."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,21 +86,35 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
     if not candidates.labels or most >= N:
         raise ValueError(f"candidates: expected markers on vertices 0..{N - 1}, got {len(candidates.labels)} markers "
                          f"up to vertex {most}")
-    tell = progress or (lambda done, total: None)
-    template, total = model.template.vertices, 2 * len(bodies)
+    tell, template, sd = progress or (lambda done, total: None), model.template.vertices, config.marker_sd
     few = spread_vertices(template, 400)  # vertices that stand for all of them in the first fit to each whole body
-    weights = share_of_vertices(template, few) * len(few) / (len(template) * config.marker_sd**2)
+    weights = share_of_vertices(template, few) * len(few) / (len(template) * sd**2)
     start = rough_poses(model, bodies, n_betas)
     x = fit_points(BodyPoints(model.points(few, None, n_betas)), bodies[:, few], weights,
-                   prior_around(model, start), start, FIT_ITERATIONS, lambda done: tell(done, total))
+                   prior_around(model, start), start, FIT_ITERATIONS, lambda done: tell(done, 2 * len(bodies)))
     ids, shares = candidates.skin
     markers, prior = BodyPoints(model.points(ids, shares, n_betas)), prior_around(model, x)
     places = np.einsum("lk,zlkd->zld", shares, bodies[:, ids])
-    some = spread_vertices(template, config.surface)
-    surface = BodyPoints(model.points(some, None, n_betas))
-    share = share_of_vertices(template, some) / len(template)
-    linear = _linearised(x, markers, places, surface, bodies[:, some], share, prior, config.marker_sd,
-                         lambda done: tell(len(bodies) + done, total))
+
+    # linearised: points of the surface (L) stand for shares (L,) of it
+    spread = spread_vertices(template, config.surface)
+    surface = BodyPoints(model.points(spread, None, n_betas))
+    root = np.sqrt(share_of_vertices(template, spread) / len(template))[:, None]
+    (Z, P), C = x.shape, markers.count
+    rows, gaps = np.empty((Z, C, 3, P)), np.empty((Z, C, 3))
+    gram, pull, rest = np.empty((Z, P, P)), np.empty((Z, P)), np.empty(Z)
+    size = min(surface.batch, markers.batch)
+    for begin in range(0, Z, size):
+        some = slice(begin, begin + size)
+        at = markers.follow(x[some])
+        rows[some], gaps[some] = at.jacobian / sd, (places[some] - at.positions) / sd
+        at = surface.follow(x[some])
+        J = (root[..., None] * at.jacobian).reshape(len(at.positions), -1, P)
+        e = (root * (bodies[some][:, spread] - at.positions)).reshape(len(J), -1, 1)
+        transposed = np.swapaxes(J, -1, -2)
+        gram[some], pull[some], rest[some] = transposed @ J, (transposed @ e)[..., 0], (e**2).sum(axis=(1, 2))
+        tell(Z + min(begin + size, Z), 2 * Z)
+    linear = LinearBodies(rows, gaps, gram, pull, rest, prior.precision, (prior.mean - x) @ prior.precision)
     return WholeFits(x, markers, places, prior, linear)
 
 
@@ -112,27 +126,6 @@ def check_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     if bodies.ndim != 3 or not len(bodies) or bodies.shape[1:] != wanted or not np.isfinite(bodies).all():
         raise ValueError(f"bodies: expected finite numbers of shape (Z, {wanted[0]}, 3), got shape {bodies.shape}")
     return bodies
-
-
-def _linearised(x: np.ndarray, markers: BodyPoints, places: np.ndarray, surface: BodyPoints, targets: np.ndarray,
-                share: np.ndarray, prior: Prior, sd: float, tell: Callable[[int], None]) -> LinearBodies:
-    """`LinearBodies` at x (Z, P); the surface's points (L) stand for shares (L,) of it."""
-    (Z, P), C, root = x.shape, markers.count, np.sqrt(share)[:, None]
-    rows, gaps = np.empty((Z, C, 3, P)), np.empty((Z, C, 3))
-    gram, pull, rest = np.empty((Z, P, P)), np.empty((Z, P)), np.empty(Z)
-    size = min(surface.batch, markers.batch)
-    for begin in range(0, Z, size):
-        some = slice(begin, begin + size)
-        at = markers.follow(x[some])
-        rows[some], gaps[some] = at.jacobian / sd, (places[some] - at.positions) / sd
-        at = surface.follow(x[some])
-        J = (root[..., None] * at.jacobian).reshape(len(at.positions), -1, P)
-        e = (root * (targets[some] - at.positions)).reshape(len(J), -1, 1)
-        transposed = np.swapaxes(J, -1, -2)
-        gram[some], pull[some], rest[some] = transposed @ J, (transposed @ e)[..., 0], (e**2).sum(axis=(1, 2))
-        tell(min(begin + size, Z))
-    lean = (prior.mean - x) @ prior.precision
-    return LinearBodies(rows, gaps, gram, pull, rest, prior.precision, lean)
 
 
 def shared_shape(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas: int) -> LinearBodies:
@@ -187,14 +180,13 @@ def example_poses(model: BodyModel, count: int) -> np.ndarray:
 
 
 def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,
-             progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+             progress: Progress | None = None) -> np.ndarray:
     """Each registered body (Z, N, 3), metres, with its own full shape, in poses (F, J, 3): (Z, F, N, 3) float32."""
     bodies = check_bodies(model, bodies)
     poses, _ = check_pose(model.skeleton, poses, None)
-    fitter = ShapeFitter(model, FitConfig(polish=0))
+    fitter, tell = ShapeFitter(model, FitConfig(polish=0)), progress or (lambda done, total: None)
     out = np.empty((len(bodies), len(poses), *bodies.shape[1:]), dtype=np.float32)
     for i, body in enumerate(np.asarray(bodies, dtype=np.float64)):
         out[i] = own_body(model, body, fitter.fit(body)).subject.vertices(poses)
-        if progress is not None:
-            progress(i + 1, len(bodies))
+        tell(i + 1, len(bodies))
     return out

@@ -116,7 +116,34 @@ class MarkerLayout:
         path = Path(path)
         tree = storage.read_json(path, "a marker layout", MarkerFileError)
         with storage.taking_apart(path, "a whole marker layout", MarkerFileError):
-            layout = _restored(path, tree)
+            sets = tree.get("markersets") if isinstance(tree, Mapping) else None
+            if not isinstance(sets, list):
+                raise MarkerFileError(f'{path}: expected a marker layout {{"markersets": [...]}}, '
+                                      "found something else")
+            rows = []
+            for markers in sets:
+                indices = markers.get("indices") if isinstance(markers, Mapping) else None
+                distance = markers.get("distance_from_skin", DISTANCE) if isinstance(markers, Mapping) else None
+                if not isinstance(indices, Mapping) or not isinstance(distance, int | float):
+                    raise MarkerFileError(f"{path}: expected marker sets with 'indices' {{label: vertex}} and a number "
+                                          f"'distance_from_skin'")
+                for label, place in indices.items():
+                    if isinstance(place, bool) or not isinstance(place, int | Mapping):
+                        raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {str(place)[:40]!r}")
+                    rows.append((label, place, float(distance), markers))
+            if not rows:
+                raise MarkerFileError(f"{path}: expected markers in the layout, found none")
+            labels, places, distances, owners = zip(*rows, strict=True)
+            loose, wands = (tuple(label for label, of in zip(labels, owners, strict=True) if of.get(kind, False))
+                            for kind in ("loose", "wand"))
+            weights = None
+            if not all(isinstance(place, int) for place in places):
+                pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"])
+                         for p in places]
+                places, weights = zip(*pairs, strict=True)
+            layout = MarkerLayout(labels, np.array(places), np.array(distances),
+                                  None if weights is None else np.array(weights), dict(tree.get("aliases", {})), loose,
+                                  wands)
         if n_vertices is not None:
             layout._check(n_vertices, str(path))
         return layout
@@ -252,32 +279,3 @@ class MarkerLayout:
 def _plain(label: str) -> str:
     """A label without case, dots, blanks, dashes and underscores."""
     return re.sub(r"[ ._-]", "", label).upper()
-
-
-def _restored(path: Path, tree: Any) -> MarkerLayout:
-    """The layout of a file."""
-    sets = tree.get("markersets") if isinstance(tree, Mapping) else None
-    if not isinstance(sets, list):
-        raise MarkerFileError(f"{path}: expected a marker layout {{\"markersets\": [...]}}, found something else")
-    rows = []
-    for markers in sets:
-        indices = markers.get("indices") if isinstance(markers, Mapping) else None
-        distance = markers.get("distance_from_skin", DISTANCE) if isinstance(markers, Mapping) else None
-        if not isinstance(indices, Mapping) or not isinstance(distance, int | float):
-            raise MarkerFileError(f"{path}: expected marker sets with 'indices' {{label: vertex}} and a number "
-                                  f"'distance_from_skin'")
-        for label, place in indices.items():
-            if isinstance(place, bool) or not isinstance(place, int | Mapping):
-                raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {str(place)[:40]!r}")
-            rows.append((label, place, float(distance), markers))
-    if not rows:
-        raise MarkerFileError(f"{path}: expected markers in the layout, found none")
-    labels, places, distances, owners = zip(*rows, strict=True)
-    loose, wands = (tuple(label for label, of in zip(labels, owners, strict=True) if of.get(kind, False))
-                    for kind in ("loose", "wand"))
-    vertices, weights = places, None
-    if not all(isinstance(place, int) for place in places):
-        pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"]) for p in places]
-        vertices, weights = zip(*pairs, strict=True)
-    return MarkerLayout(labels, np.array(vertices), np.array(distances), None if weights is None else np.array(weights),
-                        dict(tree.get("aliases", {})), loose, wands)

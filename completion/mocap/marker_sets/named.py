@@ -21,7 +21,6 @@ from ..files.text import MarkerFileError
 from .layout import MarkerLayout
 
 FEWEST = 3                           # labels by which a marker set is known
-OFF = 0.015                          # of the template's size: farthest from it that a clicked marker may be
 FOLDER = Path(__file__).parent / "layouts"
 OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {LABEL: VERTEX, ...}}]} '
        "and load it with MarkerLayout.load (--layout FILE)")
@@ -121,7 +120,12 @@ def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[s
 
 
 def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
-    """The layout for a body that is named, or in a file: a layout, or places that were clicked on the template."""
+    """The layout for a body that is named, or in a file: a layout, or places that were clicked on the template.
+
+    Such as `scape pick` saves; MarkerFileError for places that are not on the template.
+
+    [SCAPE] §8
+    """
     named = layout_or_file(given)
     if isinstance(named, str):
         return named_layout(named, template, kept)
@@ -130,20 +134,12 @@ def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = Non
         tree = storage.read_json(named, "a marker layout", MarkerFileError)
         clicked = isinstance(tree, dict) and bool(tree) and "markersets" not in tree and all(
             isinstance(place, list | int) or (isinstance(place, dict) and "face" in place) for place in tree.values())
-    return clicked_layout(named, template) if clicked else MarkerLayout.load(named, len(template.vertices))
-
-
-def clicked_layout(path: Path, template: Mesh) -> MarkerLayout:
-    """Markers where somebody clicked them on the template of the model, as `scape pick` saves them.
-
-    MarkerFileError for places that are not on it.
-
-    [SCAPE] §8
-    """
-    layout, distances = layout_on(template, read_landmarks(path, template))
+    if not clicked:
+        return MarkerLayout.load(named, len(template.vertices))
+    layout, distances = layout_on(template, read_landmarks(named, template))
     far = distances.argmax()
-    if distances[far] > OFF * size(template):
-        raise MarkerFileError(f"{path}: expected places on the model's template, '{layout.labels[far]}' is "
+    if distances[far] > 0.015 * size(template):                        # a click is that much off the skin at most
+        raise MarkerFileError(f"{named}: expected places on the model's template, '{layout.labels[far]}' is "
                               f"{1000 * distances[far]:.0f} mm off it; click them on the template")
     return layout
 

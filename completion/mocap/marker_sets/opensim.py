@@ -11,14 +11,7 @@ from scanprep.skeleton.tree import Skeleton
 from .layout import MarkerLayout
 from .symmetry import label_pairs
 
-# Bodies of OpenSim's models begin at the joints, but for these: by the axes x ahead, y up, z right and for hips that
-# are `_HIPS` apart, metres, as in its model gait2392
-_HIPS = 0.167
-_PELVIS = (0.0707, 0.0661, 0.0)      # between the front spines, from the middle of the hips
-_TORSO = (-0.1007, 0.0815, 0.0)      # the lowest lumbar joint, from there
-_HEEL = (-0.0488, -0.0420, 0.0)      # from the ankle
 _LIMBS = {"humerus": "ulna", "ulna": "hand", "femur": "tibia", "tibia": "calcn"}      # y of each points back from these
-_ORDER = ("pelvis", "torso", "femur", "humerus", "tibia", "ulna", "calcn", "hand")
 _WITH = {"head": "torso"}            # bodies that most models do not have
 
 
@@ -37,14 +30,20 @@ def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dic
     named = names_of(skeleton, "opensim")
     frames = _frames({name: skeleton.joints[skeleton.names.index(part)] for part, name in named.items()
                       if name not in _WITH}, *stance(body))
-    parts = skeleton.part_of_vertex(body)[layout.nearest]
-    carriers = [_carrier(skeleton, named, frames, int(part)) for part in parts]
-    found = {}
+    # the body of OpenSim that a part belongs to: its own, or that of the first part above it which has one
+    carriers, found = list[str](), {}
+    for part in skeleton.part_of_vertex(body)[layout.nearest].tolist():
+        name = ""
+        while part >= 0 and name not in frames:
+            name = named.get(skeleton.names[part], "")
+            name, part = _WITH.get(name, name), int(skeleton.parents[part])
+        carriers.append(name if name in frames else "torso")
+    order = ("pelvis", "torso", "femur", "humerus", "tibia", "ulna", "calcn", "hand")
     for i, (label, place, other) in enumerate(zip(layout.labels, layout.place(body), label_pairs(layout.labels),
                                                   strict=True)):
         kind, _, side = carriers[i].partition("_")
         partner = carriers[other].partition("_")[0] if other >= 0 else kind
-        kind = min(kind, partner, key=_ORDER.index)          # of a pair at a joint, the one that is nearer the root
+        kind = min(kind, partner, key=order.index)           # of a pair at a joint, the one that is nearer the root
         name = kind if kind in frames else f"{kind}_{side}"
         origin, axes = frames[name]
         found[label] = f"/bodyset/{name}", axes.T @ (place - origin)
@@ -56,15 +55,17 @@ def _frames(joints: dict[str, np.ndarray], vertical: np.ndarray, ahead: np.ndarr
     """Origin (3,), metres, and axes (3, 3) as columns of every body."""
     if not {"femur_l", "femur_r", "pelvis"} <= joints.keys():
         raise ValueError(f"skeleton: expected a pelvis and two thighs, as OpenSim's bodies, got {', '.join(joints)}")
+    # bodies of OpenSim's models begin at the joints, but for pelvis, torso and heel: places by the axes x ahead, y up,
+    # z right and for hips that are 0.167 m apart, as in its model gait2392
+    scale = float(np.linalg.norm(joints["femur_l"] - joints["femur_r"])) / 0.167
     upright = np.column_stack([ahead, vertical, np.cross(ahead, vertical)])
-    hips = (joints["femur_l"] + joints["femur_r"]) / 2
-    scale = float(np.linalg.norm(joints["femur_l"] - joints["femur_r"])) / _HIPS
-    pelvis = hips + scale * upright @ _PELVIS
-    found = {"pelvis": (pelvis, upright), "torso": (pelvis + scale * upright @ _TORSO, upright)}
+    # between the front spines, from the middle of the hips; the lowest lumbar joint from there
+    pelvis = (joints["femur_l"] + joints["femur_r"]) / 2 + scale * upright @ (0.0707, 0.0661, 0.0)
+    found = {"pelvis": (pelvis, upright), "torso": (pelvis + scale * upright @ (-0.1007, 0.0815, 0.0), upright)}
     for name, joint in joints.items():
         kind, _, side = name.partition("_")
         if kind == "calcn":
-            found[name] = joint + scale * upright @ _HEEL, upright
+            found[name] = joint + scale * upright @ (-0.0488, -0.0420, 0.0), upright
         elif f"{_LIMBS.get(kind)}_{side}" in joints:
             found[name] = joint, _along(joint - joints[f"{_LIMBS[kind]}_{side}"], vertical, ahead)
         elif kind == "hand":
@@ -79,14 +80,3 @@ def _along(y: np.ndarray, vertical: np.ndarray, ahead: np.ndarray) -> np.ndarray
     x = x - (x @ y) * y
     x /= np.linalg.norm(x)
     return np.column_stack([x, y, np.cross(x, y)])
-
-
-def _carrier(skeleton: Skeleton, named: dict[str, str], frames: dict[str, tuple[np.ndarray, np.ndarray]], part: int
-             ) -> str:
-    """The body of OpenSim that a part belongs to: its own, or that of the first part above it which has one."""
-    while part >= 0:
-        name = named.get(skeleton.names[part], "")
-        if (name := _WITH.get(name, name)) in frames:
-            return name
-        part = int(skeleton.parents[part])
-    return "torso"

@@ -8,11 +8,11 @@ import numpy as np
 
 from scanprep.correspondence.correlated import find_correspondences
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface
-from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 
 from .layout import MarkerLayout
+from .named import layout_on
 
 UNCERTAIN = 0.05                      # a limb may be wrong
 Landmarks = tuple[np.ndarray, np.ndarray]
@@ -83,24 +83,19 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
     if np.array_equal(source.faces, target.faces):
         L = len(layout.labels)
         return TransferredLayout(layout, np.zeros(L), np.ones(L), 0.0, np.nan, 0.0, target)
-    fit = _registered(source, target, landmarks, config or RegistrationConfig(), search,
-                      progress or (lambda done, total: None))
+    config, tell = config or RegistrationConfig(), progress or (lambda done, total: None)
+    if landmarks is not None or not search:
+        fit = register(source, target, landmarks, config, tell)
+    else:
+        # by places that look alike; where they leave much of the target, as both stand
+        fit = register(source, target, None, config, tell, find_correspondences(source, target))
+        if fit.uncovered > UNCERTAIN:
+            fit = min(fit, register(source, target, None, config, tell), key=lambda one: one.uncovered)
     if fit.uncovered > 0.3:  # of the target that the source does not cover: it is somewhere else
         raise ValueError(f"target: the source could not be brought onto it, {fit.uncovered:.0%} of it stays uncovered; "
                          "give landmarks, three at least, spread over the body")
-    found = Surface(target).closest(layout.skin_points(fit.mesh.vertices))
-    inside = np.clip(found.bary, 0.0, 1.0)                            # without the last digits outside of the triangle
-    there = replace(layout, vertices=target.faces[found.faces], weights=inside / inside.sum(axis=1, keepdims=True))
-    return TransferredLayout(there, found.distances, fit.confidence[layout.nearest], fit.rms, fit.landmark_rms,
+    places = dict(zip(layout.labels, layout.skin_points(fit.mesh.vertices), strict=True))
+    found, distances = layout_on(target, places)
+    there = replace(layout, vertices=found.vertices, weights=found.weights)
+    return TransferredLayout(there, distances, fit.confidence[layout.nearest], fit.rms, fit.landmark_rms,
                              fit.uncovered, fit.mesh)
-
-
-def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config: RegistrationConfig, search: bool,
-                tell: Callable[[int, int], None]) -> Registration:
-    """By landmarks; else by places that look alike, and where that leaves much of the target, as both stand."""
-    if landmarks is not None or not search:
-        return register(source, target, landmarks, config, tell)
-    alike = register(source, target, None, config, tell, find_correspondences(source, target))
-    if alike.uncovered <= UNCERTAIN:
-        return alike
-    return min(alike, register(source, target, None, config, tell), key=lambda fit: fit.uncovered)

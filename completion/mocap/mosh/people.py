@@ -26,8 +26,6 @@ from .pictures import standing
 from .recordings import Actor, Recording
 
 FRAMES = 6                           # worst frames that are shown of a person
-ROD = (0.35, 0.40, 0.48)
-CLEAR = 0.05                         # metres: the end of the colours of residuals
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,15 @@ class Found:
         for one, motion in zip(self.recordings, self.motions, strict=True):
             for label in motion.distrusted:
                 found.setdefault(label, []).append(f"{one.name}: hardly believed")
-            for label, line in _artefacts(self.folder / one.name / "artefacts.json"):
+            path = self.folder / one.name / "artefacts.json"
+            told = storage.read_json(path, "a list of artefacts")
+            with storage.taking_apart(path, "a list of artefacts"):
+                rate = told["rate"]
+                lines = [(label, f"exchanged with {other} from {s['begin'] / rate:.2f} to {s['end'] / rate:.2f} s")
+                         for s in told["exchanges"] for label, other in (s["labels"], s["labels"][::-1])]
+                lines += [(b["label"], f"{b['kind']} by {1000 * b['distance']:.0f} mm from {b['begin'] / rate:.2f} to "
+                           f"{b['end'] / rate:.2f} s") for b in told["bad"]]
+            for label, line in lines:
                 found.setdefault(label, []).append(f"{one.name}: {line}")
         return found
 
@@ -160,39 +166,27 @@ class Found:
                if label in measured}
         seen, there = np.array([measured[label] for label in has]), np.array(list(has.values()))
         far = np.linalg.norm(seen - there, axis=1)
-        dots = Dots(seen, Heat(far, 0.0, CLEAR, "measured marker from where the body has it"), 0.014, name="markers",
+        dots = Dots(seen, Heat(far, 0.0, 0.05, "measured marker from where the body has it"), 0.014, name="markers",
                     labels=[f"{label} {1000 * d:.0f}" for label, d in zip(has, far, strict=True)])
         camera = facing(self.subject, motion.poses[frame.number], body.vertices, vertical=upwards(motion, self.subject))
-        return Pane([Solid(body, name="body"), dots, Bones(there, seen, ROD, 0.004, name="from the body")], camera,
-                    frame.told)
+        rods = Bones(there, seen, (0.35, 0.40, 0.48), 0.004, name="from the body")
+        return Pane([Solid(body, name="body"), dots, rods], camera, frame.told)
 
 
 def found_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None,
                  rate: float | None) -> list[Found]:
     """The people of an output, as their files tell; StorageError where they do not, ValueError where there are none."""
-    found = [_found(folder / actor.name, actor, models, unit, rate) for actor in actors]
-    if not any(one.recordings for one in found):
+    found = []
+    for actor in actors:
+        own = folder / actor.name
+        about = storage.read_json(own / "subject.json", "a person that scape mosh found")
+        with storage.taking_apart(own / "subject.json", "a person that scape mosh found"):
+            model = models.sexes.get((about["sex"] or {}).get("sex", ""), models.neutral)
+            about = {name: about[name] for name in ("betas", "layout", "worn_elsewhere", "exchanged", "left_out")}
+        layout = MarkerLayout.load(own / "layout.json", len(model.template.vertices))
+        there = tuple(one for one in actor.recordings if (own / one.name / "motion.npz").exists())
+        if there:
+            found.append(Found(actor.name, own, there, model, layout, about, unit, rate))
+    if not found:
         raise ValueError(f"{folder}: expected what scape mosh found of the people, there is none; run it once more")
-    return [one for one in found if one.recordings]
-
-
-def _found(folder: Path, actor: Actor, models: Models, unit: str | None, rate: float | None) -> Found:
-    about = storage.read_json(folder / "subject.json", "a person that scape mosh found")
-    with storage.taking_apart(folder / "subject.json", "a person that scape mosh found"):
-        sex = (about["sex"] or {}).get("sex", "")
-        model = models.sexes.get(sex, models.neutral)
-        about = {name: about[name] for name in ("betas", "layout", "worn_elsewhere", "exchanged", "left_out")}
-    there = tuple(one for one in actor.recordings if (folder / one.name / "motion.npz").exists())
-    layout = MarkerLayout.load(folder / "layout.json", len(model.template.vertices))
-    return Found(actor.name, folder, there, model, layout, about, unit, rate)
-
-
-def _artefacts(path: Path) -> list[tuple[str, str]]:
-    """Label and what is wrong with it for a while, of a file of artefacts."""
-    told = storage.read_json(path, "a list of artefacts")
-    with storage.taking_apart(path, "a list of artefacts"):
-        rate = told["rate"]
-        swaps = [(label, f"exchanged with {other} from {s['begin'] / rate:.2f} to {s['end'] / rate:.2f} s")
-                 for s in told["exchanges"] for label, other in (s["labels"], s["labels"][::-1])]
-        return swaps + [(b["label"], f"{b['kind']} by {1000 * b['distance']:.0f} mm from {b['begin'] / rate:.2f} to "
-                         f"{b['end'] / rate:.2f} s") for b in told["bad"]]
+    return found

@@ -14,14 +14,23 @@ from scanprep.pictures.scene import Pane, picture_pane, picture_panes
 from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid, side_by_side
 from scanprep.words import number_of
 
-from ...motion_pictures import MARKER, chart_states, facing, frames_apart, mean_over, moving_pane, played, upwards
+from ...motion_pictures import (
+    MARKER,
+    chart,
+    chart_states,
+    facing,
+    frames_apart,
+    mean_over,
+    moving_pane,
+    played,
+    upwards,
+)
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .takes import Take
 
 USUAL, UNCERTAIN, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
-SIDES = ("front", "left", "back", "right")
 LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
 
 
@@ -33,8 +42,8 @@ def standing(model: BodyModel, betas: np.ndarray) -> Mesh:
 def picture_sides(body: Mesh, found: np.ndarray, height: int = 360) -> np.ndarray:
     """A body from four sides with its markers (L, 3)."""
     shapes: list[Shape] = [Solid(body), Dots(found, MARKER, 0.011)]
-    return picture_panes([Pane(shapes, camera, side) for camera, side in zip(look_around(body), SIDES, strict=True)],
-                         height)
+    sides = zip(look_around(body), ("front", "left", "back", "right"), strict=True)
+    return picture_panes([Pane(shapes, camera, side) for camera, side in sides], height)
 
 
 def person_pane(body: Mesh, found: np.ndarray, usual: np.ndarray, labels: Sequence[str]) -> Pane:
@@ -68,13 +77,15 @@ def take_pane(take: Take) -> Pane:
     return moving_pane(take.shown, take.subject, dots, take.make, take.light)
 
 
-def frame_panes(take: Take, frames: np.ndarray) -> list[Pane]:
-    """Some frames with their markers."""
-    vertical = upwards(take.shown, take.subject)
-    return [Pane([take.light.mesh(body), *marker_dots(take, int(t))],
+def frame_panes(take: Take, frames: np.ndarray, looks: Sequence[Sequence[Shape]] | None = None,
+                radius: float = 0.014) -> list[Pane]:
+    """Some frames with their markers; `looks` shows the body of each, if not as it is."""
+    vertical, bodies = upwards(take.shown, take.subject), take.bodies(frames)
+    looks = looks or [[take.light.mesh(body)] for body in bodies]
+    return [Pane([*look, *marker_dots(take, int(t), radius)],
                  facing(take.subject, take.shown.poses[t], body, vertical=vertical),
                  f"{t} · {t / take.shown.rate:.2f} s")
-            for t, body in zip(frames, take.bodies(frames), strict=True)]
+            for t, body, look in zip(frames, bodies, looks, strict=True)]
 
 
 def picture_large(take: Take, frames: np.ndarray, height: int = 340) -> np.ndarray:
@@ -104,16 +115,13 @@ def soft_pane(take: Take, frames: np.ndarray) -> Pane:
 
 def changed_panes(take: Take, frames: np.ndarray) -> list[Pane]:
     """Frames with soft tissue, coloured by how far it moves the skin; the fixed shape can be laid over each."""
-    change, light, vertical = soft_change(take, frames), take.light, upwards(take.shown, take.subject)
-    end, panes = max(float(np.percentile(np.abs(change), 99.5)), LITTLE), []
-    for t, rigid, soft, out in zip(frames, take.rigid(frames), take.bodies(frames), change, strict=True):
+    change, light, looks = soft_change(take, frames), take.light, list[list[Shape]]()
+    end = max(float(np.percentile(np.abs(change), 99.5)), LITTLE)
+    for rigid, soft, out in zip(take.rigid(frames), take.bodies(frames), change, strict=True):
         shown = Heat(out[light.vertex_ids], -end, end, "skin moved inwards (-) and outwards", colormap="coolwarm")
-        shapes: list[Shape] = [
-            Solid(light.mesh(soft), shown, name="with soft tissue"),
-            Solid(light.mesh(rigid), name="fixed shape", visible=False), *marker_dots(take, int(t), 0.010)]
-        panes.append(Pane(shapes, facing(take.subject, take.shown.poses[t], soft, vertical=vertical),
-                          f"{t} · {t / take.shown.rate:.2f} s"))
-    return panes
+        looks.append([Solid(light.mesh(soft), shown, name="with soft tissue"),
+                      Solid(light.mesh(rigid), name="fixed shape", visible=False)])
+    return frame_panes(take, frames, looks, 0.010)
 
 
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
@@ -141,10 +149,7 @@ def _thinned(values: np.ndarray, most: int = 900) -> np.ndarray:
 
 def chart_frames(take: Take) -> Any:
     """The mean distance of the markers in every frame, with fixed shape, soft tissue, and of held-out ones."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.8, 2.7))
-    axes = figure.add_subplot()
+    figure, axes = chart(7.8, 2.7)
     lines = [("fixed shape", take.motion.residuals, "#7a8794")]
     if take.soft is not None:
         lines.append(("with soft tissue", take.soft.motion.residuals, "#c8452f"))
@@ -162,13 +167,10 @@ def chart_frames(take: Take) -> Any:
 
 def chart_map(take: Take) -> Any:
     """The distance of every marker in every frame, the worst marker first; white where it was not seen."""
-    from matplotlib.figure import Figure
-
     off = take.shown.residuals
     used = np.flatnonzero(np.isfinite(off).any(axis=0))
     used = used[np.argsort(-mean_over(off[:, used], 0))]
-    figure = Figure(figsize=(7.8, 0.7 + 0.13 * len(used)))
-    axes = figure.add_subplot()
+    figure, axes = chart(7.8, 0.7 + 0.13 * len(used))
     drawn = axes.imshow(MM * _thinned(off[:, used]).T, aspect="auto", interpolation="nearest", cmap="magma_r", vmin=0,
                         vmax=float(np.nanpercentile(MM * off, 99)),
                         extent=(0, max(take.motion.times[-1], 1e-9), len(used) - 0.5, -0.5))
@@ -210,7 +212,7 @@ def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int =
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    spans = _spans(found)
+    spans, times, most, step = _spans(found), markers.times, 400.0, 1 / markers.rate
     length = {label: sum(end - begin + 1 for _, begin, end, _ in some) for label, some in spans.items()}
     shown = sorted((label for label in spans if label in found.labels), key=lambda label: -length[label])[:rows]
     figure = Figure(figsize=(7.8, 0.8 + 0.55 * max(1, len(shown))))
@@ -219,7 +221,20 @@ def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int =
         return figure
     axes = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     for axis, label in zip(axes, shown, strict=True):
-        _row(axis, found, markers, label, spans[label])
+        row = found.labels.index(label)
+        for kind, begin, end, other in spans[label]:
+            axis.axvspan(times[begin] - step / 2, times[end] + step / 2, color=STATES[kind], alpha=0.45, linewidth=0)
+            if other and (end - begin) > 0.06 * len(times):
+                axis.text(0.5 * (times[begin] + times[end]), 2.0, other, fontsize=5.5, ha="center", color=STATES[kind])
+        for sequence, color, width in ((markers, "#9aa3ab", 1.3), (found.repaired, "black", 0.7)):
+            off = np.linalg.norm(sequence.positions[:, sequence.labels.index(label)] - found.simulated[:, row], axis=1)
+            axis.plot(times, np.clip(MM * off, 1.0, most), color=color, linewidth=width)
+        axis.set(yscale="log", ylim=(1.0, most), xlim=(0, times[-1] + step), yticks=[10, 100],
+                 yticklabels=["10", "100"])
+        axis.minorticks_off()
+        axis.tick_params(labelsize=7)
+        axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
+        axis.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xlabel("time (s)")
     used = [kind for kind in STATES if any(kind == some[0] for label in shown for some in spans[label])]
     hidden = len(spans) - len(shown)
@@ -230,22 +245,3 @@ def chart_artefacts(found: MarkerArtefacts, markers: MarkerSequence, rows: int =
     figure.subplots_adjust(left=0.11, right=0.985, top=1 - 0.32 / figure.get_figheight(),
                            bottom=0.42 / figure.get_figheight(), hspace=0.25)
     return figure
-
-
-def _row(axis: Any, found: MarkerArtefacts, markers: MarkerSequence, label: str,
-         spans: list[tuple[str, int, int, str]]) -> None:
-    """One marker."""
-    row, times, most, step = found.labels.index(label), markers.times, 400.0, 1 / markers.rate
-    for kind, begin, end, other in spans:
-        axis.axvspan(times[begin] - step / 2, times[end] + step / 2, color=STATES[kind], alpha=0.45, linewidth=0)
-        if other and (end - begin) > 0.06 * len(times):
-            axis.text(0.5 * (times[begin] + times[end]), 2.0, other, fontsize=5.5, ha="center", color=STATES[kind])
-    for sequence, color, width in ((markers, "#9aa3ab", 1.3), (found.repaired, "black", 0.7)):
-        off = np.linalg.norm(sequence.positions[:, sequence.labels.index(label)] - found.simulated[:, row], axis=1)
-        axis.plot(times, np.clip(MM * off, 1.0, most), color=color, linewidth=width)
-    axis.set(yscale="log", ylim=(1.0, most), xlim=(0, times[-1] + step), yticks=[10, 100], yticklabels=["10", "100"])
-    axis.minorticks_off()
-    axis.tick_params(labelsize=7)
-    axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast, get_args
 
@@ -66,16 +66,19 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
     for place in given:
         if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
             raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
-    found = [replace(file, people=_labelled(file.path, grouping))
-             for file in _files(given, output, grouping.table)]
+    found = list(_files(given, output, grouping))
     if not found:
         raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(READERS)}, found none")
     whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given)
                                      and not any(len(f.people) > 1 for f in found))
     if grouping.table is not None:
         said = _read_table(grouping.table, [f.path for f in found])
-        rows = [(folder_name(subject), f, grouping.who or _named_person(f, subject),
-                 f"as {grouping.table} says") for f in found for subject in said.get(f.path, ())]
+        rows = []
+        for f, subject in [(file, subject) for file in found for subject in said.get(file.path, ())]:
+            # of several people in a file the one whom the table names
+            named = (who for who in f.people if folder_name(who) == folder_name(subject))
+            who = grouping.who or (next(named, None) if len(f.people) > 1 else None)
+            rows.append((folder_name(subject), f, who, f"as {grouping.table} says"))
     elif whole:
         name = next(_people(found[0], grouping))[0]
         if len(given) == 1 and given[0].is_dir():
@@ -105,12 +108,12 @@ class _File:
 
     path: Path
     folders: tuple[str, ...]
-    people: tuple[str, ...] = ()
+    people: tuple[str, ...]              # none where one of them is named
 
 
-def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterator[_File]:
+def _files(given: list[Path], output: Path | None, grouping: Grouping) -> Iterator[_File]:
     """The files that were named, and the marker files of the folders that were, each once."""
-    seen: set[Path] = {p.resolve() for p in (table,) if p is not None}
+    seen = set() if grouping.table is None else {grouping.table.resolve()}
     outputs = {output.resolve()} if output is not None else set()
     for place in given:
         if not place.exists():
@@ -125,7 +128,11 @@ def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterat
                 continue
             if whole not in seen:
                 seen.add(whole)
-                yield _File(path, parts[:-1])
+                try:
+                    people = marker_subjects(path) if grouping.who is None else ()
+                except MarkerFileError:  # told when the file is read in earnest
+                    people = ()
+                yield _File(path, parts[:-1], people)
 
 
 def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, str]]:
@@ -143,20 +150,6 @@ def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, 
         yield people[0], None, "by what stands before the labels"
     else:
         yield own if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
-
-
-def _named_person(file: _File, subject: str) -> str | None:
-    """The one of several people in a file whom a table names; None for a file of one."""
-    named = (who for who in file.people if folder_name(who) == folder_name(subject))
-    return next(named, None) if len(file.people) > 1 else None
-
-
-def _labelled(path: Path, grouping: Grouping) -> tuple[str, ...]:
-    """The people in a file by its labels; none where one of them is named."""
-    try:
-        return marker_subjects(path) if grouping.who is None else ()
-    except MarkerFileError:              # told when the file is read in earnest
-        return ()
 
 
 def _named(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recording, ...]:

@@ -150,8 +150,6 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue) -> tuple
     return most, write_glb(path, soft.motion, character.subject(soft.motion.betas), bodies, heat(most, 0.0, FULL))
 
 
-REACH = (1, 2, 2, 3, 3, 4)           # rings around inverted triangles that are laid anew, one round each
-
 
 class Creases:
     """Where triangles of a posed body are inverted, and the body without.
@@ -184,33 +182,26 @@ class Creases:
 
         Patches around inverted triangles grow while some are left; one that leaves more of them is not taken.
         """
-        out = np.array(bodies)
-        for t in range(len(out)):
-            bad = self.inverted(out[t], poses[t])
-            for rings in REACH:
-                if not bad.any():
-                    break
-                out[t] = self._laid(out[t], poses[t], bad, rings)
-                bad = self.inverted(out[t], poses[t])
+        out, faces = np.array(bodies), self.rest.faces
+        for x, pose in zip(out, poses, strict=True):
+            bad = self.inverted(x, pose)
+            for rings in (1, 2, 2, 3, 3, 4):             # around inverted triangles that are laid anew, one round each
+                free = np.zeros(len(x))
+                free[faces[bad]] = 1
+                for _ in range(rings - 1):
+                    free = (free + self._near @ free > 0).astype(float)
+                mine = np.flatnonzero(free)
+                if len(mine) in (0, len(x)):
+                    continue
+                count, patch = connected_components(self._near[mine][:, mine])
+                trial = harmonic(self._near, x, free == 0)
+                left = self.inverted(trial, pose)
+                of_vertex = np.full(len(x), -1)
+                of_vertex[mine] = patch
+                of_face = of_vertex[faces].max(axis=1)   # no triangle touches two patches
+                before, after = (np.bincount(of_face[some & (of_face >= 0)], minlength=count) for some in (bad, left))
+                kept = mine[~(after < before)[patch]]
+                trial[kept] = x[kept]
+                x[:] = trial                             # a row of `out`
+                bad = self.inverted(x, pose)
         return out
-
-    def _laid(self, x: np.ndarray, pose: np.ndarray, bad: np.ndarray, rings: int) -> np.ndarray:
-        """Vertices (N, 3) with patches of so many rings around inverted triangles (F,) laid where that helps."""
-        free = np.zeros(len(x))
-        free[self.rest.faces[bad]] = 1
-        for _ in range(rings - 1):
-            free = (free + self._near @ free > 0).astype(float)
-        mine = np.flatnonzero(free)
-        if len(mine) == len(x):
-            return x
-        count, patch = connected_components(self._near[mine][:, mine])
-        trial = harmonic(self._near, x, free == 0)
-        left = self.inverted(trial, pose)
-        of_vertex = np.full(len(x), -1)
-        of_vertex[mine] = patch
-        of_face = of_vertex[self.rest.faces].max(axis=1)                      # no triangle touches two patches
-        better = np.bincount(of_face[left & (of_face >= 0)], minlength=count) < np.bincount(of_face[bad],
-                                                                                           minlength=count)
-        kept = mine[~better[patch]]
-        trial[kept] = x[kept]
-        return trial
