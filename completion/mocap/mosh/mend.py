@@ -146,10 +146,13 @@ class MoshApp(ResultsApp):
     # what the page sends
 
     def on_open(self, send: Send, scan: int) -> None:
-        """Another person."""
+        """Another person; bodies of people are no files that could be read again, so none is forgotten."""
+        if not 0 <= scan < len(self.scans):
+            raise ValueError(f"person: expected 0 to {len(self.scans) - 1}, got {scan}")
         if scan != self.current:
-            self.frame = 0
-        super().on_open(send, scan)
+            self.current, self.frame = scan, 0
+            self.choose_next(None)
+            send(self.scene())
 
     def on_frame(self, send: Send, frame: int) -> None:
         """Another of the worst frames."""
