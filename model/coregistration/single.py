@@ -28,6 +28,7 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 PERSON = 1.36                        # metres: root of the surface area of a person
 EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
 ENOUGH = 0.98                        # share of a scan that a start must explain for no other to be sought
+CLEARLY = 0.8                        # of the misfit of a start that explains its scan, below which another is better
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +140,17 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
 
 def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray, int]:
     """The best unknowns (P,) for a scan, and how many starts were tried: those given (1, P) first, all if need be."""
-    few, ends, tried = fit.few(), [], 0
+    few, tried, best = fit.few(), 0, None
     if given is not None:
-        ends, tried = [reinitialise_limbs(few, best_starts(few, given)[0])], 1
-    if not ends or limbs_amiss(few, ends[0]) or few.unexplained(ends[0], few.thin).mean() > 1 - ENOUGH:
+        best, tried = reinitialise_limbs(few, best_starts(few, given)[0]), 1
+    explains = best is not None and few.unexplained(best, few.thin).mean() <= 1 - ENOUGH
+    if best is None or not explains or limbs_amiss(few, best):
         starts = first_starts(fit, few)
         tried += len(starts)
-        ends.append(with_limbs(fit, few, best_starts(few, starts))[0])
-    best = min(ends, key=few.misfit)
+        other = with_limbs(fit, few, best_starts(few, starts))[0]
+        # a body that lies the other way round may explain a scan about as well: what was known decides
+        least = np.inf if best is None else (CLEARLY if explains else 1.0) * few.misfit(best)
+        best = other if best is None or few.misfit(other) < least else best
     return solve_jointly(fit, few, best, lambda done: None).x, tried
 
 
