@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, save_arrays, taking_apart
 from scanprep.geometry.surface import OrientedPoints, Surface
 from scanprep.registration.nonrigid import register, registration_problem
+from scanprep.skeleton.tree import Skeleton
 
 from ...body import BodyModel
 from ...fitting.vertices import fit_shape
@@ -98,14 +100,20 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
 
     The generic control model rests as they do, so the rotations of the parts in the world carry over.
     """
-    from scanprep.synthetic.people import Person
-
-    skeleton = Person().skeleton
+    skeleton = _average_skeleton()
     poses, trans = check_motion(skeleton, poses, trans, rate)
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
                        joint_places(skeleton, poses, trans), rate)
     return retargeted(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
+
+
+@lru_cache(maxsize=1)
+def _average_skeleton() -> Skeleton:
+    """That of the average synthetic person, whose surface takes a second to make."""
+    from scanprep.synthetic.people import Person
+
+    return Person().skeleton
 
 
 def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> Retargeted:
