@@ -207,5 +207,5 @@ def test_the_page_has_the_failed_first_and_then_the_worst_explained(tmp_path):
 
     results = {"a": figures(98.0, "good"), "b": figures(99.0, "failed"), "c": figures(70.0, "check"),
                "d": figures(80.0, "good")}
-    html = FolderCall(tmp_path).told(tmp_path, "model").page(Results(results, {}, ()), [], tmp_path).html()
+    html = FolderCall(tmp_path).description(tmp_path, "model").page(Results(results, {}, ()), [], tmp_path).html()
     assert sorted("abcd", key=lambda name: html.index(f'href="{name}/report.html"')) == ["b", "c", "d", "a"]
