@@ -12,7 +12,7 @@ from model_bodies import random_poses, worm_model
 from model import coregister, learn_scape, register_with_model
 from model.bilinear import PosedPoints
 from model.coregistration.single import apart
-from model.fitting.bodies import as_body, resized
+from model.fitting.bodies import ResizedBody, as_body
 from model.fitting.rounds import meet_vertices
 from model.fitting.scan import prepare_scan
 from model.fitting.scan_fit import scan_fit
@@ -124,7 +124,7 @@ def test_a_body_of_another_size_has_the_same_pose_and_betas(known):
     """Points times a factor about where the root stands; derivatives agree with finite differences."""
     worm = worm_model()
     person = as_body(worm.subject([1.0, 0, 0]) if known else worm)
-    large, x = resized(person, 2.5), np.random.default_rng(3).normal(0, 0.3, person.n_angles + 3 + person.n_betas)
+    large, x = ResizedBody(person, 2.5), np.random.default_rng(3).normal(0, 0.3, person.n_angles + 3 + person.n_betas)
     stand = person.subject.origin + person.split(x)[1]
     np.testing.assert_allclose(large.vertices(x) - stand, 2.5 * (person.vertices(x) - stand), atol=1e-6)
     ids = np.array([3, 50, 200, 390])
@@ -133,6 +133,8 @@ def test_a_body_of_another_size_has_the_same_pose_and_betas(known):
     np.testing.assert_allclose(y, large.vertices(x)[ids], atol=1e-6)
     np.testing.assert_allclose(np.moveaxis(columns, 0, -1), differences(points.positions, x), atol=1e-6)
     np.testing.assert_allclose(large.held(x).vertices(x[:person.n_angles + 3]), large.vertices(x), atol=1e-6)
+    own, factor = large.in_metres(x)
+    np.testing.assert_allclose(person.vertices(own), factor * large.vertices(x), atol=1e-6)
 
 
 def test_prior_is_the_shrunk_gaussian(crab_model):

@@ -41,6 +41,7 @@ class CoregistrationConfig(Settings):
     workers : Workers
     """
 
+    # with 0.008 m, the value of `complete`, predicted bodies of 20 scans were 12.58 mm off on average, not 12.43
     fit: ScanFitConfig = field(default_factory=lambda: ScanFitConfig(scan_sd=0.015))
     registration: RegistrationConfig = NEAR
     learn: LearnConfig = field(default_factory=LearnConfig)

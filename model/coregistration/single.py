@@ -15,7 +15,7 @@ from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..features import twists
-from ..fitting.bodies import FixedBody, as_body, resized
+from ..fitting.bodies import FixedBody, ResizedBody, as_body
 from ..fitting.limbs import limbs_amiss, reinitialise_limbs, with_limbs
 from ..fitting.rounds import meet_vertices, solve_jointly
 from ..fitting.scan import prepare_scan
@@ -28,7 +28,9 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 PERSON = 1.36                        # metres: root of the surface area of a person
 EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
 ENOUGH = 0.98                        # share of a scan that a start must explain for no other to be sought
-CLEARLY = 0.8                        # of the misfit of a start that explains its scan, below which another is better
+# of the misfit of a start that explains its scan, below which another is better: of a crab, a body that lay the other
+# way round had 1.0 to 1.6 times the misfit of the right one
+CLEARLY = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +119,18 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     size = float(np.sqrt(body.template.face_areas.sum()))
     factor = 1.0 if 0.5 < size / PERSON < 2 else PERSON / size
     person = as_body(body)
-    fit = scan_fit(person if factor == 1 else resized(person, factor), prepare_scan(scan, metres=factor), vertices,
+    fit = scan_fit(person if factor == 1 else ResizedBody(person, factor), prepare_scan(scan, metres=factor), vertices,
                    factor * points, config.fit)
     # 1. pose, place and betas by matches alone
     x, tried = _pose_and_shape(fit, None if start is None else _given(fit, start, factor))
     tell(1, 2)
     # 2. the template as the model predicts it is aligned with the scan
-    aligned = register(_predicted(person, x, factor), scan, None, config.registration)
+    aligned = register(_predicted(person, fit, x), scan, None, config.registration)
     # 3. pose and betas from where there are data
     x = meet_vertices(fit, x, factor * aligned.mesh.vertices, aligned.confidence)
     tell(2, 2)
-    predicted, mesh, seen = _predicted(person, x, factor), aligned.mesh, aligned.seen
-    pose, trans, betas = person.split(_own_size(person, x, factor))
+    predicted, mesh, seen = _predicted(person, fit, x), aligned.mesh, aligned.seen
+    pose, trans, betas = person.split(fit.body.in_metres(x)[0])
     off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
     off_marks = np.linalg.norm(mesh.vertices[vertices] - points, axis=1)
     limit = EXPLAINED * size
@@ -168,16 +170,9 @@ def _given(fit: ScanFit, start: np.ndarray, factor: float) -> np.ndarray:
     return (meet_vertices(fit, x, onto, np.ones(len(onto))) if registered else x)[None]
 
 
-def _own_size(person: FixedBody, x: np.ndarray, factor: float) -> np.ndarray:
-    """Unknowns (P,) of a body at its own size, of those of the same body times a factor."""
-    out, place = x.copy(), slice(person.n_angles, person.n_angles + 3)
-    out[place] = (person.subject.origin + x[place]) / factor - person.subject.origin
-    return out
-
-
-def _predicted(person: FixedBody, x: np.ndarray, factor: float) -> Mesh:
-    """The body's own mesh, of unknowns (P,) of the same body times a factor."""
-    return person.template.with_vertices(person.vertices(_own_size(person, x, factor)))
+def _predicted(person: FixedBody, fit: ScanFit, x: np.ndarray) -> Mesh:
+    """A person's own mesh, of unknowns (P,) of a fit that may be of another size."""
+    return person.template.with_vertices(person.vertices(fit.body.in_metres(x)[0]))
 
 
 def apart(mesh: Mesh, target: Target, limit: float) -> np.ndarray:

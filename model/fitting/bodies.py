@@ -259,20 +259,22 @@ class RoughBody(ShapedBody):
 
 
 class ResizedBody(FixedBody):
-    """A body of unknown shape with all lengths times a factor; by `resized`.
+    """A body with all lengths times a factor: the lengths of a search, in metres, are those of a person.
 
     Its place is that of the root's joint, which stands where it stood.
     """
 
     def __init__(self, inner: FixedBody, factor: float) -> None:
-        known = resized(inner.held(np.zeros(inner.n_angles + 3 + inner.n_betas)), factor)
-        super().__init__(known.subject)
+        own = inner.held(np.zeros(inner.n_angles + 3 + inner.n_betas)).subject
+        super().__init__(replace(own, operator=own.operator.scaled(factor),
+                                 template=own.template.with_vertices(factor * own.template.vertices),
+                                 skeleton=replace(own.skeleton, joints=factor * own.skeleton.joints)))
         self.inner, self.factor, self.n_betas = inner, factor, inner.n_betas
         self.known_poses = inner.known_poses
 
     def held(self, x: np.ndarray) -> FixedBody:
         """The body with the shape it has at x (P,), as one of known shape."""
-        return resized(self.inner.held(x), self.factor)
+        return ResizedBody(self.inner.held(x), self.factor)
 
     def some(self, ids: np.ndarray) -> FixedBody:
         return ResizedBody(self.inner.some(ids), self.factor)
@@ -283,6 +285,12 @@ class ResizedBody(FixedBody):
 
     def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
         return ResizedPoints(self.inner.near(vertex_ids, x), self.subject.origin, self.n_angles, self.factor)
+
+    def in_metres(self, x: np.ndarray) -> tuple[np.ndarray, float]:
+        """Unknowns (P,) of the body at its own size, and what the scan has to be multiplied with for it."""
+        out, place = x.copy(), slice(self.n_angles, self.n_angles + 3)
+        out[place] = (self.subject.origin + x[place]) / self.factor - self.subject.origin
+        return out, 1 / self.factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,19 +317,6 @@ class ResizedPoints:
 def resize(points: np.ndarray, about: np.ndarray, factor: float) -> np.ndarray:
     """Points (L, 3) with their distances from a point (3,) times a factor."""
     return about + factor * (points - about)
-
-
-def resized(body: FixedBody, factor: float) -> FixedBody:
-    """A body with all lengths times a factor: the search's lengths in metres are those of a person."""
-    if body.n_betas:
-        return ResizedBody(body, factor)
-    subject = body.subject
-    large = replace(subject, operator=subject.operator.scaled(factor),
-                    template=subject.template.with_vertices(factor * subject.template.vertices),
-                    skeleton=replace(subject.skeleton, joints=factor * subject.skeleton.joints))
-    out = FixedBody(large)
-    out.known_poses = body.known_poses
-    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,8 @@ COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, 
 STEPS = 2                            # for each matching of them: they are too few to settle with one
 PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
 FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
-HALF = 0.65                          # of a body's length: a scan that is shorter is of a part of it
+# of a body's length: a scan that is shorter is of a part of it; half a man had 0.49
+HALF = 0.65
 ROTATIONS = 600                         # about 25 degrees between neighbours
 LEVELS = 5                           # heights at which a body that stands is laid on what is seen of it
 POSES = 100                          # tried at most

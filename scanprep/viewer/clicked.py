@@ -90,7 +90,7 @@ class Clicked:
         """What is drawn of it: no more triangles or points than one can see."""
         if self._shown is None:
             shape, points = self.body.shape, self.body.points
-            # of a cloud
+            # a cloud of more points is no clearer, and slow to turn
             self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
                 Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
         return self._shown
