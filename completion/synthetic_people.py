@@ -27,7 +27,7 @@ Progress = Callable[[int, int], None]
 
 CACHE = "SCAPEKIT_CACHE"             # environment variable that names another folder
 SEAL = "seal"                        # its place in the model's info
-VERSION = 4                          # raised when the same recipe makes another model
+VERSION = 5                          # raised when the same recipe makes another model
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class SyntheticRecipe:
     """
 
     poses: int = 40
-    people: int = 48
+    people: int = 120
     faces: int = 10000
-    learn: LearnConfig = field(default_factory=lambda: LearnConfig(components=18, refinements=2))
+    learn: LearnConfig = field(default_factory=lambda: LearnConfig(components=30, refinements=2))
     seed: int = 5
 
     @property
@@ -149,7 +149,7 @@ def build_synthetic(recipe: SyntheticRecipe, progress: Progress | None = None) -
         poses.append(person.posed(subject_pose(k, rng)[1]))
         tell(k + 1, made + learning)
     for k in range(recipe.people):
-        shapes.append(Person(BodyShape.random(rng, sex=(-1.0, 1.0)[k % 2])).posed(near_rest(rng)))
+        shapes.append(Person(BodyShape.random(rng, sex=("female", "male")[k % 2])).posed(near_rest(rng)))
         tell(recipe.poses + k + 1, made + learning)
     small = _decimated(person, np.stack(poses), recipe.faces)
     assert small.skeleton is not None, "a skeleton was given"
