@@ -15,7 +15,7 @@ from scanprep.decimation.decimate import decimate
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.implicit_surface import Field, Group, RoundCone, project
+from implicit_surface import Field, Group, RoundCone, project
 
 NAMES = ("barrel", "neck", "head", "tail", "fore left", "fore left cannon", "fore right", "fore right cannon",
          "hind left", "hind left cannon", "hind right", "hind right cannon")

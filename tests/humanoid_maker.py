@@ -26,7 +26,7 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic import body_parts as people_parts
 from scanprep.synthetic.anatomy import Anatomy, tables
 from scanprep.synthetic.body_parts import cross_sections
-from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
+from implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.topology import CANONICAL, blending, load
 

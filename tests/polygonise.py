@@ -5,7 +5,7 @@ import igl
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.implicit_surface import Field
+from implicit_surface import Field
 
 
 def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> Mesh:

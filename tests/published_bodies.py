@@ -35,7 +35,7 @@ def synthetic_smpl(faces: int = 1600, people: int = 3, poses: int = 8, seed: int
         pose[0] = 0
     small = _decimated(man, None, faces)
     own, template = small.vertex_map, small.template
-    shapes = np.stack([Person(BodyShape.random(rng, (-1.0, 1.0)[k % 2])).mesh.vertices[own] for k in range(people)])
+    shapes = np.stack([Person(BodyShape.random(rng, ("female", "male")[k % 2])).mesh.vertices[own] for k in range(people)])
     mean = shapes.mean(axis=0)
     _, s, Vt = np.linalg.svd((shapes - mean).reshape(people, -1), full_matrices=False)
     shapedirs = (s[:10, None] * Vt[:10] / np.sqrt(people - 1)).reshape(-1, len(own), 3)[:people - 1]
@@ -155,4 +155,4 @@ def published_vertices(a: dict[str, np.ndarray], pose: np.ndarray, betas: np.nda
 def people_near_rest(count: int, seed: int) -> list[tuple[Person, np.ndarray]]:
     """People who were not learned from, and how they stand."""
     rng = np.random.default_rng(seed)
-    return [(Person(BodyShape.random(rng, (-1.0, 1.0)[k % 2])), near_rest(rng)) for k in range(count)]
+    return [(Person(BodyShape.random(rng, ("female", "male")[k % 2])), near_rest(rng)) for k in range(count)]

@@ -101,7 +101,7 @@ def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys):
 
 
 def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
-    person = Person(BodyShape(weight=1.0))
+    person = Person(BodyShape.like(weight=1.0))
     bodies = RegisteredSet.create(tmp_path / "set", person.mesh)
     bodies.add("one", person.mesh, subject="a")
     assert scape(tmp_path / "set", "-o", tmp_path / "set.csv") == 0
@@ -111,7 +111,7 @@ def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
 
 def test_a_completion_states_errors(folder, tmp_path):
     """Those that expected errors of its vertices imply; its report names the model."""
-    model, person = small_people(), Person(BodyShape(sex=0.3))
+    model, person = small_people(), Person(BodyShape("male", (0.1,)))
     body = model.template.with_vertices(person.mesh.vertices[kept()])
     n = len(body.vertices)
     done = Completion(body, body, np.zeros((16, 3)), np.zeros(4), np.zeros(3), np.ones(n, bool), 0.001, 1.0, 0.001,

@@ -27,7 +27,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(scope="module")
 def person():
-    return Person(BodyShape(sex=-0.6, weight=0.8, chest=0.7))
+    return Person(BodyShape.like("female", weight=0.8))
 
 
 @pytest.fixture(scope="module")

@@ -56,7 +56,7 @@ def walled(mesh, height):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person(BodyShape(sex=1.0, stature=1.82, weight=0.4))
+    return Person(BodyShape.like("male", stature=1.82, weight=0.4))
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,7 @@ def test_mass_is_plausible(bodies):
     """A litre of body weighs about a kilogram; body mass index of the averages."""
     for person in bodies[:2]:
         assert 20 < 1000 * person.mesh.volume / person.shape.stature**2 < 25
-    heavier = Person(BodyShape(weight=1.0))
+    heavier = Person(BodyShape.like(weight=1.0))
     assert 8 < 1000 * (heavier.mesh.volume - bodies[0].mesh.volume) < 16
 
 

@@ -55,7 +55,7 @@ def kept(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.
 def somebody(k: int) -> tuple[Person, np.random.Generator]:
     """The k-th person, women and men in turn."""
     rng = np.random.default_rng([18, k])
-    return Person(BodyShape.random(rng, 1.0 if k % 2 else -1.0)), rng
+    return Person(BodyShape.random(rng, "male" if k % 2 else "female")), rng
 
 
 def registered(person: Person, rng: np.random.Generator) -> dict[str, np.ndarray]:

@@ -41,7 +41,7 @@ def learned(folder: Path) -> dict[str, BodyModel]:
         rng = np.random.default_rng(recipe.seed)
         man, sexes = Person(SUBJECT), [("female", "male")[k % 2] for k in range(recipe.people)]
         poses = np.stack([man.posed(subject_pose(k, rng)[1]) for k in range(recipe.poses)])
-        shapes = np.stack([Person(BodyShape.random(rng, sex=1.0 if sex == "male" else -1.0)).posed(near_rest(rng))
+        shapes = np.stack([Person(BodyShape.random(rng, sex=sex)).posed(near_rest(rng))
                            for sex in sexes])
         small = _decimated(man, poses, recipe.faces)
         found = learn_by_sex(small.template, small.transfer(poses), small.transfer(shapes), sexes, small.skeleton,

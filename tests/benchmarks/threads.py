@@ -43,7 +43,7 @@ BUSY = "while True: pass"
 def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, list[str]]:
     """What the commands read, and their arguments."""
     rng = np.random.default_rng(0)
-    person = Person(BodyShape.random(rng, sex=-1.0))
+    person = Person(BodyShape.random(rng, sex="female"))
     marks = {name: int(v) for name, v in model.info["landmarks"].items()}
     kept = np.array(model.info["people_vertices"])
     scan = model.template.with_vertices(person.mesh.vertices[kept])

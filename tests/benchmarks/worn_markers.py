@@ -93,7 +93,7 @@ def synthetic_cases(count: int) -> Iterator[Case]:
         "left toe", "right toe", "left knee", "left middle finger", "right middle finger", "top of head", "navel")])
     for k in range(count):
         rng = np.random.default_rng(1000 + k)
-        person = Person(BodyShape.random(rng, float(k % 2)))
+        person = Person(BodyShape.random(rng, "male" if k % 2 else "female"))
         posed = person.mesh.with_vertices(person.posed(0.6 * random_pose(rng)))
         truth = model.template.with_vertices(posed.vertices[kept])
         whole = scan(posed, ScannerConfig(), rng).merged
