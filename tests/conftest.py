@@ -11,6 +11,7 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not take each other's cores
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.cpu_count = lambda: 1
+    os.sched_getaffinity = lambda pid: {0}
 
 from browser import browser, new_page, page  # noqa: F401 -- fixtures
 from click_app import app, server  # noqa: F401 -- fixtures
@@ -55,11 +56,14 @@ def demo_folder(run_folder):
         while not ended.exists():
             time.sleep(0.5)
     else:
+        from quiet_pictures import coarse_pictures
+
         from completion.demo.cli import demo
 
         code = None
         try:
-            code = run(demo, "scape demo", ["--quick", "--output", str(folder)])
+            with coarse_pictures():
+                code = run(demo, "scape demo", ["--quick", "--output", str(folder)])
         finally:
             ended.write_text(str(code))
     assert ended.read_text() == "0"

@@ -66,7 +66,7 @@ NEEDED = {"pelvis", "head", "hand_left", "hand_right", "foot_left", "foot_right"
 def light_person():
     """The true subject with few triangles: the light mesh, and which vertices of the whole one it has."""
     whole = Person(SUBJECT)
-    few = decimate_set(whole.mesh, None, 4000)
+    few = decimate_set(whole.mesh, None, 2000)
     return whole, few.template, few.vertex_map
 
 
