@@ -18,15 +18,17 @@ from completion import Motion, synthetic_people
 from completion.__main__ import main
 from model import load_model, write_body_npz
 from scanprep import RegisteredSet, write_mesh
+from scanprep.batch.digests import Digests
 from scanprep.batch.ownership import HOME
 from scanprep.batch.values import load_header
 from scanprep.decimation.registered_set import decimate_set
 from scanprep.pipeline.prepare import SCANS
+from scanprep.registration import person
 from scanprep.synthetic.data_set import read_views
 from scanprep.viewer import server
 
 ROOT = Path(__file__).parents[1]
-CHILD = 0.6                          # the size of the person in the range views: small ones are merged quickly
+CHILD = 0.45                         # the size of the person in the range views: small ones are merged quickly
 OTHERS = 2500                        # triangles of meshes that others registered: a skeleton is sought on them
 SIDES = {0: "front", 4: "back"}      # two views of the grown person
 QUICKER = {"scape statue fit": ["--size", "512"]}            # added to a command that takes long
@@ -55,11 +57,26 @@ def run_commands(readme):
             assert main(words[1:]) == 0, line
 
 
+_on: dict[str, object] = {}
+
+
+def once(find):
+    """The average person on a template, sought once of all the commands that read the same one."""
+    def found(template, landmarks, config, tell):
+        key = Digests().of(template.vertices, template.faces, landmarks, config)
+        if key not in _on:
+            _on[key] = find(template, landmarks, config, tell)
+        return _on[key]
+
+    return found
+
+
 @contextmanager
 def of_a_user(folder):
     """Work in a folder, with a cache of its own; the model of those without one is small, and so are all pictures."""
     small = small_people()                                       # from the cache of the run
     with pytest.MonkeyPatch.context() as here, coarse_pictures():
+        here.setattr(person, "_person_on", once(person._person_on))
         here.chdir(folder)
         here.setenv(synthetic_people.CACHE, str(folder / "cache"))
         here.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: small)

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from browser import wait_until
+from readme_folder import CHILD
 from scene_reader import scenes_of
 
 from completion import Motion
@@ -23,7 +24,7 @@ from scanprep import RegisteredSet, console
 from scanprep.batch.opening import workspace
 from scanprep.command_line import run
 from scanprep.decimation.registered_set import decimate_set
-from scanprep.geometry.files import read_mesh
+from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.mesh import template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.pipeline.prepare import PrepareConfig
@@ -104,8 +105,14 @@ def test_more_of_the_first_component_is_more_volume(demo_folder):
 
 def test_range_views_and_cameras_make_a_template(demo_folder, tmp_path):
     views = demo_folder / "template_scan" / "range_views"
-    assert set(json.loads((views / "cameras.json").read_text())) == {path.stem for path in views.glob("*.ply")}
-    assert run(template, "scape prep template", [str(views), "--faces", "3000", "-o",
+    cameras = json.loads((views / "cameras.json").read_text())
+    assert set(cameras) == {path.stem for path in views.glob("*.ply")}
+    for name in cameras:                                                # of a child, who is merged quickly
+        view = read_mesh(views / f"{name}.ply")
+        write_mesh(tmp_path / "views" / f"{name}.ply", view.with_vertices(CHILD * view.vertices))
+    (tmp_path / "views" / "cameras.json").write_text(json.dumps(
+        {name: (CHILD * np.array(place)).tolist() for name, place in cameras.items()}))
+    assert run(template, "scape prep template", [str(tmp_path / "views"), "--faces", "3000", "-o",
                                                           str(tmp_path / "t.ply")]) == 0
     assert template_problem(read_mesh(tmp_path / "t.ply")) is None
 
