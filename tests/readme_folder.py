@@ -3,27 +3,21 @@ import json
 import re
 import shlex
 import shutil
-from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import patch
 from urllib.parse import quote
 from urllib.request import urlopen
 
 import numpy as np
-import pytest
-from people_bodies import small_people
-from quiet_pictures import coarse_pictures
 
-from completion import Motion, synthetic_people
+from completion import Motion
 from completion.__main__ import main
 from model import load_model, write_body_npz
 from scanprep import RegisteredSet, write_mesh
-from scanprep.batch.digests import Digests
 from scanprep.batch.ownership import HOME
 from scanprep.batch.values import load_header
 from scanprep.decimation.registered_set import decimate_set
 from scanprep.pipeline.prepare import SCANS
-from scanprep.registration import person
 from scanprep.synthetic.data_set import read_views
 from scanprep.viewer import server
 
@@ -55,32 +49,6 @@ def run_commands(readme):
         words += QUICKER.get(" ".join(words[:3]), [])
         with patch.object(server, "serve", opened_once):
             assert main(words[1:]) == 0, line
-
-
-_on: dict[str, object] = {}
-
-
-def once(find):
-    """The average person on a template, sought once of all the commands that read the same one."""
-    def found(template, landmarks, config, tell):
-        key = Digests().of(template.vertices, template.faces, landmarks, config)
-        if key not in _on:
-            _on[key] = find(template, landmarks, config, tell)
-        return _on[key]
-
-    return found
-
-
-@contextmanager
-def of_a_user(folder):
-    """Work in a folder, with a cache of its own; the model of those without one is small, and so are all pictures."""
-    small = small_people()                                       # from the cache of the run
-    with pytest.MonkeyPatch.context() as here, coarse_pictures():
-        here.setattr(person, "_person_on", once(person._person_on))
-        here.chdir(folder)
-        here.setenv(synthetic_people.CACHE, str(folder / "cache"))
-        here.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: small)
-        yield
 
 
 def opened_once(app, *_given):

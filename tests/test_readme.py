@@ -6,7 +6,8 @@ One file, so that one process does it all: these READMEs go on with what the com
 import re
 
 import pytest
-from readme_folder import ROOT, SET_UP, blocks, commands, of_a_user, run_commands, user_folder, with_demo_model
+from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder, with_demo_model
+from readme_user import of_a_user
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PACKAGES = [f"{package}/README.md" for package in ("scanprep", "completion")]

@@ -2,7 +2,8 @@
 import shutil
 
 import pytest
-from readme_folder import blocks, of_a_user, run_commands, user_folder, with_demo_model
+from readme_folder import blocks, run_commands, user_folder, with_demo_model
+from readme_user import of_a_user
 
 README = "model/README.md"
 pytestmark = pytest.mark.timeout(1800)
