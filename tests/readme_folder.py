@@ -22,7 +22,7 @@ from scanprep.synthetic.data_set import read_views
 from scanprep.viewer import server
 
 ROOT = Path(__file__).parents[1]
-CHILD = 0.45                         # the size of the person in the range views: small ones are merged quickly
+CHILD = 0.6                          # the size of the person in the range views: small ones are merged quickly
 OTHERS = 2500                        # triangles of meshes that others registered: a skeleton is sought on them
 SIDES = {0: "front", 4: "back"}      # two views of the grown person
 QUICKER = {"scape statue fit": ["--size", "512"]}            # added to a command that takes long

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from browser import wait_until
-from readme_folder import CHILD
 from scene_reader import scenes_of
 
 from completion import Motion
@@ -33,6 +32,7 @@ from scanprep.surfaces.cli import template
 from scanprep.synthetic.data_set import SUBJECT, subject_pose
 from scanprep.synthetic.people import Person
 
+CHILD = 0.45                       # the size of a person whose views are merged quickly
 pytestmark = pytest.mark.timeout(600)
 
 
