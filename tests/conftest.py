@@ -11,6 +11,7 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not take each other's cores
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.cpu_count = lambda: 1
+    os.sched_getaffinity = lambda pid: {0}
 
 from browser import browser, new_page, page  # noqa: F401 -- fixtures
 from click_app import app, server  # noqa: F401 -- fixtures
@@ -18,19 +19,20 @@ from click_app import app, server  # noqa: F401 -- fixtures
 from scanprep.command_line import run
 
 LONGEST = (
-    "readme", "scanprep_pipeline_workers", "model_coregistration_rounds", "scanprep_pipeline",
-    "model_coregistration", "model_learning_resume", "model_statue_cli", "demo", "completion_mosh_resume",
-    "scanprep_registration_nonrigid", "model_learning_cli", "judgement", "scanprep_skeleton_search",
-    "completion_interactive", "completion_viewing_inside", "scanprep_skeleton_find", "scanprep_decimation",
-    "completion_tracking", "completion_stream", "scanprep_viewer_pick", "model_mixing", "completion_tracking_cli",
-    "scanprep_cli", "completion_mend", "completion_search", "model_conformance")
+    "readme", "model_learning_resume", "completion_mosh_resume", "scanprep_pipeline_workers", "model_statue_cli",
+    "readme_model", "demo", "model_coregistration_rounds", "model_statue_features", "scanprep_viewer_pick", "judgement",
+    "scanprep_pipeline", "scanprep_registration_start", "model_coregistration", "model_learning_cli",
+    "scanprep_skeleton_search", "scanprep_skeleton_find", "scanprep_template", "completion_stream",
+    "scanprep_viewer_connection", "completion_viewing_inside", "completion_measuring", "scanprep_registration_nonrigid",
+    "completion_viewing_models", "model_conformance", "model_animals", "completion_interactive",
+    "completion_mosh_cli", "model_mixing", "scanprep_cli", "completion_tracking")
 PLACE = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
 
 
 def pytest_collection_modifyitems(items):
     """The longest files first, so that all processes end at about the same time.
 
-    `demo` waits for the folder that `readme` makes first, so it is not at the very beginning.
+    `readme_model` and `demo` wait for the folder that `readme` makes first, so they are not at the very beginning.
     """
     items.sort(key=lambda item: PLACE.get(item.path.name, len(PLACE)))
 
@@ -55,11 +57,14 @@ def demo_folder(run_folder):
         while not ended.exists():
             time.sleep(0.5)
     else:
+        from quiet_pictures import coarse_pictures
+
         from completion.demo.cli import demo
 
         code = None
         try:
-            code = run(demo, "scape demo", ["--quick", "--output", str(folder)])
+            with coarse_pictures():
+                code = run(demo, "scape demo", ["--quick", "--output", str(folder)])
         finally:
             ended.write_text(str(code))
     assert ended.read_text() == "0"

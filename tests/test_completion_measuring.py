@@ -12,6 +12,7 @@ from completion.__main__ import main
 from completion.partial.completion import Completion, save_completion
 from model import find_tapes, measure
 from model.measurement.catalogue import CATALOGUE
+from model.measurement.survey import ordinal, percentiles
 from scanprep import Mesh, RegisteredSet, write_mesh
 from scanprep.geometry.landmark_names import known_landmarks, landmark_name
 from scanprep.judgement import Judgement
@@ -186,3 +187,18 @@ def test_a_hole_leaves_a_cell_empty(folder, tmp_path, capsys):
     assert row["waist_girth"] != "" and "nan" not in (tmp_path / "m.csv").read_text().lower()
     said = capsys.readouterr().err
     assert "LOOK AT THE RESULT: open: no knee girth left, a hole" in said, said
+
+
+def test_percentiles_of_a_sex(folder, tmp_path, capsys):
+    """The table, the figures and the page compare with the survey; without --sex nothing of it is there."""
+    assert scape(folder / "bodies" / "rest.ply", "-m", folder / "model.npz", "--sex", "male", "-o",
+                 tmp_path / "m.csv") == 0
+    row = table(tmp_path / "m.csv")["rest"]
+    true = percentiles({"stature": float(row["stature"]), "thigh_girth_left": float(row["thigh_girth_left"])}, "male")
+    assert float(row["stature_percentile"]) == pytest.approx(true["stature"], abs=0.3)
+    assert float(row["thigh_girth_left_percentile"]) == pytest.approx(true["thigh_girth_left"], abs=0.3)
+    assert "knee_girth_left_percentile" not in row, "the survey has none"
+    assert "of men" in capsys.readouterr().out
+    page = (tmp_path / "m.html").read_text(encoding="utf-8")
+    assert f"({ordinal(true['stature'])})" in page and "4,082 men of ANSUR II" in page
+    assert scape("--to", "stature=1.8", "--sex", "male", "-m", folder / "model.npz", "-o", tmp_path / "b.ply") == 2

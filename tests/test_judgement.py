@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
+from people_bodies import small_people
 from quiet_pictures import small_pictures  # noqa: F401 -- fixture
 from scanned_shapes import ball as sphere
 from scipy import stats
@@ -26,7 +27,6 @@ from completion.mocap.subject.worn_elsewhere import Worn
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
-from completion.synthetic_people import synthetic_model
 from completion.tracking.cli import wrong_size
 from completion.tracking.sequence import tracking_doubts, tracking_problem
 from model.coregistration.rounds import coregistration_doubts, coregistration_problem
@@ -445,7 +445,7 @@ def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
 
 
 def test_betas_that_somebody_typed_are_the_cause_of_the_body_that_they_make():
-    model = synthetic_model()
+    model = small_people()
     found = person_judgement(model, np.array([20.0]), ASKED)
     assert found.verdict == "failed" and found.reasons[0].endswith(ASKED) and "--unit" not in found.why
     assert person_judgement(model, np.array([2.0, -1.0]), ASKED).verdict == "good"

@@ -1,35 +1,26 @@
-"""Every command and snippet of the README runs, on files under the names that it uses; then those of the packages.
+"""Every command and snippet of the README runs, on files under the names that it uses; then those of two packages.
 
-One file, so that one process does it all: the READMEs of the packages go on with what the commands of the README wrote.
+One file, so that one process does it all: these READMEs go on with what the commands of the README wrote. That of
+`model` needs only what the demonstration did: `test_readme_model.py`.
 """
 import re
 
 import pytest
-from people_bodies import SMALL
-from quiet_pictures import coarse_pictures
 from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder, with_demo_model
-
-from completion import synthetic_people
-from completion.synthetic_people import build_synthetic
+from readme_user import of_a_user
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PACKAGES = [f"{package}/README.md" for package in ("scanprep", "model", "completion")]
+PACKAGES = [f"{package}/README.md" for package in ("scanprep", "completion")]
 pytestmark = pytest.mark.timeout(1800)
 
 
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
-    """The folder of a user in which the commands of the README were run.
-
-    The model of those without one is small, and so are all pictures.
-    """
+    """The folder of a user in which the commands of the README were run."""
     folder = user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
-    with pytest.MonkeyPatch.context() as patch, coarse_pictures():
-        patch.chdir(folder)
-        patch.setenv("SCAPEKIT_CACHE", str(folder / "cache"))
-        patch.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: build_synthetic(SMALL, progress))
+    with of_a_user(folder):
         run_commands("README.md")
-        yield folder
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +30,13 @@ def results(place):
 
 
 @pytest.fixture(autouse=True)
-def there(request, monkeypatch):
+def there(request):
     """Work in that folder."""
-    if "place" in request.fixturenames:
-        place = request.getfixturevalue("place")
-        monkeypatch.chdir(place)
-        monkeypatch.setenv("SCAPEKIT_CACHE", str(place / "cache"))
+    if "place" not in request.fixturenames:
+        yield
+        return
+    with of_a_user(request.getfixturevalue("place")):
+        yield
 
 
 def test_set_up_is_what_ci_does():

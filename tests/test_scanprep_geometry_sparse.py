@@ -7,7 +7,7 @@ from scipy.sparse import csc_array, eye_array, random_array
 from scipy.spatial import ConvexHull
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import Factored, conjugate_gradients, factor, harmonic, solve_smooth
+from scanprep.geometry.sparse import Factored, conjugate_gradients, distinct, factor, harmonic, solve_smooth
 
 
 def system(n=80, seed=0):
@@ -91,3 +91,11 @@ def test_harmonic_values_are_means_of_their_neighbours():
     means = (two.vertex_adjacency @ filled) / two.vertex_adjacency.sum(axis=1)[:, None]
     np.testing.assert_allclose(filled[~untouched], means[~untouched], atol=1e-9)
     assert filled[~untouched].max() <= values[known].max() and filled[~untouched].min() >= values[known].min()
+
+
+def test_distinct_numbers_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    for numbers in (rng.integers(-50, 50, (40, 3)), np.arange(0), np.array([7, 7]), rng.integers(0, 2**60, 500)):
+        found = distinct(numbers)
+        assert found.dtype == numbers.dtype
+        np.testing.assert_array_equal(found, np.unique(numbers))

@@ -257,18 +257,25 @@ def test_rotations_are_those_of_a_rigid_motion_and_a_fold_does_not_sway_them():
     assert np.linalg.norm(rotations.log(vertex_rotations(mesh, x) @ R.T), axis=1).max() < 0.3
 
 
+@pytest.fixture(scope="module")
+def near_the_origin():
+    """A body, points of it, four marks, and the registration that they lead to."""
+    template = body()
+    points = template.vertices[::3] + 0.002 * np.sin(40 * template.vertices[::3])
+    marks = np.array([3, 400, 900, 1500])
+    near = template.vertices[marks]
+    hints = Correspondences(marks, near, np.ones(4))
+    return template, points, marks, hints, register(template, points, (marks, near), small(), None, hints, np.eye(4))
+
+
 @pytest.mark.parametrize("away", [(3.0, -3.0, 3.0), (5e5, 5e6, 100.0)], ids=["a room", "UTM"])
-def test_a_scan_far_from_the_origin_is_registered_as_one_near_it(away):
+def test_a_scan_far_from_the_origin_is_registered_as_one_near_it(near_the_origin, away):
     """And is given back there: what led it and where it began come along.
 
     In UTM the scan itself is rounded, to a nanometre, which tips a few matches.
     """
-    template = body()
-    points = template.vertices[::3] + 0.002 * np.sin(40 * template.vertices[::3])
-    marks = np.array([3, 400, 900, 1500])
-    near, hints = template.vertices[marks], Correspondences(marks, template.vertices[marks], np.ones(4))
-    here = register(template, points, (marks, near), small(), None, hints, np.eye(4))
-    start = np.eye(4)
+    template, points, marks, hints, here = near_the_origin
+    start, near = np.eye(4), hints.scan_points
     start[:3, 3] = away
     there = register(template, points + away, (marks, near + away), small(), None,
                      replace(hints, scan_points=near + away), start)

@@ -188,7 +188,7 @@ def test_the_same_input_gives_the_same_bytes(figure: Figure, poses: np.ndarray, 
 
 def test_noise_leaves_the_parts(figure: Figure, poses: np.ndarray) -> None:
     noisy = poses + np.random.default_rng(9).normal(0, 0.005, poses.shape)
-    part = match(figure, skeleton := find_skeleton(figure.template, noisy))
+    part = match(figure, skeleton := find_skeleton(figure.template, noisy, FEW))
     assert len(skeleton.parents) == len(BOXES)
     assert np.linalg.norm(skeleton.joints[part[1:]] - JOINTS[1:], axis=1).max() < 0.01
 

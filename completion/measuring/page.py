@@ -7,6 +7,7 @@ import numpy as np
 
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.measure import Measurements
+from model.measurement.survey import WORDS, Sex, ordinal, percentiles, survey
 from model.measurement.tapes import Girth, Height, Tapes
 from scanprep.cli import MM
 from scanprep.pictures.camera import Camera
@@ -19,9 +20,9 @@ HEIGHT = (0.25, 0.30, 0.38)          # colour of the lines of heights
 BESIDE = 0.045                       # metres between the lines of heights
 
 
-def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Sequence[Measurements], tapes: Tapes
-                  ) -> Page:
-    """The page of `scape measure`, of bodies (N, 3) as they were measured."""
+def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Sequence[Measurements], tapes: Tapes,
+                  sex: Sex | None = None) -> Page:
+    """The page of `scape measure`, of bodies (N, 3) as they were measured, compared with people of a sex."""
     several = f"{len(names)} bodies" if len(names) > 1 else names[0]
     page = Page(f"{several}, measured", "Where the tape ran on each body. Metres in the table file, millimetres here.")
     shown = range(min(SHOWN, len(names)))
@@ -33,9 +34,12 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
                     560 if len(few) < 3 else 420)
     if len(names) > SHOWN:
         page.text(f"The first {SHOWN} of {len(names)} bodies; all are in the table file.")
-    page.table([(_words(both), *(_cell(found[k], both) for k in shown)) for both in _pairs()
+    page.table([(_words(both), *(_cell(found[k], both, sex) for k in shown)) for both in _pairs()
                 if any(name in found[k].readings for k in shown for name in both)],
                ("mm", *(names[k] for k in shown)))
+    if sex:
+        page.text(f"In brackets: the percentile among {survey(sex).people:,} {WORDS[sex]} of ANSUR II, the survey of "
+                  "US Army personnel of 2012. Soldiers are leaner and younger than everybody.")
     notes = [(names[k], line) for k in shown for line in (
         *found[k].turned, *(f"no {name.replace('_', ' ')}: {why}" for name, why in found[k].missing.items()))]
     if notes:
@@ -61,10 +65,17 @@ def _words(both: tuple[str, ...]) -> str:
     return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", "\u00a0")
 
 
-def _cell(mine: Measurements, both: tuple[str, ...]) -> str:
-    """Millimetres of one measurement, or of left and right."""
-    return " / ".join(f"{MM * mine.values[name]:,.0f}" + (f" ± {MM * mine.errors[name]:.0f}" if name in mine.errors
-                                                          else "") if name in mine.values else "–" for name in both)
+def _cell(mine: Measurements, both: tuple[str, ...], sex: Sex | None) -> str:
+    """Millimetres of one measurement, or of left and right, with the percentile among people of a sex."""
+    shares = percentiles(mine.values, sex) if sex else {}
+
+    def text(name: str) -> str:
+        if name not in mine.values:
+            return "–"
+        error = f" ± {MM * mine.errors[name]:.0f}" if name in mine.errors else ""
+        return f"{MM * mine.values[name]:,.0f}{error}" + (f" ({ordinal(shares[name])})" if name in shares else "")
+
+    return " / ".join(map(text, both))
 
 
 def _pane(name: str, vertices: np.ndarray, mine: Measurements, tapes: Tapes, labelled: bool) -> Pane:

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
+from ..geometry.sparse import distinct
 from ..geometry.surface import Rays, barycentric, mesh_and_camera
 from ..ranges import Cell, Cosine, Range, Settings, Share
 from ..repair.manifold import drop_small_components, split_vertices
@@ -102,7 +103,7 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     ends = [end for view in prepared for end in (view.mesh.vertices.min(axis=0), view.mesh.vertices.max(axis=0))]
     grid = _Grid.around(np.min(ends, axis=0), np.max(ends, axis=0), config.voxel)
     near = [grid.near(view.mesh) for view in prepared]
-    keys = np.unique(np.concatenate(near))
+    keys = distinct(np.concatenate(near))
     points = grid.points(keys)
     total, weight = np.zeros(len(keys)), np.zeros(len(keys))
     for number, view in enumerate(prepared):
@@ -167,10 +168,10 @@ class _Grid:
         """Sorted numbers of the voxels in the blocks that hold a surface, and in those around them."""
         side = BLOCK * self.voxel
         blocks = np.floor((_dense_points(mesh, side / 2) - self.origin) / side).astype(np.int64)
-        flat = np.unique(np.ravel_multi_index(tuple(blocks.T), self.blocks))
+        flat = distinct(np.ravel_multi_index(tuple(blocks.T), self.blocks))
         for axis in range(3):                       # one axis after the other is cheap
             step = int(np.prod(self.blocks[axis + 1:]))
-            flat = np.unique(np.concatenate([flat - step, flat, flat + step]))
+            flat = distinct(np.concatenate([flat - step, flat, flat + step]))
         blocks = np.stack(np.unravel_index(flat, self.blocks), axis=1)
         inside = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         voxels = (BLOCK * blocks[:, None] + inside).reshape(-1, 3)
@@ -179,7 +180,7 @@ class _Grid:
 
 def _dense_points(mesh: Mesh, spacing: float) -> np.ndarray:
     """Points that leave no triangle further than about `spacing` from one of them."""
-    points = [mesh.vertices[np.unique(mesh.faces)]]
+    points = [mesh.vertices[distinct(mesh.faces)]]
     corners = mesh.corners
     while len(corners):
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -221,7 +222,7 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     cells = cells[(inside > 0) & (inside < 8)]
     if not len(cells):
         return Mesh(np.empty((0, 3)), np.empty((0, 3), int))
-    used = np.unique(cells.ravel())
+    used = distinct(cells.ravel())
     local = np.searchsorted(used, cells)
     values = distance[used]
     values[np.abs(values) < 1e-4 * voxel] = 1e-4 * voxel   # a surface through a corner would make flat triangles

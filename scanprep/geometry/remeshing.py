@@ -5,6 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from .mesh import Mesh
+from .sparse import distinct
 from .surface import Surface
 
 
@@ -29,7 +30,7 @@ def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine
     across = np.roll(faces, 1, axis=1).ravel()
     face = np.repeat(np.arange(len(faces)), 3)
     key = np.minimum(start, end) * count + np.maximum(start, end)
-    known = np.unique(key)
+    known = distinct(key)
     order = np.argsort(key, kind="stable")
     order = order[allowed[face[order]]]
     twin = np.flatnonzero(key[order][1:] == key[order][:-1])

@@ -1,4 +1,4 @@
-"""Sums over groups, and symmetric positive definite systems, factored once and solved many times."""
+"""Sums over groups, different numbers, and symmetric positive definite systems, factored once and solved many times."""
 from __future__ import annotations
 
 import math
@@ -20,6 +20,22 @@ def gatherer(index: np.ndarray, count: int) -> csr_array:
 def sum_groups(gather: csr_array, values: np.ndarray) -> np.ndarray:
     """(count, ...) what a `gatherer` makes of values (n, ...)."""
     return (gather @ values.reshape(len(values), math.prod(values.shape[1:]))).reshape(-1, *values.shape[1:])
+
+
+def distinct(numbers: np.ndarray) -> np.ndarray:
+    """The different integers (k,) among some, ascending.
+
+    Sorted; NumPy's `unique` hashes integers since 2.3, which takes 25 times as long for a million of them.
+
+    Examples
+    --------
+    >>> distinct(np.array([[3, 1], [1, 2]])).tolist()
+    [1, 2, 3]
+    """
+    ordered = np.sort(numbers, axis=None)
+    first = np.ones(len(ordered), dtype=bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return np.asarray(ordered[first])
 
 
 def connected_pieces(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from .farthest_points import thin
 from .mesh import Mesh
 from .places import distinct_places
 from .sanitise import sanitise
+from .sparse import distinct
 from .surface import OrientedPoints, checked_points
 
 
@@ -42,7 +43,7 @@ def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
     index, normals = distinct_places(points), None
     if isinstance(scan, Mesh) and len(scan.faces):
         scan = sanitise(scan, name)
-        index = np.unique(scan.faces)
+        index = distinct(scan.faces)
         index = index[distinct_places(points[index])]
         normals = scan.vertex_normals[index]
     if len(index) < 4:

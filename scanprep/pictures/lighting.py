@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from ..geometry.format_common import as_seen
+from ..geometry.sparse import distinct
 
 # Directions of the lights in the camera's frame (right, up, back) and their linear strengths.
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
@@ -72,7 +73,7 @@ class Scene:
         rays = np.flatnonzero(hit["primID"] >= 0)
         face = hit["primID"][rays]
         # fill in the visibility at the corners of the triangles in sight
-        faces = np.unique(face)
+        faces = distinct(face)
         sky = sphere_directions(80)
         key = cone_directions(_unit(np.array(KEY[0])) @ self.axes, 0.16, 14)
         for shape, start, end in zip(self._shapes, self._starts[:-1], self._starts[1:], strict=True):

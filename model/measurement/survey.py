@@ -1,0 +1,121 @@
+"""Where a measurement stands among people who were measured: percentiles of ANSUR II.
+
+The table holds, for women and men, mean, standard deviation and quantiles of 22 measures and age, and how the measures
+go together. `tests/people/ansur2.py` made it from the rows of the survey, which are not here.
+"""
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+Sex = Literal["female", "male"]
+NAME = "ANSUR II"
+WORDS = {"female": "women", "male": "men"}
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What was measured of one sex.
+
+    Attributes
+    ----------
+    people : int
+        How many were measured.
+    names : tuple of str
+        Measures, as in `CATALOGUE` without the side; "weight", "knee_height" and "age" beside them.
+    mean, sd : (m,) float
+        Metres; kilograms; years.
+    shares : (q,) float
+        Of the people, from 0 to 1.
+    quantiles : (m, q) float
+        What that share of the people do not exceed.
+    correlation : (m, m) float
+        Of normal scores.
+    """
+
+    people: int
+    names: tuple[str, ...]
+    mean: np.ndarray
+    sd: np.ndarray
+    shares: np.ndarray
+    quantiles: np.ndarray
+    correlation: np.ndarray
+
+
+@lru_cache(maxsize=2)
+def survey(sex: Sex) -> Survey:
+    """The table of a sex.
+
+    Raises
+    ------
+    ValueError
+        Another word than "female" or "male".
+    """
+    if sex not in WORDS:
+        raise ValueError(f"sex: expected 'female' or 'male', got {sex!r}")
+    table = json.loads(Path(__file__).with_name("ansur2.json").read_text(encoding="utf-8"))
+    mine = table[sex]
+    return Survey(mine["people"], tuple(table["measures"]), np.array(mine["mean"]), np.array(mine["sd"]),
+                  np.array(table["shares"]), np.array(mine["quantiles"]), np.array(mine["correlation"]))
+
+
+def percentiles(values: Mapping[str, float], sex: Sex) -> dict[str, float]:
+    """Which share of the people of a sex, in per cent, has less of each measure that the survey knows.
+
+    Between two quantiles the normal score is linear in the value, and beyond the outermost as steep as between the
+    last two. Soldiers of 17 to 58 years were measured: they are leaner and younger than everybody.
+
+    Parameters
+    ----------
+    values : name to float
+        Metres, by names of `CATALOGUE`; "weight" in kilograms.
+    sex : {"female", "male"}
+
+    Returns
+    -------
+    dict of name to float
+        From 0.1 to 99.9: nothing is known further out.
+
+    Examples
+    --------
+    >>> {name: round(share) for name, share in percentiles({"stature": 1.756, "waist_girth": 0.94}, "male").items()}
+    {'stature': 51, 'waist_girth': 51}
+    """
+    table = survey(sex)
+    scores, found = ndtri(table.shares), dict[str, float]()
+    for name, value in values.items():
+        plain = name.removesuffix("_left").removesuffix("_right")
+        if plain not in table.names or not np.isfinite(value):
+            continue
+        x = table.quantiles[table.names.index(plain)]
+        if value < x[0] or value > x[-1]:
+            a, b = (0, 1) if value < x[0] else (-2, -1)
+            score = scores[b] + (value - x[b]) * (scores[b] - scores[a]) / (x[b] - x[a])
+        else:
+            score = float(np.interp(value, x, scores))
+        found[name] = float(np.clip(100 * ndtr(score), 0.1, 99.9))
+    return found
+
+
+def ordinal(percentile: float) -> str:
+    """A percentile in words: 52nd, above 99th, below 1st.
+
+    Examples
+    --------
+    >>> ordinal(51.7), ordinal(12.2), ordinal(99.7)
+    ('52nd', '12th', 'above 99th')
+    """
+    if percentile > 99:
+        return "above 99th"
+    if percentile < 1:
+        return "below 1st"
+    whole = round(percentile)
+    ending = "th" if whole % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(whole % 10, "th")
+    return f"{whole}{ending}"

@@ -1,0 +1,56 @@
+"""Percentiles of people who were measured: the table's own quantiles, order, ends, and who it knows."""
+import numpy as np
+import pytest
+
+from model.measurement.catalogue import CATALOGUE
+from model.measurement.survey import WORDS, ordinal, percentiles, survey
+
+SEXES = tuple(WORDS)
+
+
+@pytest.mark.parametrize("sex", SEXES)
+def test_the_table_says_what_it_says(sex):
+    """Its quantiles are their own percentiles, its means near the middle, its correlation one."""
+    table = survey(sex)
+    assert (np.diff(table.quantiles[:-1], axis=1) > 0).all()
+    assert np.array_equal(table.correlation, table.correlation.T)
+    assert np.linalg.eigvalsh(table.correlation).min() > 0 and np.allclose(np.diag(table.correlation), 1)
+    for name, quantiles in zip(table.names[:-1], table.quantiles[:-1], strict=True):        # ages are whole years
+        for share, value in zip(table.shares, quantiles, strict=True):
+            assert percentiles({name: value}, sex)[name] == pytest.approx(100 * share, abs=1e-6)
+    for name, mean in zip(table.names, table.mean, strict=True):
+        assert 35 < percentiles({name: mean}, sex)[name] < 65
+    assert set(table.names) - {"weight", "knee_height", "age"} <= {
+        name.removesuffix("_left").removesuffix("_right") for name in CATALOGUE}
+
+
+@pytest.mark.parametrize("sex", SEXES)
+def test_percentiles_grow_with_the_value_and_end(sex):
+    shares = [percentiles({"waist_girth": x}, sex)["waist_girth"] for x in np.linspace(0.3, 2.5, 400)]
+    assert (np.diff(shares) >= 0).all() and (shares[0], shares[-1]) == (0.1, 99.9)
+
+
+@pytest.mark.parametrize(("name", "mean", "sd"), [
+    ("stature", 1693, 93), ("chest_girth", 1002, 101), ("waist_girth", 899, 112), ("hip_girth", 1020, 77),
+    ("thigh_girth", 621, 58)])
+def test_women_and_men_half_and_half(name, mean, sd):
+    """Mean and spread of both together, millimetres, as another program worked them out from 400 rows of each sex."""
+    both = [survey(sex) for sex in SEXES]
+    means = np.array([table.mean[table.names.index(name)] for table in both])
+    sds = np.array([table.sd[table.names.index(name)] for table in both])
+    assert 1000 * means.mean() == pytest.approx(mean, abs=2)
+    assert 1000 * np.sqrt((sds**2).mean() + means.var()) == pytest.approx(sd, abs=2)
+
+
+def test_sides_and_what_is_not_known():
+    both = percentiles({"calf_girth_left": 0.39, "calf_girth_right": 0.39, "knee_girth_left": 0.4,
+                        "neck_girth": np.nan}, "male")
+    assert list(both) == ["calf_girth_left", "calf_girth_right"] and len(set(both.values())) == 1
+    with pytest.raises(ValueError, match="sex: expected 'female' or 'male', got 'man'"):
+        survey("man")
+
+
+@pytest.mark.parametrize(("share", "words"), [(51.7, "52nd"), (1.4, "1st"), (3.3, "3rd"), (11, "11th"), (12, "12th"),
+                                              (13, "13th"), (21, "21st"), (99.2, "above 99th"), (0.4, "below 1st")])
+def test_ordinals(share, words):
+    assert ordinal(share) == words
