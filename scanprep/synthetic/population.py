@@ -67,13 +67,21 @@ class Population:
 def population() -> Population:
     """The built-in people, read once a process."""
     header, a = storage.load(STORED, "people", (VERSION,))
+    mirror = a["mirror"].astype(np.int64)
+    n, swap = len(mirror), MIRROR_PART
+    twin = np.concatenate([mirror, n + swap, n + 16 + swap, [n + 32]])
+    # stored numbers are rounded; left and right stay mirror images
+    mean = a["mean"].astype(np.float64)
+    mean = 0.5 * (mean + mean[twin] * [-1, 1, 1])
     directions = a["directions"] * a["scale"].astype(np.float64)[:, None, None]
+    directions = 0.5 * (directions + directions[:, twin] * [-1, 1, 1])
     weights = a["weights"].astype(np.float64)
+    weights += weights[mirror][:, swap]
 
     def marks(kind: str) -> dict[str, int]:
         return {str(name): int(v) for name, v in zip(a[kind], a[f"{kind}_vertices"], strict=True)}
 
-    return Population(a["mean"].astype(np.float64), directions, a["faces"].astype(np.int64),
-                      weights / weights.sum(axis=1, keepdims=True), a["mirror"].astype(np.int64),
+    return Population(mean, directions, a["faces"].astype(np.int64),
+                      weights / weights.sum(axis=1, keepdims=True), mirror,
                       {sex: (a[f"{sex}_mean"], a[f"{sex}_covariance"]) for sex in ("female", "male")},
                       marks("landmarks"), marks("markers"), header)

@@ -242,14 +242,14 @@ def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, betas:
     kept = [i for i, name in enumerate(survey.names) if name != "age"]
     goal, C, sd = survey.mean[kept], survey.covariance[np.ix_(kept, kept)], survey.sd[kept]
     m, S = betas.mean(axis=0), np.cov(betas.T)
-    for _ in range(2):
-        rows = mean + np.tensordot(m, directions, 1)
-        values, J = bodies.measures(rows, directions)
+    for _ in range(5):
+        values, J = bodies.measures(mean + np.tensordot(m, directions, 1), directions)
         assert J is not None
         values, J = values[kept], J[kept]
         M = J @ S @ J.T
-        K = S @ J.T @ np.linalg.inv(M + np.diag((0.12 * sd)**2))
-        m, S = m + K @ (goal - values), S + K @ (C - M) @ K.T
+        m = m + S @ J.T @ np.linalg.solve(M + np.diag((0.03 * sd)**2), goal - values)
+        K = S @ J.T @ np.linalg.inv(M + np.diag((0.1 * sd)**2))
+        S = S + K @ (C - M) @ K.T
         S = (S + S.T) / 2
     return m, S
 
