@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
+from .landmarks import landmarks
 
 
 @lru_cache(maxsize=1)
@@ -166,10 +167,9 @@ def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lift of the root (T,) that puts the lower foot on the floor, and how far it moves ahead (T - 1,)."""
     a = average()
     soles = []
-    for foot in (12, 15):
-        toe = a.ends[foot] * [1, 1, 0]
-        heel = a.joints[foot] * [1, 1, 0] + [0, 0.055, 0]
-        soles.append([_carry(a, pose, foot, np.stack([heel, toe])) for pose in poses])
+    for foot, side in ((12, "left"), (15, "right")):
+        tread = a.vertices[[landmarks()[f"{side} {end}"] for end in ("heel", "toe")]] * [1, 1, 0]
+        soles.append([_carry(a, pose, foot, tread) for pose in poses])
     points = np.swapaxes(np.array(soles), 0, 1).reshape(len(poses), 4, 3)
     lowest = points[:, :, 2].min(axis=1)
     weight = np.exp(-(points[:, :, 2] - lowest[:, None]) / 0.01)

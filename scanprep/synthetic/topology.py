@@ -34,8 +34,17 @@ def load() -> Template:
     """The template of the built-in people."""
     people = population()
     anatomy = Anatomy(BodyShape("male", (0.0,)))
+    mesh = Mesh(anatomy.vertices, people.faces)
     carried = people.weights[people.faces].sum(axis=1)                    # (F, 16)
-    return Template(Mesh(anatomy.vertices, people.faces), people.mirror, carried.argmax(axis=1), anatomy)
+    part = carried.argmax(axis=1)
+    # islands of a part go to what carries them next
+    for p in range(len(PARENTS)):
+        piece = mesh.submesh(part == p)[0]
+        label = piece.vertex_component[piece.faces[:, 0]]
+        island = np.flatnonzero(part == p)[label != np.bincount(label).argmax()]
+        carried[island, p] = 0
+        part[island] = carried[island].argmax(axis=1)
+    return Template(mesh, people.mirror, part, anatomy)
 
 
 @lru_cache(maxsize=1)
