@@ -10,7 +10,7 @@ from scipy.sparse import csr_array, diags_array
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from ..skeleton.tree import Skeleton
-from .anatomy import PARENTS, Anatomy, BodyShape
+from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
 from .population import population
 
 
@@ -35,16 +35,40 @@ def load() -> Template:
     people = population()
     anatomy = Anatomy(BodyShape("male", (0.0,)))
     mesh = Mesh(anatomy.vertices, people.faces)
-    carried = people.weights[people.faces].sum(axis=1)                    # (F, 16)
-    part = carried.argmax(axis=1)
-    # islands of a part go to what carries them next
-    for p in range(len(PARENTS)):
-        piece = mesh.submesh(part == p)[0]
-        label = piece.vertex_component[piece.faces[:, 0]]
-        island = np.flatnonzero(part == p)[label != np.bincount(label).argmax()]
-        carried[island, p] = 0
-        part[island] = carried[island].argmax(axis=1)
+    part = label_faces(mesh, anatomy, people.weights)
+    # mirror images have mirrored parts, whatever rounding does at a border
+    left = mesh.corners.mean(axis=1)[:, 0] > 0
+    twin = {tuple(sorted(face)): f for f, face in enumerate(people.mirror[people.faces].tolist())}
+    other = np.array([twin[tuple(sorted(face))] for face in people.faces.tolist()])
+    part[~left] = MIRROR_PART[part[other[~left]]]
     return Template(mesh, people.mirror, part, anatomy)
+
+
+def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray:
+    """Part of every triangle (F,) of the left half: cut by a plane through each joint. Arms are told by blend weights."""
+    c, j = mesh.corners.mean(axis=1), anatomy.joints
+    arm = weights[mesh.faces][:, :, 4:7].sum(axis=(1, 2)) > 0.75              # a quarter of each corner
+    part = np.zeros(len(c), dtype=np.int64)
+
+    def beyond(joint: int, normal: np.ndarray) -> np.ndarray:
+        return (c - j[joint]) @ normal > 0
+
+    part[c[:, 2] > j[1, 2]] = 1
+    part[c[:, 2] > j[2, 2]] = 2
+    part[beyond(3, np.array([0, -0.35, 1.0])) & (np.abs(c[:, 0]) < 0.12)] = 3
+    # the shoulder is cut from the armpit outwards and up
+    up = anatomy.upper_arm_frame[2]
+    armpit = j[4] - [0.012 * anatomy.scale, 0, 0]
+    mine = arm & ((c - armpit) @ (0.75 * up + 0.66 * np.array([1, 0, 0.25])) > 0)
+    part[mine] = 4
+    part[mine & beyond(5, up + anatomy.forearm_frame[2])] = 5
+    part[mine & beyond(6, anatomy.forearm_frame[2])] = 6
+    # the hip from the groin to its crest
+    mine = ((c - j[10]) @ np.array([0.72, 0, -1.0]) > 0) & (c[:, 0] > 0) & (c[:, 2] < j[0, 2] + 0.02) & ~arm
+    part[mine] = 10
+    part[mine & (c[:, 2] < j[11, 2])] = 11
+    part[mine & beyond(12, np.array([0, -0.5, -1.0]))] = 12
+    return part
 
 
 @lru_cache(maxsize=1)
