@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
@@ -62,6 +64,16 @@ def test_the_motion_comes_back_from_its_markers(subject, layout, walk):
     assert motion.poses.shape == (FRAMES, 4, 3) and motion.labels == layout.labels and motion.rate == 100
     assert np.linalg.norm(motion.poses, axis=2).max() < np.pi + 0.1
     assert ticks[-1] == (FRAMES, FRAMES)
+
+
+def test_a_frame_has_converged_where_the_last_round_left_it(subject, layout, walk):
+    """From 5 cm beside the motion one round moves all frames; from its end no round moves any."""
+    _, sequence = walk
+    found = animate(subject, sequence, layout, AnimateConfig(smoothing=6))
+    beside = replace(found, trans=found.trans + [0.05, 0, 0])
+    once = AnimateConfig(smoothing=1)
+    assert not animate(subject, sequence, layout, once, near=beside).converged.any()
+    assert animate(subject, sequence, layout, once, near=found).converged.all()
 
 
 def test_missing_markers_are_left_out(subject, layout, walk):

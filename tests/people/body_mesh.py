@@ -7,6 +7,7 @@ MakeHuman's vertices, so its targets carry over by one product. Left and right h
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from dataclasses import dataclass
 
@@ -25,8 +26,8 @@ JOINTS = ("", "spine-4", "spine-2", "neck", "{}-shoulder", "{}-elbow", "{}-hand"
 BONES = {                            # how names of bones of the default rig begin: our part
     "spine05": "abdomen", "spine04": "abdomen", "spine03": "abdomen", "spine": "chest", "breast": "chest",
     "clavicle": "chest", "shoulder": "chest", "upperarm": "upper_arm_", "lowerarm": "forearm_", "wrist": "hand_",
-    "metacarpal": "hand_", "finger": "hand_", "upperleg": "thigh_", "lowerleg": "shin_", "foot": "foot_", "toe": "foot_",
-    "root": "pelvis", "pelvis": "pelvis"}
+    "metacarpal": "hand_", "finger": "hand_", "upperleg": "thigh_", "lowerleg": "shin_", "foot": "foot_",
+    "toe": "foot_", "root": "pelvis", "pelvis": "pelvis"}
 # degrees from the vertical at rest: arms sideways, forearms further ahead, legs sideways; of feet from straight ahead
 ARM, ELBOW, LEG, TOES = np.radians([36.0, 14.0, 4.5, 9.0])
 
@@ -92,7 +93,7 @@ def body_mesh(source: MakeHuman) -> BodyMesh:
             chains.append(np.array([first[0], *inner, first[-1]]))
         chains.append(second)
         places = np.array([sum(w * base[v] for v, w in row.items()) for row in rows])
-        faces += [_zip(one, other, places) for one, other in zip(chains[:-1], chains[1:], strict=True)]
+        faces += [_zip(one, other, places) for one, other in itertools.pairwise(chains)]
     # the right side is the mirror image of the left one
     for v in range(source.count, len(rows)):
         rows.append({int(twin[u]): w for u, w in rows[v].items()})

@@ -41,8 +41,10 @@ DENSITY = 985.0                      # kilograms of a person per cubic metre of 
 TOLERANCE = {"hip_width": 0.35, "chest_depth": 0.15, "knee_height": 0.15}
 MACRO_SD, LOCAL_SD = 0.25, 0.17      # prior of sliders; looser ones make barrels and waists like wasps
 LIMITS = ((-0.65, 0.95), (-1.2, 1.2))          # of macro and of local sliders from their middle
-LOCAL = {                            # local sliders: pairs of targets for less and more, those of left and right together
-    "bust": "torso/measure-bust-circ", "under bust": "torso/measure-underbust-circ", "waist": "torso/measure-waist-circ",
+# local sliders: pairs of targets for less and for more, those of left and right together
+LOCAL = {
+    "bust": "torso/measure-bust-circ", "under bust": "torso/measure-underbust-circ",
+    "waist": "torso/measure-waist-circ",
     "hips": "torso/measure-hips-circ", "thigh": "legs/measure-thigh-circ", "knee": "legs/measure-knee-circ",
     "calf": "legs/measure-calf-circ", "ankle": "feet/measure-ankle-circ", "neck": "neck/measure-neck-circ",
     "neck height": "neck/measure-neck-height", "upper arm": "arms/measure-upperarm-circ",
@@ -139,11 +141,13 @@ class Bodies:
             ids, force = np.zeros(0, dtype=int), np.zeros((0, 3))
             if name == "weight":
                 a, b, c = (V[self.mesh.faces[:, k]] for k in range(3))
-                value, ids, force = DENSITY * np.einsum("ij,ij->", a, np.cross(b, c)) / 6, np.arange(len(V)), np.zeros_like(V)
+                value = DENSITY * np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+                ids, force = np.arange(len(V)), np.zeros_like(V)
                 for k, by in enumerate((np.cross(b, c), np.cross(c, a), np.cross(a, b))):
                     np.add.at(force, self.mesh.faces[:, k], DENSITY / 6 * by)
             elif name == "knee_height":
-                ids, force = np.array([self.places[f"{side} knee"] for side in ("left", "right")]), np.array([[0, 0, 0.5]] * 2)
+                ids = np.array([self.places[f"{side} knee"] for side in ("left", "right")])
+                force = np.array([[0, 0, 0.5]] * 2)
                 value = V[ids, 2].mean()
             elif name == "age":
                 value = age
@@ -217,8 +221,7 @@ def shape_space(rows: np.ndarray, male: np.ndarray, count: int, slopes: Callable
     """
     mean = rows.mean(axis=0)
     D = (rows - mean).reshape(len(rows), -1)
-    values, U = np.linalg.eigh(D @ D.T)
-    U = U[:, ::-1][:, :count]
+    U = np.linalg.eigh(D @ D.T)[1][:, ::-1][:, :count]
     betas = U * np.sqrt(len(rows) - 1)
     directions = (U.T @ D / np.sqrt(len(rows) - 1)).reshape(count, *mean.shape)
     # turn: stature, weight, sex, then by how much they move the surface
@@ -264,7 +267,7 @@ def make(wheel: Path, table: Path, count: int, people: int, say: Callable[[str],
     bodies = Bodies(source, mesh, places["landmarks"], surveys["male"].names)
     # tapes are found on the middle between the two mean persons, so first on a rough one
     means = dict[str, np.ndarray]()
-    for rough in (True, False):
+    for _ in range(2):
         middle = 0.5 * sum(bodies.rows(means.get(sex, np.zeros(len(bodies.prior(sex)))), sex) for sex in SEXES)
         bodies.tapes = find_tapes(Mesh(middle[:mesh.count], mesh.faces), bodies.places)
         found = {sex: mean_person(bodies, sex, surveys[sex]) for sex in SEXES}

@@ -125,7 +125,7 @@ class MakeHuman:
 
 
 def _hats(value: float, corners: tuple[str, ...]) -> list[tuple[str, float]]:
-    """Corners around a value, equally spaced from 0 to 1, and how much each counts; beyond the last, on a straight line."""
+    """Corners around a value, equally spaced from 0 to 1, and how much each counts; beyond the ends, straight on."""
     place = float(np.clip(value, -0.5, 1.5)) * (len(corners) - 1)
     i = int(np.clip(np.floor(place), 0, len(corners) - 2))
     return [(corners[i], 1 - (place - i)), (corners[i + 1], place - i)]

@@ -111,7 +111,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         # swapped labels are put right, lost limbs found again, and outliers lose their weight
         order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
-        near = reinitialise_limbs(body, x[inside], taken, config)
+        near = reinitialise_limbs(body, x[inside].copy(), taken, config)         # x changes below, and is compared
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
 
         # one step of all frames together
