@@ -57,8 +57,8 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
         unit: Unit of meshes.
         to: Measurements in metres that a body is to have, such as stature=1.80 waist=0.85; the rest is as probable as
             it can be. Needs a model, or takes that of the synthetic people.
-        sex: Also tell how each measurement compares with 4,082 men or 1,986 women of ANSUR II, in percentiles. They
-            were soldiers of 17 to 58 years, who are leaner than everybody.
+        sex: Also tell percentiles among the 4,082 men or 1,986 women of ANSUR II, of measurements that were taken in
+            the same way there. They were soldiers of 17 to 58 years, who are leaner than everybody.
     """
     if to:
         if sex is not None:

@@ -39,7 +39,8 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
                ("mm", *(names[k] for k in shown)))
     if sex:
         page.text(f"In brackets: the percentile among {survey(sex).people:,} {WORDS[sex]} of ANSUR II, the survey of "
-                  "US Army personnel of 2012. Soldiers are leaner and younger than everybody.")
+                  "US Army personnel of 2012. Soldiers are leaner and younger than everybody. "
+                  "Measures that the survey took in another way have none.")
     notes = [(names[k], line) for k in shown for line in (
         *found[k].turned, *(f"no {name.replace('_', ' ')}: {why}" for name, why in found[k].missing.items()))]
     if notes:

