@@ -9,8 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
 from people_maker import mirror, remesh
 from polygonise import polygonise
+from scanprep.synthetic.body_parts import cross_sections
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
@@ -25,8 +27,6 @@ from scanprep.geometry.surface import Surface
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic import body_parts as people_parts
 from scanprep.synthetic.anatomy import Anatomy, tables
-from scanprep.synthetic.body_parts import cross_sections
-from implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.topology import CANONICAL, blending, load
 

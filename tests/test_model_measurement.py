@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from derivatives import slope
 from people_bodies import kept, small_people
+from scanprep.synthetic.body_parts import body_surface
 from scipy.spatial import ConvexHull
 
 from model import body_with_measurements, find_tapes, measure
@@ -18,7 +19,6 @@ from model.measurement.section import Curve, around, bulge, direction, mean_of, 
 from model.measurement.tapes import Girth, Span, Way
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
-from scanprep.synthetic.body_parts import body_surface
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import BodyShape, Person
 
