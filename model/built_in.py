@@ -103,10 +103,10 @@ def load_fingered_model() -> SkinningModel:
             near = np.flatnonzero(both)
             regressor[[j], near] = both[near] / both.sum()
     weights /= weights.sum(axis=1, keepdims=True)
-    rest = people.rows(np.zeros(0))[:n]
+    rest, names = people.rows(np.zeros(0))[:n], (*PARTS, *FINGERS["left"], *FINGERS["right"])
     return as_skinning(
         Published(Mesh(rest, people.faces), np.moveaxis(people.directions[:, :n], 0, -1), np.zeros((n, 3, 0)),
-                  csr_array(regressor), weights, np.array(parents), (*PARTS, *FINGERS["left"], *FINGERS["right"]), {}, ()),
+                  csr_array(regressor), weights, np.array(parents), names, {}, ()),
         {**{key: header["info"][key] for key in ("recipe", "shapes", "statistics")}, "name": f"{NAME} with fingers",
          "landmarks": people.landmarks, "markers": people.markers, "sexes": _sexes(people)})
 

@@ -1,6 +1,5 @@
 """Other people's body models: the published formula, and every way in which such a file can be wrong."""
 import pickle
-import sys
 from dataclasses import replace
 from functools import cache
 
@@ -11,7 +10,6 @@ from derivatives import differences
 from published_bodies import as_smplx, as_star, published_vertices, synthetic_smpl
 from scipy.sparse import csc_array, csr_array
 
-from model.cli import import_file
 from model.export.correctives import write_body_npz
 from model.features import QuaternionLift, RotationLift, lifted, lifted_slopes
 from model.files import load_model
@@ -22,7 +20,6 @@ from model.products import Products, Terms
 from model.resolution.change import change_resolution, resample
 from model.rig import joint_places, make_rig
 from scanprep.batch.digests import Digests
-from scanprep.command_line import run
 from scanprep.geometry import rotations
 
 

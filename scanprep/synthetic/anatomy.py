@@ -57,8 +57,8 @@ class BodyShape:
 
     @staticmethod
     def like(sex: Sex = "male", stature: float | None = None, weight: float | None = None) -> BodyShape:
-        """The most likely person of a sex who is that tall, metres, and whose second beta, *weight*, is so many standard
-        deviations from the average of those who are that tall.
+        """The most likely person of a sex who is that tall, metres, and of such a weight: so many standard deviations of
+        the second beta from the average of those who are that tall.
         """
         mean, covariance = population().moments[sex]
         betas = mean.copy()

@@ -39,7 +39,7 @@ def measure_body(model: Any, body: Mesh, k: int, landmarks: dict[str, int]) -> d
         return float(1e3 * Surface(mesh).closest(body.vertices[of]).distances.mean())
 
     start = time.process_time()
-    points, _, normals = body.sample(20000, rng)
+    points, _, _ = body.sample(20000, rng)
     points = points + rng.normal(0, 0.002, points.shape)
     every = np.array(list(known.values()))
     seven = every[np.round(np.linspace(0, len(every) - 1, 7)).astype(int)]
