@@ -288,6 +288,7 @@ def test_walk_goes_ahead_with_a_foot_on_the_floor(man):
     poses, trans = people.walk(44, rate=20.0)
     assert poses.shape == (44, 16, 3) and trans.shape == (44, 3)
     assert 0.8 < -(trans[-1, 1] - trans[0, 1]) / (43 / 20) < 2.0            # metres a second, towards -y
+    assert (-np.diff(trans[:, 1]) * 20).min() > 0.6, "nobody steps back between the feet"
     lowest = np.array([(man.posed(p, t))[:, 2].min() for p, t in zip(poses[::4], trans[::4], strict=True)])
     assert np.abs(lowest).max() < 0.03
     once, _ = people.walk(1, rate=20.0)
