@@ -64,7 +64,7 @@ def load_built_in_model() -> ScapeModel:
     skeleton = Skeleton(part, PARENTS, joints, PARTS)
     features = PoseFeatures(skeleton, LIFTS[header["lift"]], a["feature_part"].astype(np.int64), a["feature_mix"])
     space = PoseSpace(features, unpack_coefficients(features, a["pose_coefficients"], a["pose_scales"]))
-    info = {**header["info"], "name": NAME, "people_vertices": kept.tolist(), "sexes": _sexes(people)}
+    info = {"name": NAME, **header["info"], "people_vertices": kept.tolist(), "sexes": _sexes(people)}
     return ScapeModel(template, skeleton, space, shape_space(people, kept, template, space), a["pose_mean"],
                       a["pose_covariance"], info, pose_examples=a["pose_examples"].astype(np.float64))
 
@@ -107,7 +107,7 @@ def load_fingered_model() -> SkinningModel:
     return as_skinning(
         Published(Mesh(rest, people.faces), np.moveaxis(people.directions[:, :n], 0, -1), np.zeros((n, 3, 0)),
                   csr_array(regressor), weights, np.array(parents), names, {}, ()),
-        {**{key: header["info"][key] for key in ("recipe", "shapes", "statistics")}, "name": f"{NAME} with fingers",
+        {"name": f"{NAME} with fingers", **{key: header["info"][key] for key in ("source", "recipe")},
          "landmarks": people.landmarks, "markers": people.markers, "sexes": _sexes(people)})
 
 

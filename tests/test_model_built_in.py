@@ -7,6 +7,8 @@ import pytest
 from people_bodies import make_model
 
 from completion.cli import read_landmark_pairs, read_model
+from completion.mocap.joint_angles import anatomical_angles
+from completion.motion import Motion
 from completion.viewing.kinds import reported_model
 from model import fit_pose, load_model
 from model.built_in import STORED, load_built_in_model, load_fingered_model, pack_coefficients, unpack_coefficients
@@ -26,7 +28,7 @@ def test_file_and_recipe_belong_together(model):
     """`tests/people/make_model.py` makes it anew from the same people; both files are small enough for the wheel."""
     assert model.info["recipe"] == make_model.recipe_digest()
     assert STORED.stat().st_size + PEOPLE.stat().st_size < 5e6
-    assert "CC0" in model.info["shapes"] and "ANSUR II" in model.info["statistics"]
+    assert "CC0" in model.info["source"] and "ANSUR II" in model.info["source"]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -63,8 +65,25 @@ def test_women_and_men_together_have_betas_of_mean_0_and_variance_1(model):
     sexes = [model.info["sexes"][sex] for sex in ("female", "male")]
     means, covariances = (np.array([sex[key] for sex in sexes]) for key in ("mean", "covariance"))
     apart = (means[0] - means[1]) / 2
-    np.testing.assert_allclose(means.mean(axis=0), 0, atol=0.1)
-    np.testing.assert_allclose(np.diag(covariances.mean(axis=0) + np.outer(apart, apart)), 1, atol=0.25)
+    np.testing.assert_allclose(means.mean(axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(covariances.mean(axis=0) + np.outer(apart, apart), np.eye(30), atol=1e-9)
+
+
+# Degrees that healthy adults reach: American Academy of Orthopaedic Surgeons, 1965, and a few of slack
+RANGES = {"knee_angle": (-5, 145), "hip_flexion": (-35, 125), "hip_adduction": (-50, 35), "hip_rotation": (-50, 50),
+          "elbow_flex": (-5, 150), "ankle_angle": (-55, 25), "wrist_flex": (-80, 80), "wrist_dev": (-35, 25),
+          "shoulder_elevation": (0, 180)}
+
+
+def test_it_knows_poses_within_the_ranges_of_joints(model):
+    poses = model.pose_examples
+    still = Motion(poses, np.zeros((len(poses), 3)), np.zeros(30), 1.0, np.zeros((len(poses), 0)), ())
+    found = anatomical_angles(still, model.subject(np.zeros(30)), np.zeros(poses.shape))
+    for name, (low, high) in RANGES.items():
+        for side in "lr":
+            angles = found.degrees[:, found.names.index(f"{name}_{side}")]
+            assert np.mean((angles < low) | (angles > high)) < 0.04, name
+            assert np.ptp(angles) > 15
 
 
 def test_packed_coefficients_are_the_same_to_the_last_digits(model):

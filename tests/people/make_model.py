@@ -156,7 +156,7 @@ def main() -> None:
                "joint_vertices": joints.indices.reshape(16, -1).astype(np.uint16),
                "joint_weights": joints.data.reshape(16, -1).astype(np.float32)}
     source = population().source
-    header["info"] |= {"recipe": recipe_digest(), "shapes": source["shapes"], "statistics": source["statistics"]}
+    header["info"] = {"source": f"{source['shapes']}; {source['statistics']}", "recipe": recipe_digest()} | header["info"]
     storage.save(args.output, KIND, VERSION, arrays, header)
 
 
