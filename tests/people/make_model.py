@@ -155,8 +155,8 @@ def main() -> None:
     arrays |= {"hand_vertices": hand.astype(np.uint16), "finger_weights": np.round(255 * fingers).astype(np.uint8),
                "joint_vertices": joints.indices.reshape(16, -1).astype(np.uint16),
                "joint_weights": joints.data.reshape(16, -1).astype(np.float32)}
-    source = population().source
-    header["info"] = {"source": f"{source['shapes']}; {source['statistics']}", "recipe": recipe_digest()} | header["info"]
+    source = "{shapes}; {statistics}".format(**population().source)
+    header["info"] = {"source": source, "recipe": recipe_digest()} | header["info"]
     storage.save(args.output, KIND, VERSION, arrays, header)
 
 
