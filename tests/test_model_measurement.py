@@ -8,7 +8,6 @@ from cartoons import cartoon
 from derivatives import slope
 from implicit_surface import project
 from people_bodies import kept, small_people
-from scanprep.synthetic.body_parts import body_surface
 from scipy.spatial import ConvexHull
 
 from model import body_with_measurements, find_tapes, measure
