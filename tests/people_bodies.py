@@ -9,7 +9,7 @@ from completion.synthetic_people import SyntheticRecipe, synthetic_model
 from model.body import BodyModel
 from model.learning.config import LearnConfig
 
-SMALL = SyntheticRecipe(poses=12, people=8, faces=2000, learn=LearnConfig(components=4, refinements=0))
+SMALL = SyntheticRecipe(poses=12, people=8, faces=3000, learn=LearnConfig(components=4, refinements=0))
 
 
 @lru_cache(maxsize=1)

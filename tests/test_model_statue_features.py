@@ -249,7 +249,7 @@ def test_the_unit_is_told_by_the_height(length, unit):
 
 
 def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_arm(control):
-    person = Person(BodyShape(sex=-1, stature=1.62, weight=1.0))
+    person = Person(BodyShape.like("female", stature=1.62, weight=1.0))
     pose = compose(left_arm={"direction": (0.8, 0.5, -0.3), "elbow": 40}, back={"turn": 15}, right_leg={"knee": 20})
     vertices, joints = person.posed(pose), person.posed_joints(pose)
     rng = np.random.default_rng(4)
