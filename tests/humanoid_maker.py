@@ -96,7 +96,7 @@ def joint_places(a: Anatomy) -> np.ndarray:
     joints = a.joints[of_people]
     joints[3] = at(0.026 * a.scale, 0.035 * a.scale, a.at(1.03))
     joints[7] = joints[3] * [-1, 1, 1]
-    return joints
+    return np.where(np.abs(joints) < 1e-12, 0.0, joints)
 
 
 def slide(control: ControlModel, anatomy: Anatomy, rounds: int = 12) -> Mesh:

@@ -21,11 +21,11 @@ SHARED = "SCAPEKIT_TESTS"            # the folder of the run, see conftest
 
 @lru_cache(maxsize=1)
 def small_people() -> BodyModel:
-    """16 parts, four betas, a thousand vertices; from the folder of the run, for its other processes."""
+    """16 parts, four betas, 1,500 vertices; from the folder of the run, for its other processes."""
     path = Path(os.environ[SHARED]) / "small_people.npz"
     with locked(path.with_suffix(".lock"), path, wait=True):
         if not path.exists():
-            make_model.learn_people_model(12, 2000, LearnConfig(refinements=0), n_betas=4).save(path)
+            make_model.learn_people_model(12, 3000, LearnConfig(refinements=0), n_betas=4).save(path)
     return load_model(path)
 
 

@@ -27,7 +27,7 @@ class Synthetic:
     vertices: np.ndarray
 
 
-def synthetic_smpl(faces: int = 1600, people: int = 3, poses: int = 8, seed: int = 5) -> Synthetic:
+def synthetic_smpl(faces: int = 2400, people: int = 3, poses: int = 8, seed: int = 5) -> Synthetic:
     """24 joints, 10 betas and 207 pose columns, learned from synthetic people; no spine is cut but ours."""
     rng, man = np.random.default_rng(seed), Person(SUBJECT)
     at = [random_pose(rng) for _ in range(poses)]

@@ -134,7 +134,7 @@ def test_people_are_fitted_and_the_resolution_changes(both):
     assert fit.mean < 1e-3
     if len(model.skeleton.parents) == 55:                # its fingers are single triangles here
         return
-    coarse = change_resolution(model, resample(model.template, 500))
+    coarse = change_resolution(model, resample(model.template, 1000))
     np.testing.assert_allclose(coarse.rest_joints(betas), model.rest_joints(betas), rtol=0, atol=1e-9)
 
 

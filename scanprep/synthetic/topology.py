@@ -67,7 +67,7 @@ def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray
     mine = ((c - j[10]) @ np.array([0.72, 0, -1.0]) > 0) & (c[:, 0] > 0) & (c[:, 2] < j[0, 2] + 0.02) & ~arm
     part[mine] = 10
     part[mine & (c[:, 2] < j[11, 2])] = 11
-    part[mine & beyond(12, np.array([0, -0.5, -1.0]))] = 12
+    part[mine & beyond(12, np.array([0, -0.3, -1.0]))] = 12                # with all of the heel
     return part
 
 
