@@ -35,11 +35,11 @@ class PersonConfig(Settings):
 
     Weights stand on squared distances in centimetres, on squared standard deviations of betas and on the squared
     Mahalanobis distance of poses, as in the paper: they are inverse variances, next to a shape prior of weight one.
-    Its own values are `published()`. Ours differ in two, which were measured on recordings of four actors: markers sit
-    10 mm beside their usual place along each axis, not 20, and the model's skin is 5 mm off the true one, not 1. A skin
-    that is believed to a millimetre makes betas explain where the markers sit: they were 4 to 6 standard deviations
-    long. What a frame says of a person is much the same in another frame, so the terms of frames, data and pose, count
-    a quarter of their inverse variances: twelve frames are worth three.
+    What is wrong in one frame is wrong in others too, so the terms of frames, data and pose, count a quarter: twelve
+    frames are worth three. The paper's values are `published()`. Ours differ in three, measured on recordings of four
+    actors, along each axis: a marker is 4 mm off from frame to frame (a quarter of 1/0.4²), where it sits is 10 mm
+    beside its usual place, and the model's skin is 5 mm off the true one. With a skin that is believed to a millimetre,
+    betas explain where the markers sit, and come out twice too long.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class PersonConfig(Settings):
         A latent marker in the coordinate frame of its nearest triangle, or as a sum of the neighbours of its
         nearest vertex and the normal there.
     data : float
-        Weight of the markers against their simulation.
+        Weight of the markers against their simulation; the paper's is 0.75.
     surface : float
         Weight of the prescribed distance from the skin; the paper's is 100.
     initial : float
@@ -80,7 +80,7 @@ class PersonConfig(Settings):
     choice: Literal["spread", "random"] = "spread"
     n_betas: int = 80
     attachment: Attachment = "triangle"
-    data: float = 0.75
+    data: float = 1.5
     surface: float = 4.0
     initial: float = 1.0
     shape: float = 1.0
@@ -94,7 +94,7 @@ class PersonConfig(Settings):
     @classmethod
     def published(cls) -> PersonConfig:
         """Weights, twelve random frames and six stages of [MoSh], all markers alike."""
-        return cls(choice="random", surface=100.0, initial=0.25, outlier=1000.0, loose=False, wand=0.0)
+        return cls(choice="random", data=0.75, surface=100.0, initial=0.25, outlier=1000.0, loose=False, wand=0.0)
 
 
 @dataclass(frozen=True, eq=False)
