@@ -1,6 +1,7 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
 from .blend_weights import skin_weights as skin_weights
 from .body import BodyModel as BodyModel
+from .built_in import load_built_in_model as load_built_in_model
 from .coregistration.config import CoregistrationConfig as CoregistrationConfig
 from .coregistration.rounds import Coregistration as Coregistration
 from .coregistration.rounds import coregister as coregister

@@ -71,7 +71,7 @@ def model_of(paths: Sequence[Path]) -> Path | None:
         folders = [path, *(p.parent for p in sorted(path.glob("*/report.json")))] if path.is_dir() else [path.parent]
         for folder in folders:
             name = reported_model(folder / "report.json")
-            if name is not None and name.is_file():
+            if name is not None:
                 return name
     return None
 

@@ -20,8 +20,8 @@ from measured_bodies import of_man, of_person, somebody
 from protocols import load_real, machine, write_report
 from scans import HELD_MEN
 
-from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
+from model.built_in import load_built_in_model
 from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, laid_on, measure
 from model.measurement.section import around, tape
@@ -180,7 +180,7 @@ def main() -> None:
     parser.add_argument("-o", "--output")
     args = parser.parse_args()
     args.bodies.mkdir(parents=True, exist_ok=True)
-    model = synthetic_model()
+    model = load_built_in_model()
     tapes = find_tapes(model.template, model.info["landmarks"])
     rows = list[dict]()
     for k in range(args.people):
