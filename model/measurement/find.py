@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 
 from .marks import Places, places_of
 from .section import Carried, Curve, direction, mean_of, section, tape
-from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
+from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
 BAND = 0.10                          # how far from its place on the template a tape may run, along the surface
 
@@ -32,7 +32,7 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     ----------
     template : Mesh
     landmarks : name to vertex
-        Under the names of the synthetic people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
+        Under the names of the built-in people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
         head or neck; what begins at another landmark is left out where there is none.
 
     Raises
@@ -91,6 +91,7 @@ class _Finder:
         yield "hip_width", lambda: self.span("hip_girth", 1)
         yield "back_length", lambda: self.way("neck back", self.at_back(self.girth("waist_girth")))
         yield "shoulder_length_back", lambda: self.way("left shoulder", "neck back", "right shoulder")
+        yield "weight", self.weight
 
     def leg(self, side: str) -> Iterator[tuple[str, Callable[[], Found]]]:
         """Of one leg, from above."""
@@ -113,6 +114,12 @@ class _Finder:
         yield f"arm_length_{side}", lambda: self.way(shoulder, elbow[0], self.nearest(
             self.girth(f"wrist_girth_{side}"), elbow[0]))
         yield f"hand_length_{side}", lambda: Straight(self.girth(f"wrist_girth_{side}").centre, self.point(tip))
+
+    def weight(self) -> Weight:
+        """Of a surface that encloses a volume."""
+        if not self.mesh.is_closed:
+            raise _NotThere("the template is open, so it has no volume")
+        return Weight()
 
     def point(self, *names: str) -> Carried:
         """The mean of landmarks, all of which must be there."""

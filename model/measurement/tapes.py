@@ -68,7 +68,12 @@ class Way:
     faces: tuple[np.ndarray, ...]
 
 
-Found = Girth | Span | Height | Straight | Extent | Way
+@dataclass(frozen=True, eq=False)
+class Weight:
+    """What the volume of a closed surface weighs."""
+
+
+Found = Girth | Span | Height | Straight | Extent | Way | Weight
 
 
 @dataclass(frozen=True, eq=False)
