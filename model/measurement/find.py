@@ -171,13 +171,20 @@ class _Finder:
 
     @cached_property
     def arms(self) -> np.ndarray:
-        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is."""
+        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is.
+
+        So are those above the armpit and beside it. Where the plane of somebody's chest is as high as the armpits, the
+        fold behind the arm would else add 20 cm to it.
+        """
         found = np.zeros(len(self.mesh.vertices), dtype=bool)
+        up, left = self.mesh.vertices @ self.places.up, self.mesh.vertices @ self.places.axes[1]
         for side in ("left", "right"):
             elbow, armpit = (self.places.of.get(f"{side} {name}") for name in ("elbow inside", "armpit"))
             if elbow is not None and armpit is not None:
                 far = self.graph.distances(elbow)
                 found |= far < far[armpit]
+                outwards = 1 if side == "left" else -1
+                found |= (up > up[armpit]) & (outwards * (left - left[armpit]) > 0)
         return found
 
     def girth(self, name: str) -> Girth:
