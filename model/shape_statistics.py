@@ -1,4 +1,4 @@
-"""How the betas of the people that a model knows are spread: a Gaussian, of each sex where the model tells them apart."""
+"""How the betas of people are spread: a Gaussian, one of each sex where a model tells women from men."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -73,8 +73,8 @@ def shape_statistics(model: BodyModel, sex: Sex | None = None) -> ShapeStatistic
     if sex not in SEXES:
         raise ValueError(f"sex: expected 'female' or 'male', got {sex!r}")
     if sex not in known_sexes(model):
-        raise ValueError(f"sex: the model does not tell women from men, so it has no {WORDS[sex]}; leave it out, or take "
-                         "the built-in model, which is named people")
+        raise ValueError(f"sex: the model does not tell women from men, so it has no {WORDS[sex]}; leave it out, or "
+                         "take the built-in model, which is named people")
     kept = model.info["sexes"][sex]
     try:
         mean, covariance = (np.array(kept[name], dtype=np.float64) for name in ("mean", "covariance"))

@@ -162,8 +162,8 @@ def _figures(names: Sequence[str], found: Sequence[Measurements], sex: Sex | Non
                 Metric("left out", sum(len(mine.missing) for mine in found)),
                 Metric("stature, mean", MM * float(np.mean([mine.values["stature"] for mine in found])), "mm")]
     only = found[0]
-    return [_row(name, only.values[name], sex, f" (± {_number(name, only.errors[name])})" if name in only.errors else "")
-            for name in only.values]
+    errors = {name: f" (± {_number(name, error)})" for name, error in only.errors.items()}
+    return [_row(name, value, sex, errors.get(name, "")) for name, value in only.values.items()]
 
 
 def _number(name: str, value: float) -> str:

@@ -62,14 +62,11 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
 
 def likely_section(page: Page, made: WantedBody) -> Page:
     """What is likely of the measurements that nobody asked for."""
-    def number(name: str, value: float) -> str:
-        return CATALOGUE[name].text(value).removesuffix(" mm")
-
     who = WORDS[made.sex] if made.sex else "people"
     return page.section("What was not asked for").text(
         f"Of the {who} that the model knows, those who have what was asked for: what is most likely, which is this "
         "body, and between which values nine of ten of them are.").table(
-        [(_words((name,)), number(name, value), number(name, low), number(name, high))
+        [(_words((name,)), _number(name, value), _number(name, low), _number(name, high))
          for name in CATALOGUE if name in made.likely for low, value, high in [made.likely[name]]],
         ("mm", "this body", "5%", "95%"))
 
@@ -85,18 +82,20 @@ def _words(both: tuple[str, ...]) -> str:
     return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", "\u00a0")
 
 
+def _number(name: str, value: float) -> str:
+    """Millimetres without their name, which is in the head of the table; kilograms with it."""
+    return CATALOGUE[name].text(value).removesuffix(" mm")
+
+
 def _cell(mine: Measurements, both: tuple[str, ...], sex: Sex | None) -> str:
     """Millimetres of one measurement, or of left and right, with the percentile among people of a sex."""
     shares = percentiles(mine.values, sex) if sex else {}
 
-    def number(name: str, value: float) -> str:
-        return CATALOGUE[name].text(value).removesuffix(" mm")
-
     def text(name: str) -> str:
         if name not in mine.values:
             return "–"
-        error = f" ± {number(name, mine.errors[name])}" if name in mine.errors else ""
-        return f"{number(name, mine.values[name])}{error}" + (f" ({ordinal(shares[name])})" if name in shares else "")
+        error = f" ± {_number(name, mine.errors[name])}" if name in mine.errors else ""
+        return f"{_number(name, mine.values[name])}{error}" + (f" ({ordinal(shares[name])})" if name in shares else "")
 
     return " / ".join(map(text, both))
 

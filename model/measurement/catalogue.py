@@ -101,5 +101,5 @@ def named(word: str) -> Sequence[str]:
         found = [name for name in CATALOGUE if name in (base, f"{base}_left", f"{base}_right")]
         if found:
             return found
-    raise ValueError(f"no measurement {word!r}; there are: {', '.join(dict.fromkeys(map(plain, CATALOGUE)))} (those of limbs also with _left "
-                     "or _right)")
+    there = ", ".join(dict.fromkeys(map(plain, CATALOGUE)))
+    raise ValueError(f"no measurement {word!r}; there are: {there} (those of limbs also with _left or _right)")

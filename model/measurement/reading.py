@@ -106,11 +106,11 @@ def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
         ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
         if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
             raise NotMeasured("a hole of the mesh crosses it")
-        if found.under_arms and not any(curve.closed for curve in curves):
-            curve = Curve(np.concatenate([c.edges for c in curves]), np.concatenate([c.share for c in curves]), True)
-        else:
-            far = [float(np.linalg.norm(c.at(vertices).mean(axis=0) - place)) for c in curves]
-            curve = curves[int(np.argmin(far))]
+        far = [float(np.linalg.norm(c.at(vertices).mean(axis=0) - place)) for c in curves]
+        curve = curves[int(np.argmin(far))]
+        if found.under_arms and not curve.closed:
+            pieces = [c for c in curves if not c.closed]
+            curve = Curve(np.concatenate([c.edges for c in pieces]), np.concatenate([c.share for c in pieces]), True)
         if curve.closed:
             points = curve.at(vertices) + bulge(vertices, body.mesh.vertex_normals, curve)
             return _Cut(curve, place, normal, points, tape(points, normal))

@@ -10,6 +10,7 @@ from ..body import BodyModel
 from ..shape_statistics import Sex, known_sexes, shape_statistics
 from .catalogue import CATALOGUE, named, plain
 from .measure import Measurements, measure
+from .reading import DENSITY_SPREAD
 from .tapes import Tapes
 
 FARTHEST = 8.0                       # standard deviations, of all betas together: what no model is asked to reach
@@ -106,8 +107,9 @@ def checked_wanted(given: Mapping[str, float]) -> dict[str, float]:
                     if usual.low <= factor * value <= usual.high]
                 hint = (f"; it is in {unit}: did you mean {word}={seems[0][0]:.4g}, which is {value:g} {seems[0][1]}?"
                         if seems else f"; the nearest is {word}={float(np.clip(value, usual.low, usual.high)):g}")
-                raise ValueError(f"{word}={value:g}: expected {usual.low:g} to {usual.high:g} {usual.unit}, which people "
-                                 f"{'measure there' if usual.unit == 'm' else 'weigh'}{hint}")
+                do = "measure there" if usual.unit == "m" else "weigh"
+                raise ValueError(f"{word}={value:g}: expected {usual.low:g} to {usual.high:g} {usual.unit}, which "
+                                 f"people {do}{hint}")
             wanted[name] = float(value)
     if not wanted:
         raise ValueError("expected at least one measurement, such as stature=1.80")
@@ -181,6 +183,9 @@ class _Search:
         self.rows = alike(wanted)
         self.unit = np.array([CATALOGUE[sides[0]].exact for sides in self.rows])
         self.goal = np.array([wanted[sides[0]] for sides in self.rows]) / self.unit
+        # people of one volume weigh differently
+        self.unknown = np.array([DENSITY_SPREAD * wanted[sides[0]] if sides == ["weight"] else 0.1 * unit
+                                 for sides, unit in zip(self.rows, self.unit, strict=True)]) / self.unit
         self.mean = self.readings(np.zeros(moves.shape[2]))
 
     def measured(self, z: np.ndarray) -> Measurements:
@@ -228,7 +233,7 @@ class _Search:
     def log_density(self, z: np.ndarray) -> float:
         """Logarithm of the density of people with the wanted measurements, which are linear around z."""
         values, S = self.readings(z)
-        C = S @ S.T + 0.01 * np.eye(len(values))
+        C = S @ S.T + np.diag(self.unknown**2)
         off = self.goal - values + S @ z
         return -0.5 * float(off @ np.linalg.solve(C, off) + np.linalg.slogdet(C)[1])
 
@@ -242,13 +247,14 @@ class _Search:
         far = float(np.linalg.norm(z))
         # left and right say the same, also where they are to be different
         free = len({plain(sides[0]) for sides in self.rows})
-        # covariance of z of those who have the measurements: I - Sᵀ (S Sᵀ)⁻¹ S
-        K = np.linalg.solve(S @ S.T + 0.01 * np.eye(len(S)), S)
+        # covariance of z of those who have the measurements: I - Sᵀ (S Sᵀ + R)⁻¹ S
+        K = np.linalg.solve(S @ S.T + np.diag(self.unknown**2), S)
         likely = dict[str, tuple[float, float, float]]()
         for name, reading in whole.readings.items():
             if name not in self.wanted:
                 by_z = reading.along(self.moves)
-                half = OFTEN * float(np.sqrt(max(by_z @ by_z - (S @ by_z) @ (K @ by_z), 0.0)))
+                variance = max(float(by_z @ by_z - (S @ by_z) @ (K @ by_z)), 0.0)
+                half = OFTEN * float(np.sqrt(variance + reading.unknown**2))
                 likely[name] = (reading.value - half, reading.value, reading.value + half)
         return WantedBody(betas, vertices, dict(self.wanted), {name: whole.values[name] for name in self.wanted}, far,
                           float(chi2.sf(far**2, free)), likely, self.usual(), sex)
@@ -256,7 +262,7 @@ class _Search:
     def usual(self) -> dict[str, tuple[float, float]]:
         """Of each wanted measurement, between which values nine of ten people are who have the others."""
         values, S = self.mean
-        C, off = S @ S.T + 0.01 * np.eye(len(values)), self.goal - values
+        C, off = S @ S.T + np.diag(self.unknown**2), self.goal - values
         what = np.array([plain(sides[0]) for sides in self.rows])
         ranges = dict[str, tuple[float, float]]()
         for i, sides in enumerate(self.rows):
