@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from cartoons import cartoon
 from derivatives import slope
+from implicit_surface import project
 from people_bodies import kept, small_people
 from scanprep.synthetic.body_parts import body_surface
 from scipy.spatial import ConvexHull
@@ -111,22 +113,39 @@ def test_all_is_measured_of_a_person(person, tapes):
     assert not found.missing and not found.turned and set(found.values) == set(CATALOGUE)
     for name, value in found.values.items():
         assert CATALOGUE[name].low < value < CATALOGUE[name].high, name
-    assert found.values["stature"] == pytest.approx(person.shape.stature, abs=0.005)
+    assert found.values["stature"] == pytest.approx(person.anatomy.stature, abs=0.005)
     for name in found.values:
         if name.endswith("_left"):
             assert found.values[name] == pytest.approx(found.values[name.replace("left", "right")], rel=0.01), name
 
 
-def test_girths_are_those_of_the_surface_itself(person, tapes):
-    """The people's implicit surface, cut without any triangles; plain polygons are 1.6 mm too short."""
-    field, found, corners = body_surface(person.anatomy), measure(person.mesh, tapes, tapes.axes), []
-    for name in ("waist_girth", "hip_girth", "thigh_girth_left", "calf_girth_right", "neck_girth", "wrist_girth_left"):
+@pytest.mark.parametrize(("name", "girth"), [("back_length", "waist_girth"), ("arm_length_left", "wrist_girth_left")])
+def test_a_way_ends_at_the_girth_wherever_the_vertices_lie(tapes, name, girth):
+    """On all bodies: a vertex of the template's section was up to 2 cm from the section of another."""
+    for shape in (BodyShape(), BodyShape("female"), BodyShape.like("male", stature=1.95, weight=-2)):
+        body = Person(shape).mesh
+        way, ring = measure(body, tapes, tapes.axes, only=[name]).readings[name], tapes.found[girth]
+        end, origin = way.curve[-1], ring.centre.at(body.vertices)
+        normal = UP if ring.axis is None else direction(ring.axis, body.vertices)
+        assert (end - origin) @ normal == pytest.approx(0, abs=1e-9)
+        assert way.value == pytest.approx(np.linalg.norm(np.diff(way.curve, axis=0), axis=1).sum(), abs=5e-4)
+
+
+def test_girths_are_those_of_the_surface_itself():
+    """An implicit surface, cut without any triangles; plain polygons are 1.2 mm too short."""
+    figure, corners = cartoon("beanpole", 0.006), []
+    mesh = figure.mesh.with_vertices(project(figure.field, figure.mesh.vertices))
+    tapes = find_tapes(mesh, {name: int(np.linalg.norm(mesh.vertices - place, axis=1).argmin())
+                              for name, place in figure.landmarks.items()})
+    found = measure(mesh, tapes, tapes.axes)
+    for name in ("waist_girth", "hip_girth", "thigh_girth_left", "knee_girth_left", "calf_girth_right",
+                 "upper_arm_girth_left", "wrist_girth_left"):
         girth = tapes.found[name]
-        origin = girth.centre.at(person.mesh.vertices)
-        normal = UP if girth.axis is None else direction(girth.axis, person.mesh.vertices)
-        true = around_field(field, origin, normal)
+        origin = girth.centre.at(mesh.vertices)
+        normal = UP if girth.axis is None else direction(girth.axis, mesh.vertices)
+        true = around_field(figure.field, origin, normal)
         assert found.values[name] == pytest.approx(true, abs=0.001), name
-        cuts = [c.at(person.mesh.vertices) for c in section(person.mesh.vertices, girth.faces, origin, normal)]
+        cuts = [c.at(mesh.vertices) for c in section(mesh.vertices, girth.faces, origin, normal)]
         mine = min(cuts, key=lambda points: np.linalg.norm(points.mean(axis=0) - origin))
         corners.append(true - ConvexHull(mine @ np.linalg.svd(normal[None])[2][1:].T).area)
     assert np.mean(corners) > 0.001

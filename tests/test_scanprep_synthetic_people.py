@@ -52,7 +52,8 @@ def test_everybody_is_one_closed_outward_surface(bodies):
         assert len(mesh.vertices) == 12500
         assert len(mesh.vertices) - len(mesh.edges) + len(mesh.faces) == 2, "no handles"
         assert mesh.volume > 0
-        assert quality(mesh).min() > 0.02 and np.percentile(quality(mesh), 1) > 0.25      # MakeHuman's own quads
+        # MakeHuman's quads, pressed thin in the groin and between toes, where skin meets skin
+        assert quality(mesh).min() > 1e-3 and np.percentile(quality(mesh), 1) > 0.25
 
 
 def test_all_have_one_topology_and_its_file_is_small(bodies):
@@ -85,11 +86,17 @@ def test_people_of_a_sex_measure_as_those_of_the_survey(sex):
     C = J @ covariance @ J.T
     sds, at = np.sqrt(np.diag(C)), [table.names.index(name) for name in names]
     off = np.array([reading.value for reading in readings]) - table.mean[at]
-    wide = np.array([name == "hip_width" for name in names])             # the survey's feet are together
-    assert (np.abs(off) <= np.maximum(0.008, 0.01 * table.mean[at]))[~wide].all(), dict(zip(names, off, strict=True))
-    assert np.abs(sds / table.sd[at] - 1)[~wide].max() < 0.06, dict(zip(names, sds / table.sd[at], strict=True))
+    assert (np.abs(off) <= np.maximum(0.008, 0.01 * table.mean[at])).all(), dict(zip(names, off, strict=True))
+    assert np.abs(sds / table.sd[at] - 1).max() < 0.06, dict(zip(names, sds / table.sd[at], strict=True))
     apart = np.abs(C / np.outer(sds, sds) - table.correlation[np.ix_(at, at)])[np.triu_indices(len(at), 1)]
     assert apart.mean() < 0.04 and apart.max() < 0.15
+
+
+@pytest.mark.parametrize("sex", ["female", "male"])
+def test_the_average_of_a_sex_is_not_far_out(sex):
+    """Measures that bodies hardly vary in are not forced: that took betas of 13, women with knees like barrels."""
+    mean, covariance = population().moments[sex]
+    assert np.abs(mean).max() < 1.5 and np.sqrt(np.diag(covariance)).max() < 2
 
 
 def test_the_first_betas_are_stature_weight_and_sex():
@@ -288,6 +295,7 @@ def test_walk_goes_ahead_with_a_foot_on_the_floor(man):
     poses, trans = people.walk(44, rate=20.0)
     assert poses.shape == (44, 16, 3) and trans.shape == (44, 3)
     assert 0.8 < -(trans[-1, 1] - trans[0, 1]) / (43 / 20) < 2.0            # metres a second, towards -y
+    assert (-np.diff(trans[:, 1]) * 20).min() > 0.6, "nobody steps back between the feet"
     lowest = np.array([(man.posed(p, t))[:, 2].min() for p, t in zip(poses[::4], trans[::4], strict=True)])
     assert np.abs(lowest).max() < 0.03
     once, _ = people.walk(1, rate=20.0)

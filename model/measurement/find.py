@@ -89,7 +89,7 @@ class _Finder:
         yield "chest_width", lambda: self.span("chest_girth", 1)
         yield "chest_depth", lambda: self.span("chest_girth", 2)
         yield "hip_width", lambda: self.span("hip_girth", 1)
-        yield "back_length", lambda: self.way("neck back", self.at_back(self.girth("waist_girth")))
+        yield "back_length", lambda: self.way("neck back", self.at_back(self.girth("waist_girth")), until="waist_girth")
         yield "shoulder_length_back", lambda: self.way("left shoulder", "neck back", "right shoulder")
         yield "weight", self.weight
 
@@ -112,7 +112,7 @@ class _Finder:
             p.at(*elbow), p.at(tip), 0.42 + 0.26 * t), self.limb(
                 f"{side} forearm", p.at(*elbow), p.at(tip), 0.12, 0.45))
         yield f"arm_length_{side}", lambda: self.way(shoulder, elbow[0], self.nearest(
-            self.girth(f"wrist_girth_{side}"), elbow[0]))
+            self.girth(f"wrist_girth_{side}"), elbow[0]), until=f"wrist_girth_{side}")
         yield f"hand_length_{side}", lambda: Straight(self.girth(f"wrist_girth_{side}").centre, self.point(tip))
 
     def weight(self) -> Weight:
@@ -274,8 +274,8 @@ class _Finder:
         behind = apart @ self.places.axes[2] < 0
         return int(ring[behind][np.abs(apart[behind] @ self.places.axes[1]).argmin()])
 
-    def way(self, *stations: str | int) -> Way:
-        """Along the surface, over landmarks or vertices."""
+    def way(self, *stations: str | int, until: str | None = None) -> Way:
+        """Along the surface, over landmarks or vertices, and as far as the plane of a girth."""
         vertices = [int(self.point(s).vertices[0]) if isinstance(s, str) else s for s in stations]
         faces = []
         for start, end in itertools.pairwise(vertices):
@@ -284,7 +284,7 @@ class _Finder:
                 raise _NotThere("no way along the surface joins its ends")
             # triangles count that a way crosses which is up to 5 cm longer than the shortest
             faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + 0.05 * self.scale).all(axis=1)])
-        return Way(tuple(vertices), tuple(faces))
+        return Way(tuple(vertices), tuple(faces), until)
 
     def foot(self, side: str) -> Extent:
         """From heel to toes, of what is low and on that side."""

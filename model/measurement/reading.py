@@ -17,6 +17,8 @@ from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Wei
 DENSITY, DENSITY_SPREAD = 985.0, 0.02
 ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
 
+STRAIGHT = 0.05                      # metres at the end of a way that tell where it goes on
+
 
 class NotMeasured(ValueError):
     """A measurement that cannot be taken of a body, and why."""
@@ -88,16 +90,19 @@ class _Cut:
     hull: np.ndarray
 
 
+def _plane(found: Girth, body: Standing) -> tuple[np.ndarray, np.ndarray]:
+    """A point (3,) of the plane of a girth, and its normal."""
+    normal = body.axes[0] if found.axis is None else direction(found.axis, body.vertices)
+    return found.centre.at(body.vertices), normal
+
+
 def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     """The section of a girth, cut anew by its carried plane; NotMeasured where it is not closed.
 
     A thigh or an upper arm is measured as near to the trunk as it is on its own: its plane moves on in twelve steps, of
     4 mm for somebody of 1.75 m. Where arms are left out the pieces of the section are taken together.
     """
-    vertices, normal = body.vertices, body.axes[0]
-    origin = found.centre.at(vertices)
-    if found.axis is not None:
-        normal = direction(found.axis, vertices)
+    vertices, (origin, normal) = body.vertices, _plane(found, body)
     step = 0.004 * (np.ptp(vertices @ body.axes[0]) / 1.75) * found.aside * normal
     for place in (origin + tried * step for tried in range(12 if found.aside else 1)):
         curves = section(vertices, found.faces, place, normal)
@@ -128,17 +133,26 @@ def _moved(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: 
     along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
     out = np.einsum("md,md->m", pull, along) / (along @ cut.normal)
     on_edge = pull - out[:, None] * cut.normal
-    ids = [edges[:, 0], edges[:, 1], found.centre.vertices]
-    force = [(1 - share)[:, None] * on_edge, share[:, None] * on_edge,
-             found.centre.weights[:, None] * (out.sum() * cut.normal)]
+    by_plane = _plane_pull(found, out, cut.points[chosen] - cut.origin, cut.normal, vertices)
+    return (np.concatenate([edges[:, 0], edges[:, 1], by_plane[0]]),
+            np.concatenate([(1 - share)[:, None] * on_edge, share[:, None] * on_edge, by_plane[1]]), float(out.sum()))
+
+
+def _plane_pull(found: Girth, out: np.ndarray, apart: np.ndarray, normal: np.ndarray, vertices: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
+    """What vertices (k,) add, and their force (k, 3), where the plane of a girth takes points with it.
+
+    `out` (m,) derivative by the place of each point along the normal, `apart` (m, 3) the points from the plane's.
+    """
+    ids, force = [found.centre.vertices], [found.centre.weights[:, None] * (out.sum() * normal)]
     if found.axis is not None:                                            # the plane turns with the limb
         length = np.linalg.norm(found.axis[1].at(vertices) - found.axis[0].at(vertices))
-        by_normal = -(out @ (cut.points[chosen] - cut.origin))
-        by_end = (by_normal - (by_normal @ cut.normal) * cut.normal) / length
+        by_normal = -(out @ apart)
+        by_end = (by_normal - (by_normal @ normal) * normal) / length
         for point, sign in zip(found.axis, (-1, 1), strict=True):
             ids.append(point.vertices)
             force.append(sign * point.weights[:, None] * by_end)
-    return np.concatenate(ids), np.concatenate(force), float(out.sum())
+    return np.concatenate(ids), np.concatenate(force)
 
 
 @read.register
@@ -199,18 +213,44 @@ def _extent(found: Extent, body: Standing, tapes: Tapes) -> Reading:
 @read.register
 def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
     total, drawn, ids, force = 0.0, list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for start, end, faces in zip(found.vertices, found.vertices[1:], found.faces, strict=False):
+    last = len(found.faces) - 1
+    for k, (start, end, faces) in enumerate(zip(found.vertices, found.vertices[1:], found.faces, strict=False)):
         try:
             length, curve = shortest_path(body.vertices, faces, start, end)
         except ValueError as problem:
             raise NotMeasured(str(problem)) from None
         points = curve.at(body.vertices)
         _, pull = chain_length(points)
+        if k == last and found.until is not None:
+            girth = tapes.found[found.until]
+            assert isinstance(girth, Girth)
+            more, points, by_end = _until(girth, curve, body)
+            length += more
+            ids.append(by_end[0])
+            force.append(by_end[1])
         total += length
         drawn.append(points[::-1])                                        # the way is found from its end
         ids += [curve.edges[:, 0], curve.edges[:, 1]]
         force += [(1 - curve.share)[:, None] * pull, curve.share[:, None] * pull]
     return Reading(total, np.concatenate(drawn), np.concatenate(ids), np.concatenate(force), ENDS)
+
+
+def _until(girth: Girth, way: Curve, body: Standing) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """What a way, its last point first, lacks as far as the plane of a girth, straight on; or has too much.
+
+    Metres; the points that it then has; vertices (k,) and their force (k, 3).
+    """
+    (origin, normal), points = _plane(girth, body), way.at(body.vertices)
+    last = way.edges[0, 0]
+    k = int((np.linalg.norm(points - points[0], axis=1) > STRAIGHT).argmax()) or len(points) - 1
+    before = way.edges[k, int(way.share[k] > 0.5)]                        # a vertex, as points of ways slide
+    ahead = points[0] - body.vertices[before]
+    reach, rise, lack = float(np.linalg.norm(ahead)), ahead @ normal, (origin - points[0]) @ normal
+    by_ahead = lack * (ahead / (reach * rise) - reach / rise**2 * normal)
+    ids, force = _plane_pull(girth, np.array([reach / rise]), (points[0] - origin)[None], normal, body.vertices)
+    kept = points[((points - origin) @ normal) * rise < 0]
+    return (lack / rise * reach, np.vstack([points[0] + lack / rise * ahead, kept]),
+            (np.r_[last, before, ids], np.vstack([by_ahead - reach / rise * normal, -by_ahead, force])))
 
 
 @read.register

@@ -62,14 +62,14 @@ class BodyShape:
         """
         mean, covariance = population().moments[sex]
         betas = mean.copy()
-        if stature is not None:
-            for _ in range(3):               # stature is almost linear in the first beta
-                slope = (population().rows(betas + covariance[:, 0] / covariance[0, 0])[:, 2].max()
-                         - population().rows(betas)[:, 2].max())
-                betas += covariance[:, 0] / covariance[0, 0] * (stature - population().rows(betas)[:, 2].max()) / slope
         if weight is not None:
             left = covariance - np.outer(covariance[:, 0], covariance[0]) / covariance[0, 0]
             betas += weight * left[:, 1] / np.sqrt(left[1, 1])
+        if stature is not None:
+            step, count = covariance[:, 0] / covariance[0, 0], len(population().weights)
+            for _ in range(3):               # stature is almost linear in the first beta
+                here, there = (population().rows(b)[:count, 2].max() for b in (betas, betas + step))
+                betas += step * (stature - here) / (there - here)
         return BodyShape(sex, tuple(betas))
 
 
