@@ -22,7 +22,8 @@ def load_model(path: str | Path) -> BodyModel:
     StorageError
         Missing, damaged, or of a kind or version that is not known.
     """
-    if str(path) == BUILT_IN and not Path(path).exists():
+    # a folder of that name, as people keep, is no model file
+    if str(path) == BUILT_IN and not Path(path).is_file():
         from .built_in import load_built_in_model
 
         return load_built_in_model()

@@ -248,8 +248,15 @@ def _until(girth: Girth, way: Curve, body: Standing) -> tuple[float, np.ndarray,
     reach, rise, lack = float(np.linalg.norm(ahead)), ahead @ normal, (origin - points[0]) @ normal
     by_ahead = lack * (ahead / (reach * rise) - reach / rise**2 * normal)
     ids, force = _plane_pull(girth, np.array([reach / rise]), (points[0] - origin)[None], normal, body.vertices)
-    kept = points[((points - origin) @ normal) * rise < 0]
-    return (lack / rise * reach, np.vstack([points[0] + lack / rise * ahead, kept]),
+    beyond = int(((points - origin) @ normal * np.sign(rise) < 0).argmax())      # so many points lie behind the plane
+    if beyond:
+        # the way crosses the plane: it ends there
+        step = points[beyond] - points[beyond - 1]
+        crossing = points[beyond - 1] + (origin - points[beyond - 1]) @ normal / (step @ normal) * step
+        more = -float(np.linalg.norm(np.diff(np.vstack([points[:beyond], crossing]), axis=0), axis=1).sum())
+    else:
+        crossing, more = points[0] + lack / rise * ahead, lack / rise * reach
+    return (more, np.vstack([crossing, points[beyond:]]),
             (np.r_[last, before, ids], np.vstack([by_ahead - reach / rise * normal, -by_ahead, force])))
 
 
