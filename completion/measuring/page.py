@@ -66,7 +66,7 @@ def likely_section(page: Page, made: WantedBody) -> Page:
     return page.section("What was not asked for").text(
         f"Of the {who} that the model knows, those who have what was asked for: what is most likely, which is this "
         "body, and between which values nine of ten of them are.").table(
-        [(_words((name,)), _number(name, value), _number(name, low), _number(name, high))
+        [(name.replace("_", " "), _number(name, value), _number(name, low), _number(name, high))
          for name in CATALOGUE if name in made.likely for low, value, high in [made.likely[name]]],
         ("mm", "this body", "5%", "95%"))
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..body import BodyModel
 from ..shape_statistics import Sex, known_sexes, shape_statistics
 from .catalogue import CATALOGUE, named, plain
-from .measure import Measurements, measure
+from .measure import measure
 from .reading import DENSITY_SPREAD
 from .tapes import Tapes
 
@@ -165,8 +165,8 @@ def body_with_measurements(model: BodyModel, tapes: Tapes, given: Mapping[str, f
         people = shape_statistics(model, one)
         # betas = mean + root z: z are standard normal, and people of a sex are the model for what follows
         search = _Search(base + moves @ people.mean, moves @ people.root, tapes, wanted)
-        z = search.nearest_to_mean()
-        found.append((search.log_density(z), search.body(z, people.mean + people.root @ z, one)))
+        z, values, S = search.nearest_to_mean()
+        found.append((search.log_density(z, values, S), search.body(z, S, people.mean + people.root @ z, one)))
     best = max(found, key=lambda pair: pair[0])
     return replace(best[1], sex_probability=1 / float(np.exp([density - best[0] for density, _ in found]).sum()))
 
@@ -186,64 +186,56 @@ class _Search:
         # people of one volume weigh differently
         self.unknown = np.array([DENSITY_SPREAD * wanted[sides[0]] if sides == ["weight"] else 0.1 * unit
                                  for sides, unit in zip(self.rows, self.unit, strict=True)]) / self.unit
-        self.mean = self.readings(np.zeros(moves.shape[2]))
+        mean = self.readings(np.zeros(moves.shape[2]))
+        if mean is None:
+            raise ValueError(f"{', '.join(wanted)}: cannot be measured on the mean person of this model")
+        self.mean = mean
 
-    def measured(self, z: np.ndarray) -> Measurements:
-        """All that is wanted of the body of z."""
-        return measure(self.base + self.moves @ z, self.tapes, self.tapes.axes, only=self.wanted)
-
-    def readings(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is measured there (m,), and its derivative (m, K) by z; ValueError where it cannot be."""
-        found = self.measured(z)
-        for name in self.wanted:
-            if name not in found.readings:
-                raise ValueError(f"{name}: cannot be measured on the body with these measurements: "
-                                 f"{found.missing[name]}")
+    def readings(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """What is measured there (m,), and its derivative (m, K) by z; None where a tape does not close."""
+        found = measure(self.base + self.moves @ z, self.tapes, self.tapes.axes, only=self.wanted)
+        if len(found.readings) < len(self.wanted):
+            return None
         slopes = {name: reading.along(self.moves) for name, reading in found.readings.items()}
         return (np.array([np.mean([found.values[name] for name in sides]) for sides in self.rows]) / self.unit,
                 np.stack([np.mean([slopes[name] for name in sides], axis=0) for sides in self.rows])
                 / self.unit[:, None])
 
-    def nearest_to_mean(self) -> np.ndarray:
-        """z of least norm whose body has the measurements, or has them as nearly as it can.
+    def nearest_to_mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """z of least norm whose body has the measurements, or has them as nearly as it can; with m and S there.
 
-        z = Sᵀ (S Sᵀ)⁻¹ (goal - m + S z), the derivatives S and measurements m made anew at each z.
+        z = Sᵀ (S Sᵀ)⁻¹ (goal - m + S z), the derivatives S and measurements m made anew at each z, less far where that
+        would be worse: a level tape that slides over a bust is anything but linear.
         """
-        z = np.zeros(self.moves.shape[2])
-        values, S = self.mean
-        best, least = z, float(np.abs(self.goal - values).max())
+        z, (values, S) = np.zeros(self.moves.shape[2]), self.mean
         for _ in range(40):
             off = self.goal - values
-            ahead = S.T @ np.linalg.solve(S @ S.T + 0.01 * np.eye(len(off)), off + S @ z)
-            ahead *= min(1.0, FARTHEST / max(float(np.linalg.norm(ahead)), 1e-12))
-            step = ahead - z
-            step *= min(1.0, 3.0 / max(float(np.linalg.norm(step)), 1e-12))
-            # half as far where a tape does not close around the body
-            for shorter in (1.0, 0.5, 0.25):
-                if len(self.measured(z + shorter * step).readings) == len(self.wanted):
-                    break
-            z = z + shorter * step
-            values, S = self.readings(z)
-            if np.abs(self.goal - values).max() < least:
-                best, least = z, float(np.abs(self.goal - values).max())
-            if least < 0.1:
+            if np.abs(off).max() < 0.1:
                 break
-        return best
+            step = _not_too_far(S, off + S @ z) - z
+            step *= min(1.0, 3.0 / max(float(np.linalg.norm(step)), 1e-12))
+            for share in (1.0, 0.5, 0.25, 0.125):
+                tried = z + share * step
+                there = self.readings(tried)
+                if there is not None and np.linalg.norm(self.goal - there[0]) < np.linalg.norm(off):
+                    break
+            else:
+                break                                                     # as near as it can be
+            z, (values, S) = tried, there
+        return z, values, S
 
-    def log_density(self, z: np.ndarray) -> float:
+    def log_density(self, z: np.ndarray, values: np.ndarray, S: np.ndarray) -> float:
         """Logarithm of the density of people with the wanted measurements, which are linear around z."""
-        values, S = self.readings(z)
         C = S @ S.T + np.diag(self.unknown**2)
         off = self.goal - values + S @ z
         return -0.5 * float(off @ np.linalg.solve(C, off) + np.linalg.slogdet(C)[1])
 
-    def body(self, z: np.ndarray, betas: np.ndarray, sex: Sex | None) -> WantedBody:
+    def body(self, z: np.ndarray, S: np.ndarray, betas: np.ndarray, sex: Sex | None) -> WantedBody:
         """What is told of the body of z."""
         from scipy.stats import chi2
 
         vertices = self.base + self.moves @ z
         whole = measure(vertices, self.tapes, self.tapes.axes)
-        _, S = self.readings(z)
         far = float(np.linalg.norm(z))
         # left and right say the same, also where they are to be different
         free = len({plain(sides[0]) for sides in self.rows})
@@ -272,3 +264,18 @@ class _Search:
             both = (float((middle - half) * self.unit[i]), float((middle + half) * self.unit[i]))
             ranges |= dict.fromkeys(sides, both)
         return ranges
+
+
+def _not_too_far(S: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Sᵀ (S Sᵀ + λ)⁻¹ wanted: the z of least norm with S z = wanted, or of `FARTHEST` norm with S z nearest to it."""
+    from scipy.optimize import brentq
+
+    squares, axes = np.linalg.eigh(S @ S.T)
+    squares, along = np.maximum(squares, 0), axes.T @ wanted
+
+    def size(logarithm: float) -> float:
+        return float(np.sqrt(squares @ (along / (squares + np.exp(logarithm)))**2)) - FARTHEST
+
+    least, most = np.log(0.01), np.log(squares.max() + np.abs(along).max()**2 + 1)
+    damping = np.exp(brentq(size, least, most) if size(least) > 0 > size(most) else least)
+    return S.T @ (axes @ (along / (squares + damping)))
