@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, lil_array
 
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
@@ -17,9 +19,11 @@ from scanprep.synthetic.population import PARENTS, PARTS, Population, population
 
 from .features import LIFTS, PoseFeatures
 from .gradients import edges
+from .importing import FINGERS, Published, as_skinning
 from .pose_space import PoseSpace, faces_of_part
 from .scape import ScapeModel
 from .shape_space import ShapeSpace
+from .skinning import SkinningModel
 
 STORED = Path(__file__).with_name("built_in.npz")
 KIND, VERSION = "built-in model", 1
@@ -60,11 +64,57 @@ def load_built_in_model() -> ScapeModel:
     skeleton = Skeleton(part, PARENTS, joints, PARTS)
     features = PoseFeatures(skeleton, LIFTS[header["lift"]], a["feature_part"].astype(np.int64), a["feature_mix"])
     space = PoseSpace(features, unpack_coefficients(features, a["pose_coefficients"], a["pose_scales"]))
-    info = {**header["info"], "name": NAME, "people_vertices": kept.tolist(), "sexes": {
-        sex: {"mean": mean.tolist(), "covariance": covariance.tolist()}
-        for sex, (mean, covariance) in people.moments.items()}}
+    info = {"name": NAME, **header["info"], "people_vertices": kept.tolist(), "sexes": _sexes(people)}
     return ScapeModel(template, skeleton, space, shape_space(people, kept, template, space), a["pose_mean"],
                       a["pose_covariance"], info, pose_examples=a["pose_examples"].astype(np.float64))
+
+
+def load_fingered_model() -> SkinningModel:
+    """Read the built-in people with bones in their fingers: for animators and for hands.
+
+    The same people as `load_built_in_model`, all their 12,500 vertices, in linear blend skinning without correctives:
+    elbows and knees lose volume as they bend.
+
+    Returns
+    -------
+    SkinningModel
+        46 parts, 30 betas.
+
+    Examples
+    --------
+    >>> [name for name in load_fingered_model().skeleton.names if name.startswith("thumb")]
+    ['thumb1_left', 'thumb2_left', 'thumb3_left', 'thumb1_right', 'thumb2_right', 'thumb3_right']
+    """
+    header, a = storage.load(STORED, KIND, (VERSION,))
+    people, n = population(), len(population().weights)
+    parents, weights = list(PARENTS), np.hstack([people.weights, np.zeros((n, 30))])
+    regressor = lil_array((46, n))
+    for j in range(16):
+        regressor[[j], a["joint_vertices"][j]] = a["joint_weights"][j]
+    left, share = a["hand_vertices"].astype(np.int64), a["finger_weights"] / 255.0
+    for side, vertices, first in (("left", left, 16), ("right", people.mirror[left], 31)):
+        hand, columns = PARTS.index(f"hand_{side}"), np.arange(first, first + 15)
+        weights[vertices[:, None], columns] = weights[vertices, hand, None] * share[:, 1:]
+        weights[vertices, hand] *= share[:, 0]
+        parents += [hand if k % 3 == 0 else first + k - 1 for k in range(15)]
+        # a joint is amid the skin that both of its parts carry
+        for j in columns:
+            both = weights[:, j] * weights[:, parents[j]]
+            near = np.flatnonzero(both)
+            regressor[[j], near] = both[near] / both.sum()
+    weights /= weights.sum(axis=1, keepdims=True)
+    rest, names = people.rows(np.zeros(0))[:n], (*PARTS, *FINGERS["left"], *FINGERS["right"])
+    return as_skinning(
+        Published(Mesh(rest, people.faces), np.moveaxis(people.directions[:, :n], 0, -1), np.zeros((n, 3, 0)),
+                  csr_array(regressor), weights, np.array(parents), names, {}, ()),
+        {"name": f"{NAME} with fingers", **{key: header["info"][key] for key in ("source", "recipe")},
+         "landmarks": people.landmarks, "markers": people.markers, "sexes": _sexes(people)})
+
+
+def _sexes(people: Population) -> dict[str, Any]:
+    """Moments of the betas of each sex, as models keep them."""
+    return {sex: {"mean": mean.tolist(), "covariance": covariance.tolist()}
+            for sex, (mean, covariance) in people.moments.items()}
 
 
 def shape_space(people: Population, kept: np.ndarray, template: Mesh, space: PoseSpace) -> ShapeSpace:
