@@ -51,6 +51,9 @@ from .resolution.change import change_resolution as change_resolution
 from .rig import make_rig as make_rig
 from .scape import BlendScapeModel as BlendScapeModel
 from .scape import ScapeModel as ScapeModel
+from .shape_statistics import ShapeStatistics as ShapeStatistics
+from .shape_statistics import draw_betas as draw_betas
+from .shape_statistics import shape_statistics as shape_statistics
 from .skinning import SkinningModel as SkinningModel
 from .statue.control.files import humanoid as humanoid
 from .statue.control.model import ControlModel as ControlModel

@@ -25,7 +25,8 @@ def load_model(path: str | Path) -> BodyModel:
     StorageError
         Missing, damaged, or of a kind or version that is not known.
     """
-    if str(path) in LOADERS and not Path(path).exists():
+    # a folder of that name, as people keep, is no model file
+    if str(path) in LOADERS and not Path(path).is_file():
         load: Callable[[], BodyModel] = getattr(importlib.import_module("model.built_in"), LOADERS[str(path)])
         return load()
     kind = storage.kind_of(path)

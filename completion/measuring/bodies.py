@@ -121,7 +121,7 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     """The template that tapes are found on, and its landmarks.
 
     The model's, which keeps its own; else that of the set; else the first body. Landmarks are in the file given, or
-    beside, or known by the triangles: those of the synthetic people. Where tapes begin at others too, as they do when
+    beside, or known by the triangles: those of the built-in people. Where tapes begin at others too, as they do when
     ten were clicked, the average person finds them.
     """
     from scanprep.synthetic.landmarks import landmarks

@@ -28,6 +28,7 @@ from makehuman import MakeHuman
 
 from model.measurement.find import find_tapes
 from model.measurement.measure import measure
+from model.measurement.reading import DENSITY
 from model.measurement.survey import TABLE, Survey, survey
 from model.measurement.tapes import Tapes
 from scanprep.geometry import storage
@@ -36,7 +37,6 @@ from scanprep.geometry.mesh import Mesh
 HERE = Path(__file__).parent
 SEXES = ("female", "male")
 SIDED = {"thigh_girth", "calf_girth", "wrist_girth", "arm_length", "hand_length", "foot_length"}
-DENSITY = 985.0                      # kilograms of a person per cubic metre of the surface, lungs half full
 # Share of a standard deviation to which the mean person meets a measure. The survey measured hips with feet together,
 # chests while breathing quietly and the middle of the kneecap, which bodies that stand apart do not show.
 TOLERANCE = {"hip_width": 0.35, "chest_depth": 0.15, "knee_height": 0.15}
