@@ -164,13 +164,17 @@ class _Finder:
 
     @cached_property
     def arms(self) -> np.ndarray:
-        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is."""
+        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is.
+
+        And of the shoulders: above the armpit and farther out, where a tape at the nipples comes on some bodies.
+        """
         found = np.zeros(len(self.mesh.vertices), dtype=bool)
-        for side in ("left", "right"):
+        for side, sign in (("left", 1), ("right", -1)):
             elbow, armpit = (self.places.of.get(f"{side} {name}") for name in ("elbow inside", "armpit"))
             if elbow is not None and armpit is not None:
                 far = self.graph.distances(elbow)
-                found |= far < far[armpit]
+                up, left, _ = self.places.axes @ (self.mesh.vertices - self.mesh.vertices[armpit]).T
+                found |= (far < far[armpit]) | ((up > 0) & (sign * left > 0))
         return found
 
     def girth(self, name: str) -> Girth:
