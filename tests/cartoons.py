@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, project
 from polygonise import polygonise
 
 from scanprep.geometry.mesh import Mesh
-from implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, project
 
 ARM_ANGLE, ELBOW_ANGLE = np.radians([36.0, 14.0])
 FINGERS = ((0.30, 1.00, 0.30), (0.0, 1.10, 0.31), (-0.30, 0.95, 0.29))    # across the palm, length, thickness

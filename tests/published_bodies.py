@@ -35,7 +35,8 @@ def synthetic_smpl(faces: int = 2400, people: int = 3, poses: int = 8, seed: int
         pose[0] = 0
     small = _decimated(man, None, faces)
     own, template = small.vertex_map, small.template
-    shapes = np.stack([Person(BodyShape.random(rng, ("female", "male")[k % 2])).mesh.vertices[own] for k in range(people)])
+    shapes = np.stack([Person(BodyShape.random(rng, sex)).mesh.vertices[own]
+                       for sex in (("female", "male") * people)[:people]])
     mean = shapes.mean(axis=0)
     _, s, Vt = np.linalg.svd((shapes - mean).reshape(people, -1), full_matrices=False)
     shapedirs = (s[:10, None] * Vt[:10] / np.sqrt(people - 1)).reshape(-1, len(own), 3)[:people - 1]

@@ -136,7 +136,8 @@ def test_no_chest_takes_an_arm_along():
     rng, tapes = np.random.default_rng(0), find_tapes(load().mesh, landmarks())
     for shape in [BodyShape.random(rng) for _ in range(14)]:
         body, mean = Person(shape).mesh.vertices, Person(BodyShape(shape.sex)).mesh.vertices
-        found, usual = (measure(x, tapes, tapes.axes, only=["chest_girth"]).readings["chest_girth"] for x in (body, mean))
+        found, usual = (measure(x, tapes, tapes.axes, only=["chest_girth"]).readings["chest_girth"]
+                        for x in (body, mean))
         told = usual.value + float(usual.along((body - mean)[..., None])[0])
         assert found.value == pytest.approx(told, rel=0.065)
 

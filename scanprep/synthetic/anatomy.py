@@ -57,8 +57,8 @@ class BodyShape:
 
     @staticmethod
     def like(sex: Sex = "male", stature: float | None = None, weight: float | None = None) -> BodyShape:
-        """The most likely person of a sex who is that tall, metres, and whose second beta, *weight*, is so many standard
-        deviations from the average of those who are that tall.
+        """The most likely person of a sex who is that tall, metres, and whose second beta, *weight*, is so many
+        standard deviations from the average of those who are that tall.
         """
         mean, covariance = population().moments[sex]
         betas = mean.copy()
@@ -99,7 +99,7 @@ class Anatomy:
         self.forearm_frame = np.array([out, np.cos(b) * ahead - np.sin(b) * down, np.cos(b) * down + np.sin(b) * ahead])
         self.leg_frame = np.array([put(np.cos(c), 0, np.sin(c)), ahead, put(np.sin(c), 0, -np.cos(c))])
         self.foot_frame = np.array([put(np.cos(t), -np.sin(t), 0), put(0, 0, 1), put(np.sin(t), np.cos(t), 0)])
-        # exactly, where stored places are rounded; the axis of a foot is level: it rolls about that, not about the instep
+        # exactly, where stored places are rounded; a foot rolls about a level axis, not about the slope of the instep
         for first, frame in ((4, self.upper_arm_frame), (5, self.forearm_frame), (10, self.leg_frame),
                              (11, self.leg_frame), (12, self.foot_frame)):
             for part, flip in ((first, [1, 1, 1]), (first + 3, [-1, 1, 1])):
