@@ -35,6 +35,6 @@ def load_model(path: str | Path) -> BodyModel:
     module, name = KINDS[kind]
     model: BodyModel = getattr(importlib.import_module(module), name).load(path)
     if model.info.get("name") == "synthetic people":
-        warnings.warn(f"{path}: these are the built-in people of an earlier version, who were made up; those of now have "
-                      f"the statistics of people who were measured: -m {BUILT_IN}", stacklevel=2)
+        warnings.warn(f"{path}: these are the built-in people of an earlier version, who were made up; those of now "
+                      f"have the statistics of people who were measured: -m {BUILT_IN}", stacklevel=2)
     return model

@@ -182,8 +182,8 @@ def test_random_shapes_differ_repeat_and_are_spread_as_their_sex():
 
 
 @pytest.mark.parametrize(("given", "why"), [
-    (("woman",), "sex: expected 'female' or 'male', got 'woman'"), (("male", (0.0, np.nan)), "betas: expected at most 30"),
-    (("male", (0.0,) * 31), "betas: expected at most 30")])
+    (("woman",), "sex: expected 'female' or 'male', got 'woman'"),
+    (("male", (0.0, np.nan)), "betas: expected at most 30"), (("male", (0.0,) * 31), "betas: expected at most 30")])
 def test_shapes_that_nobody_has_are_refused(given, why):
     with pytest.raises(ValueError, match=why):
         BodyShape(*given)
@@ -270,7 +270,7 @@ def test_named_poses_keep_the_volume_and_do_not_collapse(man, name):
 
 
 def inside(mesh: Mesh) -> np.ndarray:
-    """(F,) bool, triangles with skin less than 1.5 mm in front of them: of lips and ears at rest, else within the body."""
+    """(F,) bool, triangles with skin less than 1.5 mm before them: of lips and ears at rest, else within the body."""
     before = mesh.corners.mean(axis=1) + 0.0015 * mesh.face_normals
     return np.asarray(igl.fast_winding_number(mesh.vertices, mesh.faces, np.ascontiguousarray(before))) > 0.6
 

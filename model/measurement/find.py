@@ -174,18 +174,15 @@ class _Finder:
     def arms(self) -> np.ndarray:
         """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is.
 
-        So are those above the armpit and beside it. Where the plane of somebody's chest is as high as the armpits, the
-        fold behind the arm would else add 20 cm to it.
+        And of the shoulders: above the armpit and farther out, where a tape at the nipples comes on some bodies.
         """
         found = np.zeros(len(self.mesh.vertices), dtype=bool)
-        up, left = self.mesh.vertices @ self.places.up, self.mesh.vertices @ self.places.axes[1]
-        for side in ("left", "right"):
+        for side, sign in (("left", 1), ("right", -1)):
             elbow, armpit = (self.places.of.get(f"{side} {name}") for name in ("elbow inside", "armpit"))
             if elbow is not None and armpit is not None:
                 far = self.graph.distances(elbow)
-                found |= far < far[armpit]
-                outwards = 1 if side == "left" else -1
-                found |= (up > up[armpit]) & (outwards * (left - left[armpit]) > 0)
+                up, left, _ = self.places.axes @ (self.mesh.vertices - self.mesh.vertices[armpit]).T
+                found |= (far < far[armpit]) | ((up > 0) & (sign * left > 0))
         return found
 
     def girth(self, name: str) -> Girth:
