@@ -17,6 +17,7 @@ __all__ = ["MIRROR_PART", "PARENTS", "PARTS", "Anatomy", "BodyShape"]
 Sex = Literal["female", "male"]
 # of arms from the vertical, of forearms further ahead, of legs sideways, of feet from straight ahead
 ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, TOE_OUT = np.radians([36.0, 14.0, 4.5, 9.0])
+RAREST = 3.0                         # standard deviations: rarer people are so small or odd that results are doubted
 AVERAGE_STATURE = 1.75               # metres: lengths in tables of muscles and poses are those of somebody this tall
 
 
@@ -53,7 +54,10 @@ class BodyShape:
             sex = "male" if rng.random() < 0.5 else "female"
         mean, covariance = population().moments[sex]
         root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(mean)))
-        return BodyShape(sex, tuple(mean + root @ rng.standard_normal(len(mean))))
+        z = rng.standard_normal(len(mean))
+        while (far := np.abs(z) > RAREST).any():
+            z[far] = rng.standard_normal(far.sum())
+        return BodyShape(sex, tuple(mean + root @ z))
 
     @staticmethod
     def like(sex: Sex = "male", stature: float | None = None, weight: float | None = None) -> BodyShape:
