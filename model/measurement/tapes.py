@@ -64,8 +64,8 @@ class Extent:
 class Way:
     """Shortest ways along the surface from vertex to vertex, one after the other, and the triangles for each.
 
-    `until`: the last way goes on, or ends before, where it meets the plane of a girth: a vertex of the template's section
-    may lie 2 cm from the section of another body.
+    `until`: the last way goes on, or ends before, where it meets the plane of a girth: a vertex of the template's
+    section may lie 2 cm from the section of another body.
     """
 
     vertices: tuple[int, ...]

@@ -229,8 +229,8 @@ def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, betas:
     """Mean (k,) and covariance (k, k) of the betas of a sex, corrected so that measures meet the survey."""
     kept = [i for i, name in enumerate(table.names) if name != "age"]
     goal, C, sd = table.mean[kept], covariance(table)[np.ix_(kept, kept)], table.sd[kept]
-    # Bodies hardly vary in some combinations of measures, as of neck and shoulder height. Where these are to be met more
-    # closely, or more often, the average woman gets knees like barrels.
+    # Bodies hardly vary in some combinations of measures, as of neck and shoulder height. Where these are to be met
+    # more closely, or more often, the average woman gets knees like barrels.
     near = sd * [max(TOLERANCE.get(table.names[i], 0), CLOSE) for i in kept]
     m, S = betas.mean(axis=0), np.cov(betas.T)
     for _ in range(3):
