@@ -39,11 +39,11 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def run_folder(tmp_path_factory):
-    """The folder that the processes of this run share, with a cache in the place of the user's."""
+    """The folder that the processes of this run share."""
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SCAPEKIT_CACHE", str(base / "cache"))
+        patch.setenv("SCAPEKIT_TESTS", str(base))
         yield base
 
 

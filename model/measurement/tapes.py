@@ -73,7 +73,12 @@ class Way:
     until: str | None = None
 
 
-Found = Girth | Span | Height | Straight | Extent | Way
+@dataclass(frozen=True, eq=False)
+class Weight:
+    """What the volume of a closed surface weighs."""
+
+
+Found = Girth | Span | Height | Straight | Extent | Way | Weight
 
 
 @dataclass(frozen=True, eq=False)

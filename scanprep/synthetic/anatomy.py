@@ -17,6 +17,7 @@ __all__ = ["MIRROR_PART", "PARENTS", "PARTS", "Anatomy", "BodyShape"]
 Sex = Literal["female", "male"]
 # of arms from the vertical, of forearms further ahead, of legs sideways, of feet from straight ahead
 ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, TOE_OUT = np.radians([36.0, 14.0, 4.5, 9.0])
+RAREST = 3.0                         # standard deviations: rarer people are so small or odd that results are doubted
 AVERAGE_STATURE = 1.75               # metres: lengths in tables of muscles and poses are those of somebody this tall
 
 
@@ -53,12 +54,15 @@ class BodyShape:
             sex = "male" if rng.random() < 0.5 else "female"
         mean, covariance = population().moments[sex]
         root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(mean)))
-        return BodyShape(sex, tuple(mean + root @ rng.standard_normal(len(mean))))
+        z = rng.standard_normal(len(mean))
+        while (far := np.abs(z) > RAREST).any():
+            z[far] = rng.standard_normal(far.sum())
+        return BodyShape(sex, tuple(mean + root @ z))
 
     @staticmethod
     def like(sex: Sex = "male", stature: float | None = None, weight: float | None = None) -> BodyShape:
-        """The most likely person of a sex who is that tall, metres, and whose second beta, *weight*, is so many
-        standard deviations from the average of those who are that tall.
+        """The most likely person of a sex who is that tall, metres, and of such a weight: so many standard deviations
+        of the second beta from the average of those who are that tall.
         """
         mean, covariance = population().moments[sex]
         betas = mean.copy()
@@ -99,7 +103,7 @@ class Anatomy:
         self.forearm_frame = np.array([out, np.cos(b) * ahead - np.sin(b) * down, np.cos(b) * down + np.sin(b) * ahead])
         self.leg_frame = np.array([put(np.cos(c), 0, np.sin(c)), ahead, put(np.sin(c), 0, -np.cos(c))])
         self.foot_frame = np.array([put(np.cos(t), -np.sin(t), 0), put(0, 0, 1), put(np.sin(t), np.cos(t), 0)])
-        # exactly, where stored places are rounded; a foot rolls about a level axis, not about the slope of the instep
+        # exactly, where stored places are rounded; the axis of a foot is level: it rolls about that, not the instep
         for first, frame in ((4, self.upper_arm_frame), (5, self.forearm_frame), (10, self.leg_frame),
                              (11, self.leg_frame), (12, self.foot_frame)):
             for part, flip in ((first, [1, 1, 1]), (first + 3, [-1, 1, 1])):

@@ -45,7 +45,7 @@ def load() -> Template:
 
 
 def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray:
-    """Part of every triangle (F,) of the left half: cut by a plane through each joint, arms told by blend weights."""
+    """Part of every triangle (F,) of the left half: cut by a plane through each joint; arms by weights."""
     c, j = mesh.corners.mean(axis=1), anatomy.joints
     arm = weights[mesh.faces][:, :, 4:7].sum(axis=(1, 2)) > 0.75              # a quarter of each corner
     part = np.zeros(len(c), dtype=np.int64)
