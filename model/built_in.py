@@ -98,10 +98,10 @@ def load_fingered_model() -> SkinningModel:
         weights[vertices, hand] *= share[:, 0]
         parents += [hand if k % 3 == 0 else first + k - 1 for k in range(15)]
         # a joint is amid the skin that both of its parts carry
-        for j in columns:
-            both = weights[:, j] * weights[:, parents[j]]
+        for finger in columns:
+            both = weights[:, finger] * weights[:, parents[finger]]
             near = np.flatnonzero(both)
-            regressor[[j], near] = both[near] / both.sum()
+            regressor[[finger], near] = both[near] / both.sum()
     weights /= weights.sum(axis=1, keepdims=True)
     rest, names = people.rows(np.zeros(0))[:n], (*PARTS, *FINGERS["left"], *FINGERS["right"])
     return as_skinning(
