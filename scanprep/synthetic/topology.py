@@ -50,10 +50,11 @@ def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray
     arm = weights[mesh.faces][:, :, 4:7].sum(axis=(1, 2)) > 0.75              # a quarter of each corner
     part = np.zeros(len(c), dtype=np.int64)
 
-    def beyond(joint: int, normal: np.ndarray) -> np.ndarray:
-        return (c - j[joint]) @ normal > 0
+    def beyond(joint: int, normal: np.ndarray, by: float = 0.0) -> np.ndarray:
+        return (c - j[joint]) @ normal > by * anatomy.scale
 
-    part[c[:, 2] > j[1, 2]] = 1
+    # crest and spines of the hip bone, ends of forearm and shin bones, which carry markers, are on the part of the bone
+    part[c[:, 2] > j[1, 2] + 0.015 * anatomy.scale] = 1
     part[c[:, 2] > j[2, 2]] = 2
     part[beyond(3, np.array([0, -0.35, 1.0])) & (np.abs(c[:, 0]) < 0.12)] = 3
     # the shoulder is cut from the armpit outwards and up
@@ -62,12 +63,12 @@ def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray
     mine = arm & ((c - armpit) @ (0.75 * up + 0.66 * np.array([1, 0, 0.25])) > 0)
     part[mine] = 4
     part[mine & beyond(5, up + anatomy.forearm_frame[2])] = 5
-    part[mine & beyond(6, anatomy.forearm_frame[2])] = 6
+    part[mine & beyond(6, anatomy.forearm_frame[2], 0.018)] = 6
     # the hip from the groin to its crest
     mine = ((c - j[10]) @ np.array([0.72, 0, -1.0]) > 0) & (c[:, 0] > 0) & (c[:, 2] < j[0, 2] + 0.02) & ~arm
     part[mine] = 10
     part[mine & (c[:, 2] < j[11, 2])] = 11
-    part[mine & beyond(12, np.array([0, -0.3, -1.0]))] = 12                # with all of the heel
+    part[mine & beyond(12, np.array([0, -0.3, -1.0]), 0.012)] = 12         # with all of the heel
     return part
 
 
