@@ -81,12 +81,16 @@ def _girth(found: Girth, body: Standing, tapes: Tapes) -> Reading:
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """The section of a girth, its plane, its points (m, 3), and which of them the tape touches, in order."""
+    """The section of a girth, its plane, its points (m, 3), and which of them the tape touches, in order.
+
+    `change` (m, 3): how the bulge at a point changes as it goes along its edge, by the share of the edge.
+    """
 
     curve: Curve
     origin: np.ndarray
     normal: np.ndarray
     points: np.ndarray
+    change: np.ndarray
     hull: np.ndarray
 
 
@@ -117,8 +121,9 @@ def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
             pieces = [c for c in curves if not c.closed]
             curve = Curve(np.concatenate([c.edges for c in pieces]), np.concatenate([c.share for c in pieces]), True)
         if curve.closed:
-            points = curve.at(vertices) + bulge(vertices, body.mesh.vertex_normals, curve)
-            return _Cut(curve, place, normal, points, tape(points, normal))
+            off, change = bulge(vertices, body.mesh.vertex_normals, curve)
+            points = curve.at(vertices) + off
+            return _Cut(curve, place, normal, points, change, tape(points, normal))
     raise NotMeasured("its plane runs out of the part it goes around")
 
 
@@ -127,11 +132,11 @@ def _moved(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: 
     """What vertices add where they pull at points of a section, the plane moving with them.
 
     `chosen` (m,) points of the section, `pull` (m, 3) the derivative by them; vertices (k,), their force (k, 3), and
-    the derivative by moving the plane along its normal. What the bulge between vertices changes is left out.
+    the derivative by moving the plane along its normal. What normals change at the bulge is left out.
     """
     vertices, edges, share = body.vertices, cut.curve.edges[chosen], cut.curve.share[chosen]
     along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    out = np.einsum("md,md->m", pull, along) / (along @ cut.normal)
+    out = np.einsum("md,md->m", pull, along + cut.change[chosen]) / (along @ cut.normal)
     on_edge = pull - out[:, None] * cut.normal
     by_plane = _plane_pull(found, out, cut.points[chosen] - cut.origin, cut.normal, vertices)
     return (np.concatenate([edges[:, 0], edges[:, 1], by_plane[0]]),

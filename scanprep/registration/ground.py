@@ -152,7 +152,7 @@ def find_floor(body: Mesh, feet: np.ndarray, points: np.ndarray, normals: np.nda
     if not len(flat) or not len(soles):
         return floor
     scanned = cKDTree(floor.flat(flat)).query(floor.flat(soles))[0] < REACH / 2
-    # share with data, above which they were scanned themselves: 0.64 where a scan ends 4 mm above them, 1 of a whole one
+    # share with data, above which they were scanned themselves: 0.64 where it ends 4 mm above, 1 of a whole one
     return None if np.mean(scanned) > 0.8 else floor
 
 
