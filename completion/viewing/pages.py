@@ -107,9 +107,9 @@ class Inside:
         page = self.opened.get(("complete", path))
         if not isinstance(page, CompletePage):
             if path is None:
-                from model.built_in import load_built_in_model
+                from model.files import BUILT_IN, load_model
 
-                loaded, name = load_built_in_model(), PEOPLE
+                loaded, name = load_model(BUILT_IN), PEOPLE
             else:
                 loaded, name = self.files.read_model(path), str(path)
             body = loaded if loaded.n_betas else loaded.subject(None)
