@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from model.body import BodyModel
 from model.files import load_model
 from model.learning.config import LearnConfig
 from scanprep.batch.opening import locked
+from scanprep.synthetic.population import population
 
 sys.path.insert(0, str(Path(__file__).with_name("people")))
 import make_model
@@ -25,7 +27,10 @@ def small_people() -> BodyModel:
     path = Path(os.environ[SHARED]) / "small_people.npz"
     with locked(path.with_suffix(".lock"), path, wait=True):
         if not path.exists():
-            make_model.learn_people_model(12, 3000, LearnConfig(refinements=0), n_betas=4).save(path)
+            model = make_model.learn_people_model(12, 3000, LearnConfig(refinements=0), n_betas=4)
+            sexes = {sex: {"mean": m[:4].tolist(), "covariance": C[:4, :4].tolist()}
+                     for sex, (m, C) in population().moments.items()}
+            replace(model, info={**model.info, "sexes": sexes}).save(path)
     return load_model(path)
 
 

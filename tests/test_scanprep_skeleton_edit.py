@@ -86,7 +86,7 @@ def test_a_part_is_split_across_its_length_into_connected_halves(person):
     hip, knee = joint(before, "thigh_left"), joint(before, "shin_left")
     along = (joint(after, "thigh_end") - hip) @ (knee - hip) / ((knee - hip) @ (knee - hip))
     assert 0.3 < along < 0.7
-    assert np.linalg.norm(joint(after, "thigh_end") - (hip + along * (knee - hip))) < 0.045    # flesh is ahead of the bone
+    assert np.linalg.norm(joint(after, "thigh_end") - (hip + along * (knee - hip))) < 0.045  # flesh is ahead of bone
     assert np.abs(after.joint_regressor(mesh) @ mesh.vertices - after.joints).max() < 1e-9
 
 
