@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from derivatives import differences
+from trimesh.remesh import subdivide_to_size
 
 from model.statue.control.files import humanoid
 from model.statue.fit import StatueConfig, posed_automatically, posed_by_features
@@ -264,7 +265,9 @@ def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_
     def seen(points):
         return 1000 * (points @ R.T + [2, -1, 3])
 
-    scan, _ = Mesh(seen(vertices), person.mesh.faces).submesh(keep)
+    # scans are as dense on legs as on hands
+    dense, faces, before = subdivide_to_size(vertices, person.mesh.faces, 0.015, return_index=True)
+    scan, _ = Mesh(seen(dense), faces).submesh(keep[before])
     found = find_features(control, scan)
     assert likely_unit(scan.vertices) == "mm" and found.problem is None
     assert {"r_wrist", "right middle finger", "right wrist"} <= set(found.missing)
