@@ -47,7 +47,6 @@ from .partial.completion import Completion as Completion
 from .partial.completion import complete as complete
 from .partial.masks import read_mask as read_mask
 from .partial.settings import CompletionConfig as CompletionConfig
-from .synthetic_people import synthetic_model as synthetic_model
 from .tracking.sequence import track as track
 from .tracking.settings import TrackConfig as TrackConfig
 from .viewing.notebook import Viewed as Viewed

@@ -10,27 +10,19 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.arguments import Alias, Called
 from scanprep.cli import Unit
-from scanprep.console import bar, say
+from scanprep.console import say
 
 ModelOrNone = Annotated[Path | None, Alias("-m")]
 Out = Annotated[Path, Alias("-o"), Called("--output")]
 
 
 def read_model(path: Path | None) -> tuple[BodyModel, str]:
-    """The model of a file, or without one that of the synthetic people, and the name that reports give it.
+    """Read the model of a file, or without one that of the built-in people; with the name that reports give it."""
+    from model.files import BUILT_IN, load_model
 
-    The latter is built when it is first wanted, with a bar, and kept in the user's cache.
-    """
-    from model.files import load_model
-
-    from .synthetic_people import synthetic_model, synthetic_path
-
-    if path is not None:
-        return load_model(path), str(path)
-    say("note: no model named; that of the synthetic people, who are made and not measured, gives a first answer")
-    with bar("building the synthetic people") as progress:
-        model = synthetic_model(progress)
-    return model, f"synthetic people, built {model.info['built']}, cached at {synthetic_path()}"
+    if path is None:
+        say("note: no model named, so that of the built-in people is used: the shapes of soldiers (ANSUR II)")
+    return load_model(path or BUILT_IN), str(path or BUILT_IN)
 
 
 def body_of(model: BodyModel, subject: str | None, unit: Unit | None) -> BodyModel | Subject:

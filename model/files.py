@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import importlib
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 from scanprep.geometry import storage
@@ -9,21 +11,30 @@ from scanprep.geometry import storage
 from .body import BodyModel
 
 # by the name of the kind in files: the module and the class; a new kind is a new line
+BUILT_IN = "people"                   # the name of the built-in model wherever a model file is asked for
+LOADERS = {BUILT_IN: "load_built_in_model", "people-fingers": "load_fingered_model"}     # of `model.built_in`
 KINDS = {"scape": ("model.scape", "ScapeModel"), "blendscape": ("model.scape", "BlendScapeModel"),
          "skinning": ("model.skinning", "SkinningModel")}
 
 
 def load_model(path: str | Path) -> BodyModel:
-    """Read a model file of any kind.
+    """Read a model file of any kind; "people" and "people-fingers" name the built-in models.
 
     Raises
     ------
     StorageError
         Missing, damaged, or of a kind or version that is not known.
     """
+    # a folder of that name, as people keep, is no model file
+    if str(path) in LOADERS and not Path(path).is_file():
+        load: Callable[[], BodyModel] = getattr(importlib.import_module("model.built_in"), LOADERS[str(path)])
+        return load()
     kind = storage.kind_of(path)
     if kind not in KINDS:
         raise storage.StorageError(f"{path}: expected a body model of kind {', '.join(KINDS)}, found '{kind}'")
     module, name = KINDS[kind]
     model: BodyModel = getattr(importlib.import_module(module), name).load(path)
+    if model.info.get("name") == "synthetic people":
+        warnings.warn(f"{path}: these are the built-in people of an earlier version, who were made up; those of now "
+                      f"have the statistics of people who were measured: -m {BUILT_IN}", stacklevel=2)
     return model

@@ -40,7 +40,7 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
     left = joint["leg", "left"] - joint["leg", "right"] + joint["arm", "left"] - joint["arm", "right"]
     left = _unit(left - up * (left @ up))
     axes = np.stack([left, np.cross(up, left), up], axis=1)
-    scale = float(np.ptp(template.vertices @ up)) / average().shape.stature
+    scale = float(np.ptp(template.vertices @ up)) / average().stature
     # of every part: rotations of two of their parts, and how far from one to the other; what takes its bone to theirs
     plain = [name.rstrip("0123456789") for name in names]
     trunk = [{"neck": "head", "trunk": "abdomen"}.get(name, name if name in TRUNK else "pelvis") for name in plain]

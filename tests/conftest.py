@@ -3,6 +3,7 @@
 Files of tests run side by side, one process for each core.
 """
 import os
+import tempfile
 import time
 from pathlib import Path
 
@@ -29,6 +30,14 @@ LONGEST = (
 PLACE = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
 
 
+def pytest_configure(config):
+    """A folder for what all processes of this run make once, see `people_bodies`: their environment names it."""
+    if "SCAPEKIT_TESTS" not in os.environ:
+        shared = tempfile.TemporaryDirectory(prefix="scapekit_tests_")
+        os.environ["SCAPEKIT_TESTS"] = shared.name
+        config.add_cleanup(lambda: (os.environ.pop("SCAPEKIT_TESTS"), shared.cleanup()))
+
+
 def pytest_collection_modifyitems(items):
     """The longest files first, so that all processes end at about the same time.
 
@@ -39,12 +48,9 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def run_folder(tmp_path_factory):
-    """The folder that the processes of this run share, with a cache in the place of the user's."""
+    """The folder that the processes of this run share."""
     base = tmp_path_factory.getbasetemp()
-    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SCAPEKIT_CACHE", str(base / "cache"))
-        yield base
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
 
 @pytest.fixture(scope="session")

@@ -1,34 +1,28 @@
-"""How the generic humanoid is made from the synthetic people: done once, its result is stored in the package.
+"""How the generic humanoid is brought to the built-in people: done once, its result is stored in the package.
 
-`python tests/humanoid_maker.py` makes both files anew, in a minute.
+Its triangles, chart and blend weights stay what they are: `python tests/humanoid_maker.py` slides its vertices over the
+average body, fingers and toes in one and without ears, and writes both files anew, in a minute.
 """
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 
+import igl
 import numpy as np
-from people_maker import mirror, remesh
-from polygonise import polygonise
+from implicit_surface import Field, Group, Mirrored, project
+from scipy.interpolate import RBFInterpolator
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array, csr_array, diags_array
-from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.sparse import csr_array, diags_array
+from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial.distance import cdist
 
-from model.blend_weights import strongest
-from model.statue.control.chart import make_chart
-from model.statue.control.files import STORED, write_control
+from model.statue.control.files import STORED, humanoid, humanoid_markers, write_control
 from model.statue.control.model import ControlModel
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface
-from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic import body_parts as people_parts
-from scanprep.synthetic.anatomy import Anatomy, tables
-from scanprep.synthetic.body_parts import cross_sections
-from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
+from scanprep.synthetic.anatomy import Anatomy
 from scanprep.synthetic.landmarks import landmarks, markers
-from scanprep.synthetic.topology import CANONICAL, blending, load
+from scanprep.synthetic.topology import load
 
 NAMES = ("humanoid_root", "vl5", "skullbase", "l_sternoclavicular", "l_shoulder", "l_elbow", "l_wrist",
          "r_sternoclavicular", "r_shoulder", "r_elbow", "r_wrist", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee",
@@ -36,6 +30,7 @@ NAMES = ("humanoid_root", "vl5", "skullbase", "l_sternoclavicular", "l_shoulder"
 PARENTS = np.array([-1, 0, 1, 1, 3, 4, 5, 1, 7, 8, 9, 0, 11, 12, 0, 14, 15])
 SEGMENTS = ("spine", "head", "clavicle", "upper_arm", "forearm", "hand", "thigh", "shank", "foot")
 SEGMENT_OF_PART = np.array([0, 0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 6, 7, 8, 6, 7, 8])
+SLACK = 0.012                        # metres that a vertex may lie beside its mark, for even triangles
 FREE = (-360, 360)
 # degrees from the default pose about the axes of `freedom`, of the left side
 LIMITS = {"humanoid_root": (FREE, FREE, FREE),
@@ -45,141 +40,101 @@ LIMITS = {"humanoid_root": (FREE, FREE, FREE),
           "l_shoulder": ((-75, 160), (-100, 180), (-100, 100)),              # aside, forwards, twist
           "l_elbow": ((-20, 138),), "l_wrist": ((-75, 85), (-40, 30)),       # bent; to the palm, to the thumb
           "l_hip": ((-35, 65), (-35, 130), (-50, 50)), "l_knee": ((-8, 155),), "l_ankle": ((-35, 55),)}
-BODY, LIMB, HEAD, FACE, HAND, FOOT = 0.074, 0.048, 0.042, 0.0215, 0.0175, 0.0275     # metres, wanted edges
-# of the 16 parts of the people, pelvis first, the part here
-PART_OF_PEOPLE = np.array([0, 1, 1, 2, 4, 5, 6, 8, 9, 10, 11, 12, 13, 14, 15, 16])
-
-
-def build_mesh(anatomy: Anatomy, step: float = 0.006) -> Mesh:
-    """The control mesh, the same on either side of x = 0."""
-    field = coarse_body(anatomy)
-    high = np.array([anatomy.ends[6, 0] + 0.08, 0.22, CANONICAL.stature + 0.03])
-    half = polygonise(field, np.array([0.0, -0.30, -0.02]), high, step)
-    half = half.submesh(half.vertex_component[half.faces[:, 0]] == 0)[0]
-    mesh, _ = mirror(remesh(half, field, sizing(anatomy), 30))
-    mesh = with_marks(mesh, field)
-    order = np.lexsort((np.round(mesh.vertices[:, 0], 4), np.round(mesh.vertices[:, 2], 3)))
-    place = np.argsort(order)
-    return Mesh(mesh.vertices[order], place[mesh.faces])
 
 
 def coarse_body(a: Anatomy) -> Field:
     """The surface of the people without toes, fingers and ears, which few triangles cannot follow."""
-    g = a.scale
-    torso, shoulders = people_parts.trunk(a)
-    leg, head = people_parts.leg(a), people_parts.head(a)
-    assert isinstance(leg, Group) and isinstance(head, Group)
-    leg = Group([leg.members[0], (shoe(a), leg.members[1][1])], leg.bumps, leg.bounds)
-    nose = RoundCone(a.eye + a.front(0, 0.084, 0.012), a.eye + a.front(0, 0.101, -0.036), 0.008, 0.0125)
-    head = Group([*head.members[:2], (nose, 0.008)], bounds=head.bounds)              # skull and face, eyes
-    left = Group([(Group([*torso, (leg, 0.035 * g)]), 0), *shoulders, (people_parts.arm(a), 0.048 * g)],
-                 people_parts.trunk_bumps(a))
-    return Mirrored(Group([(left, 0), (head, 0.012), (mitten(a), 0.012)]))
+    people = load()
+    x, part = people.mesh.vertices.copy(), people.part_of_vertex
+    # ears are laid flat: the skin is spanned anew over the side of the head, a quarter of the ear is left
+    ear = a.vertices[landmarks()["left ear"]] + [0, 0.012, 0.012]
+    inside = np.linalg.norm(np.abs(x * [1, 0, 0]) + x * [0, 1, 1] - ear, axis=1) < 0.055
+    A = people.mesh.vertex_adjacency
+    mean = csr_array(diags_array(1 / A.sum(axis=1)) @ A)
+    for _ in range(3000):
+        x[inside] = (mean @ x)[inside]
+    x += 0.25 * (people.mesh.vertices - x)
+    # a web between fingers, the thumb apart, and between toes
+    hand, foot = ((x - a.joints[k]) @ frame.T for k, frame in ((6, a.forearm_frame), (12, a.foot_frame)))
+    fingers = x[(part == 6) & (hand[:, 2] > 0.075) & (hand[:, 0] > -0.025)]
+    toes = x[(part == 12) & (foot[:, 2] > 0.11)]
+    body = Solid(Mesh(x, people.mesh.faces))
+    return Mirrored(Group([(body, 0), (hull(fingers), 0.012), (hull(toes), 0.012)]))
 
 
-def mitten(a: Anatomy) -> Field:
-    """Palm and fingers as one flat volume, and the thumb."""
-    L = a.width["hand"] / 0.19
-    f, wrist = a.forearm_frame, a.joints[6]
-    t = np.array([-0.012, 0.015, 0.04, 0.07, 0.10, 0.14, 0.168]) * L
-    thick = np.array([0.0195, 0.0185, 0.0170, 0.0155, 0.0130, 0.0110, 0.0090]) * L
-    fore = np.array([0.0275, 0.031, 0.037, 0.041, 0.041, 0.037, 0.029]) * L
-    bent = -np.array([0, 0, 0, 0, 0.002, 0.008, 0.014]) * L
-    flat = Loft(wrist, f, cross_sections(t, thick, thick, fore, fore, 2.5, bent), (0.006 * L, 0.016 * L))
-    thumb = [wrist + f.T @ (np.array(p) * L) for p in ((-0.006, 0.018, 0.022), (-0.013, 0.044, 0.056),
-                                                       (-0.017, 0.061, 0.104))]
-    return Group([(flat, 0), (RoundCone(thumb[0], thumb[1], 0.0175 * L, 0.0140 * L), 0.016 * L),
-                  (RoundCone(thumb[1], thumb[2], 0.0140 * L, 0.0115 * L), 0.006 * L)],
-                 bounds=(wrist + f.T @ [0, 0, 0.03 * L], wrist + f.T @ [0, 0, 0.15 * L], 0.15 * L))
+class Solid:
+    """Signed distance to a closed mesh, metres, negative inside."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(igl.signed_distance(
+            np.ascontiguousarray(points), self.mesh.vertices, self.mesh.faces,
+            igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER)[0])
 
 
-def shoe(a: Anatomy) -> Field:
-    """The foot with its toes in one."""
+def hull(points: np.ndarray) -> Solid:
+    """The convex hull of some points."""
+    found = ConvexHull(points)
+    corners = points[found.simplices]
+    inward = np.einsum("fd,fd->f", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+                       found.equations[:, :3]) < 0
+    faces = np.where(inward[:, None], found.simplices[:, ::-1], found.simplices)
+    used, faces = np.unique(faces, return_inverse=True)
+    return Solid(Mesh(points[used], faces.reshape(-1, 3)))
 
-    length, frame, ankle = a.width["foot"], a.foot_frame, a.joints[12]
-    toes = np.array([[0.66, -0.020, 0.150, -0.045, 0.138], [0.72, -0.045, 0.110, -0.055, 0.136]])
-    t, shift, half, top, bottom = (np.vstack([tables.foot, toes]) * length).T
-    origin = np.array([ankle[0], ankle[1], 0.140 * length])
-    keys = cross_sections(t, half, half, (top + bottom) / 2, (top + bottom) / 2, 2.8, shift, (top - bottom) / 2)
-    return Group([(Loft(origin, frame, keys, (0.018 * length, 0.03 * length)), 0)],
-                 bounds=(origin, origin + frame.T @ np.array([0, 0, 0.5]) * length, 0.55 * length))
 
-
-def sizing(a: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
-    """Wanted edge length in metres at points (n, 3), of either side."""
-    j, e = a.joints, a.ends
-    face = a.eye + np.array([0, -0.095, -0.035])
-    spots = [(RoundCone(j[6], e[6], 0.035, 0.06), HAND), (RoundCone(j[12], e[12] - [0, 0, 0.05], 0.04, 0.08), FOOT),
-             (RoundCone(j[4], j[5], 0.02, 0.08), LIMB), (RoundCone(j[5], j[6], 0.08, 0.05), 0.8 * LIMB),
-             (RoundCone(j[10] - [0, 0, 0.1], j[11], 0.12, 0.10), 1.1 * BODY),
-             (RoundCone(j[11], j[12], 0.10, 0.08), LIMB),
-             (RoundCone(e[12] - [0, 0, 0.05], a.front(0.13, 0.15, 0.03), 0.04, 0.04), 0.85 * FOOT),
-             (RoundCone(a.front(0, 0, a.at(-0.22)), a.front(0, 0, a.at(-0.20)), 0.05, 0.05), 0.7 * BODY),
-             (RoundCone(face, face + 1e-3, 0.045, 0.045), FACE), (RoundCone(j[3], e[3], 0.08, 0.12), HEAD)]
-
-    def size(points: np.ndarray) -> np.ndarray:
-        folded = np.abs(points * [1, 0, 0]) + points * [0, 1, 1]
-        wanted = np.full(len(points), BODY)
-        for place, fine in spots:
-            wanted = np.minimum(wanted, fine + 0.30 * np.maximum(place(folded), 0))
-        return wanted
-
-    return size
+def at(side: float, front: float, up: float) -> np.ndarray:
+    """A place (3,), metres."""
+    return np.array([side, -front, up])
 
 
 def joint_places(a: Anatomy) -> np.ndarray:
     """(17, 3) the centres of the joints; the sternoclavicular ones lie beside the notch above the breastbone."""
     of_people = np.array([0, 1, 3, 4, 4, 5, 6, 7, 7, 8, 9, 10, 11, 12, 13, 14, 15])
     joints = a.joints[of_people]
-    joints[3] = a.front(0.026 * a.scale, 0.035 * a.scale, a.at(0.975))
+    joints[3] = at(0.026 * a.scale, 0.035 * a.scale, a.at(1.03))
     joints[7] = joints[3] * [-1, 1, 1]
-    return joints
+    return np.where(np.abs(joints) < 1e-12, 0.0, joints)
 
 
-def part_weights(mesh: Mesh, a: Anatomy) -> np.ndarray:
-    """(N, 17) the weights of the people at the nearest places of their surface, a share of the chest for the clavicles.
-
-    A clavicle carries the top of the chest from the middle out to the shoulder, and where people blend chest and upper
-    arm the chest's part of it.
-    """
-    people = Surface(load().mesh).closest(mesh.vertices)
-    found = np.einsum("nc,ncp->np", people.bary, blending()[1][load().mesh.faces[people.faces]])
-    weights = np.zeros((len(mesh.vertices), 17))
-    np.add.at(weights.T, PART_OF_PEOPLE, found.T)
-    shoulder = a.joints[4]
-    high = _smoothstep((mesh.vertices[:, 2] - shoulder[2] + 0.19) / 0.17)
-    for part, side in ((3, 1), (7, -1)):
-        out = _smoothstep((side * mesh.vertices[:, 0] - 0.015) / (0.85 * shoulder[0]))
-        weights[:, part] = weights[:, 1] * high * out
-    weights[:, 1] -= weights[:, 3] + weights[:, 7]
-    weights[weights < 0.004] = 0
-    return strongest(weights)
-
-
-def with_marks(mesh: Mesh, field: Field, rounds: int = 12) -> Mesh:
-    """The mesh slid over the surface until a vertex lies at every landmark and marker of the people."""
-    people, twin = load(), mirrored_vertices(mesh)
-    marks = [v if people.mesh.vertices[v, 0] > -1e-4 else people.mirror[v] for v in (*landmarks().values(),
-                                                                                     *markers().values())]
-    goals = project(field, people.mesh.vertices[np.unique(marks)], 6)
-    goals[np.abs(goals[:, 0]) < 0.004, 0] = 0
-    far = np.linalg.norm(mesh.vertices[:, None] - goals, axis=2)
-    far[(mesh.vertices[:, 0] > 0)[:, None] != (goals[:, 0] > 0)] = np.inf
-    pinned, at = linear_sum_assignment(np.minimum(far, 1.0)**2)
-    free = np.setdiff1d(np.arange(len(twin)), np.r_[pinned, twin[pinned]])
-    x, A = mesh.vertices, mesh.vertex_adjacency
+def slide(control: ControlModel, anatomy: Anatomy, rounds: int = 12) -> Mesh:
+    """The mesh slid over the surface of the people until each landmark and marker lies at theirs."""
+    mesh, field = control.mesh, coarse_body(anatomy)
+    twin = mirrored_vertices(mesh)
+    # first as marks and joints tell
+    x, mine, theirs = mesh.vertices, [*control.skeleton.joints], [*joint_places(anatomy)]
+    goals = np.zeros((0, 3))
+    for vertices, marks in ((control.landmarks, landmarks()), (humanoid_markers(), markers())):
+        places = project(field, load().mesh.vertices[[marks[name] for name in vertices]], 6)
+        mine += [*x[list(vertices.values())]]
+        theirs += [*places]
+        # a marker beside a landmark shares its vertex, in the middle between them
+        for place in np.abs(places * [1, 0, 0]) + places * [0, 1, 1]:
+            near = np.linalg.norm(goals - place, axis=1) < 0.024
+            goals[near] = 0.5 * (goals[near] + place)
+            goals = goals if near.any() else np.vstack([goals, place])
+    _, first = np.unique(np.round(mine, 6), axis=0, return_index=True)
+    x = RBFInterpolator(np.array(mine)[first], np.array(theirs)[first], kernel="linear")(x)
+    x = 0.5 * (x + x[twin] * [-1, 1, 1])
+    # then over the surface, the nearest vertices at the marks
+    goals[goals[:, 0] < 0.004, 0] = 0
+    far = np.where((x[:, :1] > 1e-6) != (goals[:, 0] > 0), 1.0, np.minimum(cdist(x, goals), 1.0))
+    pinned, at_goal = linear_sum_assignment(far**2)
+    pinned, goals = np.r_[pinned, twin[pinned]], np.vstack([goals[at_goal], goals[at_goal] * [-1, 1, 1]])
+    A = mesh.vertex_adjacency
     mean = csr_array(diags_array(1 / A.sum(axis=1)) @ A)
-    wanted = x - mean @ x
-    for done in range(1, rounds + 1):
-        x = x.copy()
-        x[pinned] += (goals[at] - x[pinned]) * done / rounds
-        x[twin[pinned]] = x[pinned] * [-1, 1, 1]
+    wanted = x - mean @ x                        # as even as the triangles were
+    for _ in range(rounds):
         normal = mesh.with_vertices(x).vertex_normals
         for _ in range(8):
-            step = mean @ x + 0.7 * wanted - x
+            step = mean @ x + 0.9 * wanted - x
             step -= np.einsum("nd,nd->n", step, normal)[:, None] * normal
-            x[free] += 0.5 * step[free]
-        x[free] = project(field, x[free], 2)
+            x += 0.25 * step
+            off = x[pinned] - goals
+            x[pinned] = goals + off * np.minimum(1, SLACK / np.maximum(np.linalg.norm(off, axis=1), 1e-9))[:, None]
+        x = project(field, x, 2)
         x = 0.5 * (x + x[twin] * [-1, 1, 1])
     return mesh.with_vertices(x)
 
@@ -204,73 +159,15 @@ def mirrored_vertices(mesh: Mesh) -> np.ndarray:
     return cKDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])[1].astype(np.int64)
 
 
-def _smoothstep(x: np.ndarray) -> np.ndarray:
-    x = np.clip(x, 0, 1)
-    return x * x * (3 - 2 * x)
-
-
-def hidden_seams(mesh: Mesh, a: Anatomy) -> list[np.ndarray]:
-    """Seams out of sight: crown to crotch behind, under the arms and round the hand to the thumb, inside of the legs to
-    the heel and round the sole; the right side mirrors the left."""
-    g, j = a.scale, a.joints
-    fu, ff, fl, ft = a.upper_arm_frame, a.forearm_frame, a.leg_frame, a.foot_frame
-    L, foot = a.width["hand"] / 0.19, a.width["foot"]
-
-    def hand(out: float, front: float, along: float) -> np.ndarray:
-        return j[6] + L * (ff.T @ np.array([out, front, along]))
-
-    def sole(side: float, ahead: float, up: float) -> np.ndarray:
-        return j[12] + foot * (side * ft[0] + ahead * ft[2]) * [1, 1, 0] + [0, 0, foot * up - j[12, 2]]
-
-    spine = [a.eye + [0, -0.02, 0.12], a.eye + [0, 0.12, 0.02], a.front(0, -0.13 * g, a.at(1.05)),
-             a.front(0, -0.13 * g, a.at(0.6)), a.front(0, -0.13 * g, a.at(0.05)), a.front(0, -0.02, a.at(-0.25))]
-    arm = [a.front(0, -0.13 * g, a.at(0.72)), j[4] + 0.3 * (j[5] - j[4]) - 0.05 * fu[0] - 0.03 * fu[1],
-           j[5] - 0.045 * fu[0] - 0.02 * fu[1], j[6] - 0.02 * ff[0] - 0.025 * ff[1],
-           hand(0, -0.042, 0.07), hand(-0.01, -0.03, 0.16), hand(-0.014, 0, 0.186), hand(-0.01, 0.03, 0.16),
-           hand(0, 0.043, 0.10), hand(-0.017, 0.062, 0.112)]
-    leg = [a.front(0, -0.02, a.at(-0.25)), j[11] - 0.055 * fl[0], j[12] - 0.035 * fl[0] - 0.02 * fl[1],
-           sole(-0.02, -0.24, 0.10), sole(0.10, -0.10, 0), sole(0.13, 0.2, 0.02), sole(0.15, 0.50, 0.02),
-           sole(-0.03, 0.75, 0.03), sole(-0.14, 0.62, 0.03)]
-    twin = mirrored_vertices(mesh)
-    tree = [_path(mesh, spine, np.abs(mesh.vertices[:, 0]) > 1e-6)]
-    for way in (arm, leg):
-        taken = np.zeros(len(mesh.vertices), dtype=bool)
-        taken[np.concatenate(tree)] = True
-        left = _path(mesh, way, taken | (mesh.vertices[:, 0] < 1e-6))
-        tree += [left, twin[left]]
-    return tree
-
-
-def _path(mesh: Mesh, way: list[np.ndarray], costly: np.ndarray) -> np.ndarray:
-    """The shortest simple path (k,) over edges past the vertices nearest to some points, round `costly` vertices."""
-    stops = [int(np.linalg.norm(mesh.vertices - point, axis=1).argmin()) for point in way]
-    out, blocked = stops[:1], np.array(costly)
-    for last in stops[1:]:
-        x, y = mesh.edges.T
-        cost = mesh.edge_lengths * (1 + 1e3 * (blocked[x] | blocked[y]))
-        graph = coo_array((cost, (x, y)), shape=2 * (len(mesh.vertices),)).tocsr()
-        before = dijkstra(graph, directed=False, indices=out[-1], return_predecessors=True)[1]
-        back = [last]
-        while back[-1] != out[-1]:
-            back.append(int(before[back[-1]]))
-        out += back[-2::-1]
-        blocked[out] = True
-    return np.array(out)
-
-
 def build() -> ControlModel:
-    """The humanoid from scratch, a minute."""
-    anatomy = Anatomy(CANONICAL)
-    mesh = build_mesh(anatomy)
-    weights = part_weights(mesh, anatomy)
-    part_of_face = weights[mesh.faces].mean(axis=1).argmax(axis=1)
-    skeleton = Skeleton(part_of_face, PARENTS, joint_places(anatomy), NAMES)
-    joints = skeleton.joints.copy()
-    joints[0] = mesh.vertices[skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
-    chart = make_chart(mesh, hidden_seams(mesh, anatomy))
+    """The stored humanoid, brought to the people."""
+    anatomy, old = load().anatomy, humanoid()
+    mesh = slide(old, anatomy)
+    joints = joint_places(anatomy)
+    joints[0] = mesh.vertices[old.skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
     axes, limits = freedom(anatomy)
-    return ControlModel(mesh, replace(skeleton, joints=joints), weights, chart,
-                        nearest_marks(mesh, landmarks()), axes, limits, SEGMENTS, SEGMENT_OF_PART)
+    return replace(old, mesh=mesh, skeleton=replace(old.skeleton, joints=joints), axes=axes, limits=limits,
+                   landmarks=nearest_marks(mesh, landmarks()))
 
 
 def freedom(anatomy: Anatomy) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:

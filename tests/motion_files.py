@@ -45,10 +45,11 @@ def elsewhere(tmp_path, poses, trans, scale=39.37):
     rig = make_rig(small_people(), np.zeros(1))
     names, parents, J = list(rig.skeleton.names), rig.skeleton.parents, rig.skeleton.joints
     A = np.tile(np.eye(3), (16, 1, 1))
-    for side, sign in (("left", 1), ("right", -1)):
+    for side in ("left", "right"):
         arm = [names.index(f"{part}_{side}") for part in ("upper_arm", "forearm", "hand")]
         bone = J[arm[1]] - J[arm[0]]
-        A[arm] = rotations.exp(np.array([0, -sign * np.arctan2(-bone[2], abs(bone[0])), 0]))
+        A[arm] = rotations.exp(np.arctan2(-bone[2], np.hypot(bone[0], bone[1])) * np.array([bone[1], -bone[0], 0])
+                               / np.hypot(bone[0], bone[1]))
     R = rig.skeleton.part_rotations(poses) @ np.swapaxes(A, -1, -2)
     rest = joint_places(rig.skeleton, rig.skeleton.pose_of(A))
     Q = rotations.exp(np.array([0, 1.1, 0])) @ Y_UP

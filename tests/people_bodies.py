@@ -1,21 +1,37 @@
-"""A small model of the synthetic people, for the tests of markers: made once a run, in a few seconds."""
+"""A small model of the built-in people, for the tests of markers: learned once a run, in a few seconds."""
 from __future__ import annotations
 
+import os
+import sys
+from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
-from completion.synthetic_people import SyntheticRecipe, synthetic_model
 from model.body import BodyModel
+from model.files import load_model
 from model.learning.config import LearnConfig
+from scanprep.batch.opening import locked
+from scanprep.synthetic.population import population
 
-SMALL = SyntheticRecipe(poses=12, people=8, faces=2000, learn=LearnConfig(components=4, refinements=0))
+sys.path.insert(0, str(Path(__file__).with_name("people")))
+import make_model
+
+SHARED = "SCAPEKIT_TESTS"            # the folder of the run, see conftest
 
 
 @lru_cache(maxsize=1)
 def small_people() -> BodyModel:
-    """16 parts, four betas, a thousand vertices; from the cache of the run, for its other processes."""
-    return synthetic_model(recipe=SMALL)
+    """16 parts, four betas, 1,500 vertices; from the folder of the run, for its other processes."""
+    path = Path(os.environ[SHARED]) / "small_people.npz"
+    with locked(path.with_suffix(".lock"), path, wait=True):
+        if not path.exists():
+            model = make_model.learn_people_model(12, 3000, LearnConfig(refinements=0), n_betas=4)
+            sexes = {sex: {"mean": m[:4].tolist(), "covariance": C[:4, :4].tolist()}
+                     for sex, (m, C) in population().moments.items()}
+            replace(model, info={**model.info, "sexes": sexes}).save(path)
+    return load_model(path)
 
 
 def kept() -> np.ndarray:

@@ -3,9 +3,9 @@ from __future__ import annotations
 
 import igl
 import numpy as np
+from implicit_surface import Field
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.implicit_surface import Field
 
 
 def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> Mesh:

@@ -4,9 +4,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from people_bodies import make_model
 from scipy.spatial.transform import Rotation
 
-from completion.synthetic_people import _decimated
 from model.blend_weights import skin_weights, strongest
 from model.export.correctives import pose_directions
 from model.rig import Rig
@@ -27,15 +27,16 @@ class Synthetic:
     vertices: np.ndarray
 
 
-def synthetic_smpl(faces: int = 1600, people: int = 3, poses: int = 8, seed: int = 5) -> Synthetic:
+def synthetic_smpl(faces: int = 2400, people: int = 3, poses: int = 8, seed: int = 5) -> Synthetic:
     """24 joints, 10 betas and 207 pose columns, learned from synthetic people; no spine is cut but ours."""
     rng, man = np.random.default_rng(seed), Person(SUBJECT)
     at = [random_pose(rng) for _ in range(poses)]
     for pose in at:
         pose[0] = 0
-    small = _decimated(man, None, faces)
+    small = make_model.decimate_person(man, None, faces)
     own, template = small.vertex_map, small.template
-    shapes = np.stack([Person(BodyShape.random(rng, (-1.0, 1.0)[k % 2])).mesh.vertices[own] for k in range(people)])
+    drawn = [BodyShape.random(rng, ("female", "male")[k % 2]) for k in range(people)]
+    shapes = np.stack([Person(shape).mesh.vertices[own] for shape in drawn])
     mean = shapes.mean(axis=0)
     _, s, Vt = np.linalg.svd((shapes - mean).reshape(people, -1), full_matrices=False)
     shapedirs = (s[:10, None] * Vt[:10] / np.sqrt(people - 1)).reshape(-1, len(own), 3)[:people - 1]
@@ -155,4 +156,4 @@ def published_vertices(a: dict[str, np.ndarray], pose: np.ndarray, betas: np.nda
 def people_near_rest(count: int, seed: int) -> list[tuple[Person, np.ndarray]]:
     """People who were not learned from, and how they stand."""
     rng = np.random.default_rng(seed)
-    return [(Person(BodyShape.random(rng, (-1.0, 1.0)[k % 2])), near_rest(rng)) for k in range(count)]
+    return [(Person(BodyShape.random(rng, ("female", "male")[k % 2])), near_rest(rng)) for k in range(count)]

@@ -5,7 +5,7 @@ import pytest
 from people_bodies import small_people
 from quiet_pictures import coarse_pictures
 
-from completion import synthetic_people
+from model import files
 from scanprep.batch.digests import Digests
 from scanprep.registration import person
 
@@ -25,11 +25,10 @@ def once(find):
 
 @contextmanager
 def of_a_user(folder):
-    """Work in a folder, with a cache of its own; the model of those without one is small, and so are all pictures."""
-    small = small_people()                                       # from the cache of the run
+    """Work in a folder; the model of those without one is small, and so are all pictures."""
+    small, load_model = small_people(), files.load_model
     with pytest.MonkeyPatch.context() as here, coarse_pictures():
         here.setattr(person, "_person_on", once(person._person_on))
         here.chdir(folder)
-        here.setenv(synthetic_people.CACHE, str(folder / "cache"))
-        here.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: small)
+        here.setattr(files, "load_model", lambda path: small if str(path) == files.BUILT_IN else load_model(path))
         yield

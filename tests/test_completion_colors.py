@@ -40,7 +40,9 @@ def test_colours_arrive_where_the_body_was_seen(person, views):
     colors = carry_colors(person, seen, meshes, viewpoint=cameras)
     off = np.abs(colors - np.clip(paint(person.vertices), 0, 1))[seen].max(axis=1)
     grey = (colors == 0.6).all(axis=1)
-    assert np.quantile(off[~grey[seen]], 0.99) < 0.05 and grey[seen].mean() < 0.02
+    # of the skin: most vertices are of fingers, lips and ears, which hide each other
+    hidden = np.average(grey[seen], weights=person.vertex_areas[seen])
+    assert np.quantile(off[~grey[seen]], 0.99) < 0.05 and hidden < 0.02
     assert 0.02 < grey.mean() < 0.5 and grey[~seen].mean() > 0.5     # single gaps amid what was seen are closed
 
 

@@ -40,7 +40,7 @@ def test_legs_alone_say_what_they_did_not_see():
     assert set(found.unseen) == {name for name in NAMES if name.startswith(
         ("abdomen", "chest", "head", "upper_arm", "forearm", "hand"))}
     assert found.judgement().verdict == "check" and "no marker saw" in found.judgement().why
-    assert 0.5 < found.skin < 0.7
+    assert 0.45 < found.skin < 0.6               # by the rule of nines: head 9, arms 18, trunk above the hips 22 to 30%
 
 
 @pytest.mark.parametrize(("labels", "others", "verdict", "words"), [

@@ -39,7 +39,7 @@ def test_a_layout_is_shown_on_a_mesh_and_can_be_used_again(tmp_path, person):
     write_mesh(tmp_path / "body.ply", person.mesh)
     assert main(["layout", "show", "vicon47", "--body", str(tmp_path / "body.ply"), "-o", str(tmp_path / "out")]) == 0
     page = (tmp_path / "out" / "report.html").read_text()
-    layout = MarkerLayout.load(tmp_path / "out" / "layout.json", 9380)
+    layout = MarkerLayout.load(tmp_path / "out" / "layout.json", 12500)
     assert all(label in page for label in layout.labels) and (tmp_path / "out" / "layout.png").stat().st_size > 5_000
     figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "out" / "report.json").read_text())["metrics"]}
     assert (figures["markers"], figures["pairs of left and right"], figures["without a side"]) == (47, 21, 5)
@@ -121,9 +121,9 @@ def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, mon
                  "--target", str(tmp_path / "b.ply"), "--landmarks", str(tmp_path / "b.json"), "-o", str(out)]) == 0
     assert seen["landmarks"][0].tolist() == [5, 9, 700]
     target = read_mesh(tmp_path / "b.ply")
-    np.testing.assert_allclose(MarkerLayout.load(out, 9380).select(["C7", "LELB"]).place(target),
+    np.testing.assert_allclose(MarkerLayout.load(out, 12500).select(["C7", "LELB"]).place(target),
                                named_layout("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
-    assert out.with_suffix(".png").exists() and len(read_mesh(out.with_suffix(".registered.ply")).vertices) == 9380
+    assert out.with_suffix(".png").exists() and len(read_mesh(out.with_suffix(".registered.ply")).vertices) == 12500
     told = json.loads((tmp_path / "b.layout.json.report.json").read_text())
     figures = {m["metric"]: m["value"] for m in told["metrics"]}
     assert figures["target not covered"] == pytest.approx(6) and figures["landmarks"] == 3
@@ -138,7 +138,7 @@ def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, mon
 
 BAD = {
     "neither name nor file": ("show nobody --body body.ply -o out", ["nobody", "vicon47"]),
-    "another body": ("show vicon47 --body ball.ply -o out", ["vicon47", "9380", "4 vertices"]),
+    "another body": ("show vicon47 --body ball.ply -o out", ["vicon47", "12500", "4 vertices"]),
     "a layout of another body": ("show big.json --body ball.ply -o out", ["big.json", "vertex 77"]),
     "a mesh that is not there": ("show vicon47 --body none.ply -o out", ["none.ply", "no such file"]),
     "a body and a model": ("show vicon47 --body body.ply -m body.ply -o out", ["--model", "--body"]),

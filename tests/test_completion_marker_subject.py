@@ -116,7 +116,7 @@ def test_markers_on_wands_and_without_their_bars_are_the_same_person(model, layo
 
 
 def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
-    person = Person(BodyShape(sex=1.0, stature=1.88, weight=1.0))
+    person = Person(BodyShape.like("male", stature=1.88, weight=1.0))
     on_skin = named_layout("cmu41", person.mesh)
     poses, trans = walk(40, 40.0)
     bodies = np.stack([person.posed(p, t) for p, t in zip(poses, trans, strict=True)])

@@ -96,23 +96,23 @@ def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys):
     rest, bent = (folder / "bodies" / f"{name}.ply" for name in ("rest", "bent"))
     assert scape(rest, bent, "--landmarks", folder / "marks.json", "-o", tmp_path / "m.csv") == 0
     said = capsys.readouterr().err
-    assert "LOOK AT THE RESULT: bent: the left shin is turned by 50 degrees" in said, said
+    assert "LOOK AT THE RESULT: bent: the left shin is turned by 49 degrees" in said, said
     assert "name the model with -m" in said
     assert table(tmp_path / "m.csv")["bent"]["note"].startswith("the left shin is turned by")
 
 
 def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
-    person = Person(BodyShape(weight=1.0))
+    person = Person(BodyShape.like(weight=1.0))
     bodies = RegisteredSet.create(tmp_path / "set", person.mesh)
     bodies.add("one", person.mesh, subject="a")
     assert scape(tmp_path / "set", "-o", tmp_path / "set.csv") == 0
     row = table(tmp_path / "set.csv")["one"]
-    assert float(row["stature"]) == pytest.approx(person.shape.stature, abs=0.005) and row["note"] == ""
+    assert float(row["stature"]) == pytest.approx(person.anatomy.stature, abs=0.005) and row["note"] == ""
 
 
 def test_a_completion_states_errors(folder, tmp_path):
     """Those that expected errors of its vertices imply; its report names the model."""
-    model, person = small_people(), Person(BodyShape(sex=0.3))
+    model, person = small_people(), Person(BodyShape("male", (0.1,)))
     body = model.template.with_vertices(person.mesh.vertices[kept()])
     n = len(body.vertices)
     done = Completion(body, body, np.zeros((16, 3)), np.zeros(4), np.zeros(3), np.ones(n, bool), 0.001, 1.0, 0.001,
@@ -122,7 +122,7 @@ def test_a_completion_states_errors(folder, tmp_path):
     assert scape(tmp_path / "whole", "-o", tmp_path / "m.csv") == 0
     row = table(tmp_path / "m.csv")["whole"]
     assert 0.0005 < float(row["waist_girth_error"]) < 0.02
-    assert abs(float(row["stature"]) - person.shape.stature) < 0.01
+    assert abs(float(row["stature"]) - person.anatomy.stature) < 0.01
 
 
 def test_the_body_of_some_measurements(folder, tmp_path, capsys):
@@ -140,6 +140,14 @@ def test_the_body_of_some_measurements(folder, tmp_path, capsys):
 @pytest.mark.parametrize(("words", "told"), [
     (["-m", "model.npz", "--to", "stature=4", "-o", "b.ply"], "stature=4: expected 1.2 to 2.4 m, which people measure"),
     (["-m", "model.npz", "--to", "waist=0.01", "-o", "b.ply"], "waist=0.01: expected 0.4 to 2.2 m"),
+    (["-m", "model.npz", "--to", "stature=180", "-o", "b.ply"], "stature=180: expected 1.2 to 2.4 m, which people "
+     "measure there; it is in metres: did you mean stature=1.8, which is 180 centimetres?"),
+    (["-m", "model.npz", "--to", "weight=78000", "-o", "b.ply"], "weight=78000: expected 25 to 300 kg, which people "
+     "weigh; it is in kilograms: did you mean weight=78, which is 78000 grams?"),
+    (["-m", "model.npz", "--to", "waist=34", "-o", "b.ply"], "did you mean waist=0.8636, which is 34 inches?"),
+    (["-m", "model.npz", "--to", "stature=2.7", "-o", "b.ply"], "people measure there; the nearest is stature=2.4"),
+    (["-m", "model.npz", "--to", "stature=1.8", "--sex", "male", "-o", "b.ply"], "the model does not tell women from "
+     "men, so it has no men; leave it out, or take the built-in model, which is named people"),
     (["-m", "model.npz", "--to", "waist", "-o", "b.ply"], "--to: expected name=metres, such as waist=0.85, got waist"),
     (["-m", "model.npz", "--to", "shoe=1", "-o", "b.ply"], "no measurement 'shoe'; there are: stature"),
     (["bodies", "-m", "model.npz", "--to", "waist=0.8", "-o", "b.ply"], "--to makes a body from measurements"),
@@ -186,7 +194,7 @@ def test_a_hole_leaves_a_cell_empty(folder, tmp_path, capsys):
     assert row["calf_girth_left"] == "" and "calf_girth_left: a hole of the template crosses it" in row["note"]
     assert row["waist_girth"] != "" and "nan" not in (tmp_path / "m.csv").read_text().lower()
     said = capsys.readouterr().err
-    assert "LOOK AT THE RESULT: open: no knee girth left, a hole" in said, said
+    assert "LOOK AT THE RESULT: open: no calf girth left, a hole" in said, said
 
 
 def test_percentiles_of_a_sex(folder, tmp_path, capsys):
@@ -201,4 +209,56 @@ def test_percentiles_of_a_sex(folder, tmp_path, capsys):
     assert "of men" in capsys.readouterr().out
     page = (tmp_path / "m.html").read_text(encoding="utf-8")
     assert f"({ordinal(true['stature'])})" in page and "4,082 men of ANSUR II" in page
-    assert scape("--to", "stature=1.8", "--sex", "male", "-m", folder / "model.npz", "-o", tmp_path / "b.ply") == 2
+
+
+def test_the_weight_of_a_closed_body_is_told_with_its_error(folder, tmp_path, capsys):
+    """985 kg in a cubic metre, give or take 2%; an open one has none, and is good all the same."""
+    model = small_people()
+    body = model.template.with_vertices(model.vertices(np.zeros((16, 3))))
+    assert scape(folder / "bodies" / "rest.ply", "-m", folder / "model.npz", "--sex", "male", "-o",
+                 tmp_path / "m.csv") == 0
+    row = table(tmp_path / "m.csv")["rest"]
+    assert float(row["weight"]) == pytest.approx(985 * body.volume, abs=0.05)
+    assert float(row["weight_error"]) == pytest.approx(0.02 * float(row["weight"]), rel=1e-3)
+    assert float(row["weight_percentile"]) == pytest.approx(
+        percentiles({"weight": float(row["weight"])}, "male")["weight"], abs=0.1)
+    crown = int(body.vertices[:, 2].argmax())
+    write_mesh(tmp_path / "bald.ply", type(body)(body.vertices, body.faces[~(body.faces == crown).any(axis=1)]))
+    capsys.readouterr()
+    assert scape(tmp_path / "bald.ply", "--landmarks", folder / "marks.json", "-o", tmp_path / "o.csv") == 0
+    row = table(tmp_path / "o.csv")["bald"]
+    assert row["weight"] == "" and "weight: the template is open" in row["note"]
+    assert "LOOK AT" not in capsys.readouterr().err
+
+
+def test_the_most_probable_man_and_what_is_likely_of_him(tmp_path, capsys):
+    """The body has what was asked for; of the rest the table, the page, the betas and the report tell the range."""
+    assert scape("--to", "stature=1.80", "weight=78", "--sex", "male", "-o", tmp_path / "he.ply") == 0
+    said = capsys.readouterr()
+    assert "LOOK" not in said.err and "of men" in said.out and "waist girth, likely" in said.out
+    kept = json.loads((tmp_path / "he.betas.json").read_text())
+    low, value, high = kept["likely"]["waist_girth"]
+    assert kept["sex"] == "male" and low < value < high and 0.08 < high - low < 0.2
+    assert kept["measurements"]["weight"] == pytest.approx(78, abs=0.02) and "weight" not in kept["likely"]
+    page = (tmp_path / "he.html").read_text(encoding="utf-8")
+    assert "What was not asked for" in page and "78.0\u00a0kg" in page.replace(" kg", "\u00a0kg")
+    assert "wrist girth left, likely " in (tmp_path / "he.ply.report.json").read_text(encoding="utf-8")
+
+
+def test_nobody_said_the_sex(tmp_path, capsys):
+    """The more probable one is taken and told, and how to name it."""
+    assert scape("--to", "stature=1.58", "hip=1.05", "-o", tmp_path / "she.ply") == 0
+    said = capsys.readouterr()
+    assert "female (" in said.out and "name it with --sex" in said.err
+    assert json.loads((tmp_path / "she.betas.json").read_text())["sex"] == "female"
+
+
+@pytest.mark.parametrize(("words", "told"), [
+    (("waist=0.6", "hip=1.4"), "hip girth 1,400 mm fits least: most women with the other measurements have"),
+    (("stature=1.5", "weight=200"), "weight 200.0 kg fits least: most women with the other measurements have"),
+    (("stature=2.35",), "stature 2,350 mm fits least: most women have")])
+def test_measures_that_contradict_each_other_or_everybody(tmp_path, capsys, words, told):
+    """To be looked at, with what was reached and what people have."""
+    assert scape("--to", *words, "--sex", "female", "-o", tmp_path / "b.ply") == 0
+    said = capsys.readouterr().err
+    assert "LOOK AT THE RESULT" in said and told in said and "the measurements contradict each other" in said

@@ -98,7 +98,8 @@ def test_bones_point_along_the_limbs(person):
         left, right = rig.axes[names.index(name)], rig.axes[names.index("r" + name[1:])]
         mirror = np.eye(3) - 2 * np.outer(aside, aside)
         assert np.allclose(mirror @ left[:, 1:], right[:, 1:], atol=0.05), "of both sides mirror each other"
-    assert rig.axes[names.index("skullbase")][:, 1] @ vertical > 0.9, "a leaf points to the end of its surface"
+    # heads are ahead of the nape
+    assert rig.axes[names.index("skullbase")][:, 1] @ vertical > 0.85, "a leaf points to the end of its surface"
 
 
 def chain(*names, places=()):

@@ -29,7 +29,7 @@ def run(*words):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person(BodyShape(sex=1.0, stature=1.82))
+    return Person(BodyShape.like("male", stature=1.82))
 
 
 @pytest.fixture(scope="module")

@@ -26,9 +26,8 @@ from model.statue.control.model import control_problem
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.anatomy import Anatomy
 from scanprep.synthetic.people import LANDMARKS, MARKERS
-from scanprep.synthetic.topology import CANONICAL, load
+from scanprep.synthetic.topology import load
 
 MIRROR = np.array([-1, 1, 1])
 
@@ -172,7 +171,7 @@ def test_landmarks_and_markers_are_where_people_have_them():
 def test_what_is_stored_is_what_its_maker_makes():
     control = humanoid()
     assert control.skeleton.names == NAMES
-    axes, limits = freedom(Anatomy(CANONICAL))
+    axes, limits = freedom(load().anatomy)
     np.testing.assert_allclose(np.concatenate(control.axes), np.concatenate(axes), atol=1e-12)
     np.testing.assert_allclose(np.concatenate(control.limits), np.concatenate(limits), atol=1e-12)
     assert nearest_marks(control.mesh, LANDMARKS) == control.landmarks

@@ -56,7 +56,7 @@ def walled(mesh, height):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person(BodyShape(sex=1.0, stature=1.82, weight=0.4))
+    return Person(BodyShape.like("male", stature=1.82, weight=0.4))
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_soles_below_the_floor_come_to_rest_on_it(person, other, sunken, foot, s
     assert found is not None and found.beyond[0] > 0.02
     np.testing.assert_allclose(found.floor.normal, R @ UP, atol=1e-3)
     back = (found.vertices - T) @ R
-    assert abs(back[:, 2].min()) < 0.005 and np.ptp(back[:, 2]) == pytest.approx(person.shape.stature, abs=0.005)
+    assert abs(back[:, 2].min()) < 0.005 and np.ptp(back[:, 2]) == pytest.approx(person.anatomy.stature, abs=0.005)
     above = sunken.vertices[:, 2] > 0.0045
     np.testing.assert_allclose(back[above], sunken.vertices[above], atol=1e-12)
     assert (sunken.with_vertices(back).face_areas > 0).all()

@@ -31,7 +31,7 @@ def person():
 @pytest.mark.parametrize("seed", range(4))
 def test_people_of_any_build_and_direction_are_named(seed):
     rng = np.random.default_rng(seed)
-    body = Person(BodyShape.random(rng, sex=1.0 - 2 * (seed % 2)))
+    body = Person(BodyShape.random(rng, sex=("male", "female")[seed % 2]))
     R, t = rotations.exp(rng.normal(0, 2, 3)), rng.normal(0, 3, 3)
     mesh = Mesh(body.mesh.vertices @ R.T + t, body.mesh.faces)
     skeleton = Skeleton(body.part_of_face, body.parents, body.joints @ R.T + t)

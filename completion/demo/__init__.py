@@ -1,1 +1,1 @@
-"""The whole chain on the synthetic people, with its errors against the ground truth."""
+"""The whole chain on the built-in people, with its errors against the ground truth."""

@@ -96,7 +96,7 @@ MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("
 
 @dataclass(frozen=True)
 class ScanPerson:
-    """The work on each scan: a synthetic person made and scanned."""
+    """The work on each scan: a person made and scanned."""
 
     seed: int
     scanner: ScannerConfig
@@ -130,7 +130,7 @@ class Demo:
         """Scans of one subject in many poses and of many subjects."""
         tasks = [Task(f"{SCANS}{'pose' if which[1] else 'person'} {which[0]}", which)
                  for which in scan_plan(self.config.poses, self.config.subjects)]
-        with self.bar("scanning synthetic people") as progress, one_thread():
+        with self.bar("scanning people") as progress, one_thread():
             done = self.space.run(ScanPerson(self.config.seed, self.scanner), tasks, progress=progress)
         if done.failures:
             raise ValueError("; ".join(done.failures.values()))

@@ -15,7 +15,7 @@ from .chain import FULL, QUICK, Demo, DemoConfig
 
 def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False, seed: Seed = DemoConfig.seed,
          *, space: Workspace) -> Outcome:
-    """The whole chain on synthetic people: scans, registration, skeleton, model, completion, animation.
+    """The whole chain on the built-in people: scans, registration, skeleton, model, completion, animation.
 
     Example: scape demo
 

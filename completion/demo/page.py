@@ -35,7 +35,7 @@ def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Ca
                to: Path) -> None:
     """Write `report.html`, the animated GLB and pictures into a folder."""
     page = Page("From raw scans to a moving person",
-                "Every stage of the chain on synthetic people, whose true shape, pose and correspondence are known.")
+                "Every stage of the chain on the built-in people, whose true shape, pose and correspondence are known.")
     page.verdict(judgement, "Next, your own scans: `scape prep run scans --template template.ply -o set`")
     page.figures(metrics, ("measured against the truth", "value", "unit"))
     stages: tuple[Callable[[Demo, Page], None], ...] = (

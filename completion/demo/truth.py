@@ -1,4 +1,4 @@
-"""How far the results of the chain are from the ground truth of the synthetic people."""
+"""How far the results of the chain are from the ground truth of the built-in people."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scanprep.synthetic.data_set import GroundTruth
 
 @dataclass(frozen=True, eq=False)
 class TruthMap:
-    """Where each vertex of the template truly lies on any synthetic person: all of them share one triangulation."""
+    """Where each vertex of the template truly lies on any of them: all of them share one triangulation."""
 
     template: Mesh
     places: SurfacePoints  # the true surface points nearest to the template's vertices

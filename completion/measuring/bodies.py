@@ -71,7 +71,7 @@ def model_of(paths: Sequence[Path]) -> Path | None:
         folders = [path, *(p.parent for p in sorted(path.glob("*/report.json")))] if path.is_dir() else [path.parent]
         for folder in folders:
             name = reported_model(folder / "report.json")
-            if name is not None and name.is_file():
+            if name is not None:
                 return name
     return None
 
@@ -121,7 +121,7 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     """The template that tapes are found on, and its landmarks.
 
     The model's, which keeps its own; else that of the set; else the first body. Landmarks are in the file given, or
-    beside, or known by the triangles: those of the synthetic people. Where tapes begin at others too, as they do when
+    beside, or known by the triangles: those of the built-in people. Where tapes begin at others too, as they do when
     ten were clicked, the average person finds them.
     """
     from scanprep.synthetic.landmarks import landmarks

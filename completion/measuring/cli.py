@@ -9,14 +9,15 @@ import numpy as np
 
 from model.body import BodyModel
 from model.files import load_model
-from model.measurement.catalogue import CATALOGUE
+from model.measurement.catalogue import CATALOGUE, plain
 from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, measure, stands
-from model.measurement.survey import WORDS, Sex, ordinal, percentiles
+from model.measurement.survey import ordinal, percentiles
 from model.measurement.tapes import Tapes
-from model.measurement.wanted import body_with_measurements, checked_wanted
+from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
 from model.people import stature_and_volume
 from model.posing.transfer import own_body
+from model.shape_statistics import WORDS, Sex, shape_statistics
 from scanprep.arguments import Place, UsageError
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
@@ -29,43 +30,46 @@ from scanprep.words import number_of
 
 from ..cli import ModelOrNone, read_model
 from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
-from .page import measures_page
+from .page import likely_section, measures_page
 
+# of what was not asked for, what stands in the closing table; the page and the report have all
+ASKED_MOST = ("stature", "weight", "chest_girth", "waist_girth", "hip_girth", "thigh_girth_left", "crotch_height")
 BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
 
 
 def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone = None,
                    landmarks: Path | None = None, unit: Unit | None = None, to: tuple[str, ...] = (),
                    sex: Sex | None = None) -> Outcome:
-    """Stature, girths, lengths and widths of bodies, or the body that has some.
+    """Stature, girths, lengths, widths and weight of bodies, or the body that has some.
 
     Example: scape measure completed -m model.npz -o measures.csv
 
     Example: scape measure body.ply --sex female -o measures.csv
 
-    Example: scape measure -m model.npz --to stature=1.80 waist=0.85 -o body.ply
+    Example: scape measure --to stature=1.80 weight=78 waist=0.85 --sex male -o body.ply
 
     Args:
         bodies: Meshes in the triangles of one template or model, folders of them, registered sets, folders of scape
             complete and mosh, or betas of a model (JSON, .npz).
-        output: Table to write (.csv), in metres, one line a body; beside it a page of the same name (.html) with the
-            tapes on the bodies. With --to the mesh of the body; its betas are written beside it, for --subject.
+        output: Table to write (.csv), in metres and kilograms, one line a body; beside it a page of the same name
+            (.html) with the tapes on the bodies. With --to the mesh of the body; its betas are written beside it, for
+            --subject.
         model: Model of the bodies, else the one that their report names: who does not stand as its template does is
             brought into that pose first. Without any the template is that of the set, else the first body.
         landmarks: Where the landmarks are on the template, else those that the model keeps, or of the file beside the
             bodies.
         unit: Unit of meshes.
-        to: Measurements in metres that a body is to have, such as stature=1.80 waist=0.85; the rest is as probable as
-            it can be. Needs a model, or takes that of the synthetic people.
+        to: Measurements that a body is to have, in metres, and its weight in kilograms, such as stature=1.80 weight=78;
+            the rest is as probable as it can be, and told with its range. Needs a model, or takes the built-in one.
         sex: Also tell percentiles among the 4,082 men or 1,986 women of ANSUR II, of measurements that were taken in
-            the same way there. They were soldiers of 17 to 58 years, who are leaner than everybody.
+            the same way there. They were soldiers of 17 to 58 years, who are leaner than everybody. With --to the
+            body is of that sex, else of the more probable one, if the model tells women from men, as the built-in
+            one does.
     """
     if to:
-        if sex is not None:
-            raise UsageError("--sex compares bodies that are there with people: expected no --to with it")
         if bodies:
             raise UsageError("--to makes a body from measurements: expected no BODY with it")
-        return _wanted(to, output, *read_model(model), landmarks)
+        return _wanted(to, output, *read_model(model), landmarks, sex)
     if not bodies:
         raise ValueError("BODY: expected at least one body to measure, or --to with measurements of one to make")
     if output.suffix.lower() != ".csv":
@@ -102,8 +106,8 @@ def _measure(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
 
 
 def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurements], sex: Sex | None = None) -> None:
-    """One line a body: its name, measurements in metres, their expected errors, percentiles among people of a sex where
-    one is given, and why some are missing.
+    """One line a body: its name, measurements in metres and kilograms, their expected errors, percentiles among people
+    of a sex where one is given, and why some are missing.
     """
     columns = list(CATALOGUE)
     compared = list(percentiles(dict.fromkeys(columns, 1.0), sex)) if sex else []
@@ -128,17 +132,18 @@ def judged(names: Sequence[str], found: Sequence[Measurements], bodies: Sequence
             known = beyond_people(mine.values["stature"], stature_and_volume(body)[1])
             absurd += [f"{name}: {reason}" for reason in known.problems]
             doubts += [f"{name}: {reason}" for reason in known.doubts]
-        out = [word for word, value in mine.values.items()
-               if not 0.7 * CATALOGUE[word].low <= value <= 1.3 * CATALOGUE[word].high]
+        out = [word for word, value in mine.values.items() if word != "weight" and      # judged by its volume above
+               not 0.7 * CATALOGUE[word].low <= value <= 1.3 * CATALOGUE[word].high]
         if len(out) > len(mine.values) / 2:
             absurd.append(f"{name}: no person measures so, {out[0]} {mine.values[out[0]]:.3g} m: the wrong unit "
                           "(--unit), or other landmarks?")
         elif out:
             usual = CATALOGUE[out[0]]
-            doubts.append(f"{name}: {out[0].replace('_', ' ')} is {MM * mine.values[out[0]]:.0f} mm, people have "
-                          f"{MM * usual.low:.0f} to {MM * usual.high:.0f}: look at its tape on the page")
+            doubts.append(f"{name}: {out[0].replace('_', ' ')} is {usual.text(mine.values[out[0]])}, people have "
+                          f"{usual.text(usual.low)} to {usual.text(usual.high)}: look at its tape on the page")
         doubts += [f"{name}: {turned}; name the model with -m" for turned in mine.turned[:1]]
-        missing = [word for word in mine.missing if word in CATALOGUE]
+        # an open surface has no volume to weigh, which is no fault of it
+        missing = [word for word in mine.missing if word in CATALOGUE and word != "weight"]
         if missing:
             doubts.append(f"{name}: no {missing[0].replace('_', ' ')}, {mine.missing[missing[0]]}"
                           + (f", and {number_of(len(missing) - 1, 'other')}" if len(missing) > 1 else ""))
@@ -157,40 +162,80 @@ def _figures(names: Sequence[str], found: Sequence[Measurements], sex: Sex | Non
                 Metric("left out", sum(len(mine.missing) for mine in found)),
                 Metric("stature, mean", MM * float(np.mean([mine.values["stature"] for mine in found])), "mm")]
     only = found[0]
-    shares = percentiles(only.values, sex) if sex else {}
-    rows = []
-    for name, value in only.values.items():
-        error = f" (± {MM * only.errors[name]:.0f})" if name in only.errors else ""
-        compared = f", {ordinal(shares[name])} of {WORDS[sex]}" if sex and name in shares else ""
-        rows.append(Metric(name.replace("_", " ") + error, round(MM * value, 1), "mm" + compared))
-    return rows
+    errors = {name: f" (± {_number(name, error)})" for name, error in only.errors.items()}
+    return [_row(name, value, sex, errors.get(name, "")) for name, value in only.values.items()]
 
 
-def _wanted(to: Sequence[str], output: Path, model: BodyModel, name: str, landmarks: Path | None) -> Outcome:
+def _number(name: str, value: float) -> str:
+    """A value in the unit in which people read it, without that unit."""
+    return CATALOGUE[name].text(value).rpartition(" ")[0]
+
+
+def _row(name: str, value: float, sex: Sex | None, more: str = "", detail: bool = False) -> Metric:
+    """A measurement as a row of figures, with its percentile among people of a sex."""
+    factor, unit, _ = CATALOGUE[name].shown
+    share = percentiles({name: value}, sex).get(name) if sex else None
+    compared = f", {ordinal(share)} of {WORDS[sex]}" if sex and share is not None else ""
+    return Metric(name.replace("_", " ") + more, round(factor * value, 1), unit + compared, detail)
+
+
+def _wanted(to: Sequence[str], output: Path, model: BodyModel, name: str, landmarks: Path | None, sex: Sex | None
+            ) -> Outcome:
     """The most probable body with some measurements: its mesh, betas and page."""
     wanted = checked_wanted(read_measurements(to))
+    shape_statistics(model, sex)                                       # a sex that it does not know is told at once
     tapes = find_tapes(*landmarks_of(landmarks, [], model))
-    made = body_with_measurements(model, tapes, wanted)
+    made = body_with_measurements(model, tapes, wanted, sex)
     write_mesh(output, model.template.with_vertices(made.vertices))
     betas = output.with_name(f"{output.stem}.betas.json")
-    write_json(betas, {"betas": made.betas, "measurements": made.reached, "deviations": made.deviations})
+    write_json(betas, {"betas": made.betas, "measurements": made.reached, "deviations": made.deviations,
+                       "likely": made.likely, "sex": made.sex})
     title = output.stem
-    measures_page([title], [made.vertices], [measure(made.vertices, tapes, tapes.axes)], tapes).write(
-        output.with_suffix(".html"))
+    page = measures_page([title], [made.vertices], [measure(made.vertices, tapes, tapes.axes)], tapes, made.sex)
+    likely_section(page, made).write(output.with_suffix(".html"))
     say(f"note: the betas are in {betas.name}, for --subject")
-    rows = [Metric(f"{word.replace('_', ' ')}, wanted {MM * value:.0f}", round(MM * made.reached[word], 1), "mm")
+    # what was asked for, how usual that is, and of the rest what people ask for most
+    rows = [_row(word, made.reached[word], made.sex, f", wanted {_number(word, value)}")
             for word, value in made.wanted.items()]
+    if made.sex is not None and sex is None:
+        rows.append(Metric("sex", f"{made.sex} ({100 * made.sex_probability:.0f}%)"))
+        say("note: nobody said the sex, so the more probable one is taken; name it with --sex, and the body and the "
+            "ranges are those of that sex")
     rows += [Metric("from the mean person", made.deviations, "sd"),
              Metric("people as far from the mean in these measurements", 100 * made.rarer, "%")]
-    missed = [f"{name.replace('_', ' ')} is {MM * made.reached[name]:.0f} mm, not {MM * made.wanted[name]:.0f}: the "
-              "measurements contradict each other, or nobody whom the model knows has them" for name in made.missed]
+    first = [word for word in ASKED_MOST if word in made.likely]
+    rows += [_row(word, made.likely[word][1], made.sex, f", likely {_number(word, made.likely[word][0])} to "
+                  f"{_number(word, made.likely[word][2])}", word not in first)
+             for word in [*first, *(word for word in CATALOGUE if word in made.likely and word not in first)]]
+    return Outcome(output, rows, {"model": name, "sex": sex}, judgement=judge_wanted(made))
+
+
+def judge_wanted(made: WantedBody) -> Judgement:
+    """Whether the body has what was asked for, and whether people have that; what fits least, and what would fit."""
+    def words(name: str) -> str:
+        return name.replace("_", " ")
+
+    missed = [f"{words(name)} is {CATALOGUE[name].text(made.reached[name])}, not "
+              f"{_number(name, made.wanted[name])}: the measurements contradict each other, or nobody whom the model "
+              "knows has them" for name, off in made.missed.items()
+              if abs(off) > 10 * CATALOGUE[name].exact]                # 2 mm: two people with tapes differ by more
     rare = [f"fewer than one person in {1 / max(made.rarer, 1e-6):,.0f} is so far from the mean, by what the model "
             "knows"] if made.rarer < 1e-3 else []
-    return Outcome(output, rows, {"model": name}, judgement=Judgement.of(check=[*missed, *rare]))
+    if not missed and not rare:
+        return Judgement()
+    name = made.oddest
+    low, high = made.usual[name]
+    who = f"{WORDS[made.sex]}" if made.sex else "people"
+    with_it = " with the other measurements" if len({plain(word) for word in made.wanted}) > 1 else ""
+    # where that is what no person has, the other measurements are to blame as much
+    possible = low < CATALOGUE[name].high and high > CATALOGUE[name].low
+    odd = [f"{words(name)} {CATALOGUE[name].text(made.wanted[name])} fits least: most {who}{with_it} have "
+           f"{_number(name, low)} to {CATALOGUE[name].text(high)}"] if possible else []
+    return Judgement.of(check=[*missed, *odd, *rare])
 
 
 def read_measurements(words: Sequence[str]) -> dict[str, float]:
-    """Metres by name of `name=value` as they are typed; ValueError for anything else."""
+    """Metres, or kilograms, by name of `name=value` as they are typed; ValueError for anything else."""
     given = dict[str, float]()
     for word in words:
         name, sign, value = word.partition("=")

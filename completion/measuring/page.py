@@ -7,9 +7,11 @@ import numpy as np
 
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.measure import Measurements
-from model.measurement.survey import WORDS, Sex, ordinal, percentiles, survey
+from model.measurement.reading import DENSITY, DENSITY_SPREAD
+from model.measurement.survey import ordinal, percentiles, survey
 from model.measurement.tapes import Girth, Height, Tapes
-from scanprep.cli import MM
+from model.measurement.wanted import WantedBody
+from model.shape_statistics import WORDS, Sex
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
@@ -24,7 +26,8 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
                   sex: Sex | None = None) -> Page:
     """The page of `scape measure`, of bodies (N, 3) as they were measured, compared with people of a sex."""
     several = f"{len(names)} bodies" if len(names) > 1 else names[0]
-    page = Page(f"{several}, measured", "Where the tape ran on each body. Metres in the table file, millimetres here.")
+    page = Page(f"{several}, measured", "Where the tape ran on each body. Metres in the table file, millimetres here; "
+                "the weight is in kilograms.")
     shown = range(min(SHOWN, len(names)))
     for first in shown[::BESIDE_EACH_OTHER]:
         few = shown[first:first + BESIDE_EACH_OTHER]
@@ -51,8 +54,21 @@ def measures_page(names: Sequence[str], bodies: Sequence[np.ndarray], found: Seq
         "body. Trunk, head and thighs are measured level, arms, shins and neck across their own axis. Lengths along "
         "the skin are exact shortest ways over the same landmarks.\n\n"
         "± is the error to be expected from what the scan showed of the body, root mean square; it is known of "
-        "completed bodies. It does not tell how far a landmark is from the bone that the standard names.")
+        "completed bodies. It does not tell how far a landmark is from the bone that the standard names. The weight is "
+        f"{DENSITY:.0f} kilograms for every cubic metre inside the skin, with lungs half full; people differ from that "
+        f"by {100 * DENSITY_SPREAD:.0f}%, which is its ± at least.")
     return page.table([(_words(both), CATALOGUE[both[0]].standard) for both in _pairs()], ("here", "term and standard"))
+
+
+def likely_section(page: Page, made: WantedBody) -> Page:
+    """What is likely of the measurements that nobody asked for."""
+    who = WORDS[made.sex] if made.sex else "people"
+    return page.section("What was not asked for").text(
+        f"Of the {who} that the model knows, those who have what was asked for: what is most likely, which is this "
+        "body, and between which values nine of ten of them are.").table(
+        [(name.replace("_", " "), _number(name, value), _number(name, low), _number(name, high))
+         for name in CATALOGUE if name in made.likely for low, value, high in [made.likely[name]]],
+        ("mm", "this body", "5%", "95%"))
 
 
 def _pairs() -> list[tuple[str, ...]]:
@@ -66,6 +82,11 @@ def _words(both: tuple[str, ...]) -> str:
     return both[0].replace("_left", ", left / right").replace("_", " ").replace(" ", "\u00a0")
 
 
+def _number(name: str, value: float) -> str:
+    """Millimetres without their name, which is in the head of the table; kilograms with it."""
+    return CATALOGUE[name].text(value).removesuffix(" mm")
+
+
 def _cell(mine: Measurements, both: tuple[str, ...], sex: Sex | None) -> str:
     """Millimetres of one measurement, or of left and right, with the percentile among people of a sex."""
     shares = percentiles(mine.values, sex) if sex else {}
@@ -73,8 +94,8 @@ def _cell(mine: Measurements, both: tuple[str, ...], sex: Sex | None) -> str:
     def text(name: str) -> str:
         if name not in mine.values:
             return "–"
-        error = f" ± {MM * mine.errors[name]:.0f}" if name in mine.errors else ""
-        return f"{MM * mine.values[name]:,.0f}{error}" + (f" ({ordinal(shares[name])})" if name in shares else "")
+        error = f" ± {_number(name, mine.errors[name])}" if name in mine.errors else ""
+        return f"{_number(name, mine.values[name])}{error}" + (f" ({ordinal(shares[name])})" if name in shares else "")
 
     return " / ".join(map(text, both))
 

@@ -44,7 +44,7 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
             millimetres with its camera beside it in NAME.camera.json.
         output: Folder to write completed.ply, predicted.ply, completion.npz and report.html to; completed.glb for a
             scan with a texture; layout.json where markers were clicked too.
-        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
+        model: Model of `scape learn`; without it that of the built-in people.
         landmarks: 4 to 10 named points on the scan; else the file of the scan's name beside it. Without any the
             search starts from typical poses. For a folder of scans, the folder of such files. Names that are not the
             model's landmarks are markers that the person wears.

@@ -44,7 +44,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
             cameras in one frame of reference.
         output: Folder to write motion.npz, animation.glb, motion.bvh, motion.trc, motion.mot, joint_angles.csv,
             joint_centres.csv, residuals.csv and report.html to.
-        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
+        model: Model of `scape learn`; without it that of the built-in people.
         rate: Frames per second.
         cameras: How files of several cameras in one folder are named, such as "cam{camera}_{frame}.ply".
         landmarks: Named points in the first frame; without them the search starts from typical poses.

@@ -270,7 +270,7 @@ class Files:
             return self.read_model(self.model)
         for folder in list(path.resolve().parents)[:DEEP]:
             name = reported_model(folder / "report.json")
-            if name is not None and name.is_file():
+            if name is not None:
                 return self.read_model(name)
         fitting = [m for m in map(self.read_model, self.known["model"])
                    if motion is None or len(m.skeleton.parents) == motion.poses.shape[1]]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.files import KINDS
+from model.files import BUILT_IN, KINDS
 from model.motion.files import is_motion
 from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import camera_file, is_picture
@@ -38,13 +38,13 @@ def kind_of(path: Path) -> str:
 
 
 def reported_model(path: Path) -> Path | None:
-    """The model that a command's report names."""
+    """The model that a command's report names, where it is still there; None otherwise."""
     try:
         settings: Any = storage.read_json(path, "a report").get("settings", {})
-        name = str(settings["model"])
+        model = Path(str(settings["model"]))
     except (storage.StorageError, AttributeError, KeyError, TypeError):
         return None
-    return Path(name.split("cached at ")[-1])          # after which stands the file of the synthetic people's model
+    return model if model.is_file() or str(model) == BUILT_IN else None
 
 
 def worst_first(whole: RegisteredSet) -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ from ..partial.work import Work
 from .files import Entry, Files
 from .saving import free_name
 
-PEOPLE = "synthetic people"          # the model of those who have none
+PEOPLE = "built-in people"           # the model of those who have none
 Progress = Callable[[int, int], None]
 SCANS = ("surface", "picture")       # kinds of entries that can be completed
 
@@ -107,9 +107,9 @@ class Inside:
         page = self.opened.get(("complete", path))
         if not isinstance(page, CompletePage):
             if path is None:
-                from ..synthetic_people import synthetic_model
+                from model.files import BUILT_IN, load_model
 
-                loaded, name = synthetic_model(progress), PEOPLE
+                loaded, name = load_model(BUILT_IN), PEOPLE
             else:
                 loaded, name = self.files.read_model(path), str(path)
             body = loaded if loaded.n_betas else loaded.subject(None)

@@ -21,6 +21,7 @@ from ..cli import ModelArg, read_bodies
 from ..digests import digest, trained_on
 from ..files import load_model
 from ..posing.cli import read_subject
+from ..shape_statistics import SEXES, WORDS, Sex
 from .errors import Errors, compactness, errors_problem, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies, specificity
@@ -81,36 +82,42 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
 
 
 def sample(model: ModelArg, output: Output, count: Annotated[Count, Alias("-n")] = 9, seed: Seed = 0,
-           pose_too: bool = False) -> Outcome:
+           pose_too: bool = False, sex: Sex | None = None) -> Outcome:
     """Write random bodies of a model, a sheet of their pictures, and their betas and poses.
 
     Example: scape model sample model.npz -n 9 -o random
 
+    Example: scape model sample people --sex female -n 100 -o women
+
     Args:
-        model: Model file.
+        model: Model file, or the word people for the built-in one.
         output: Folder for body_1.ply, body_1.betas.json, body_1.pose.json ..., sheet.png.
         count: How many bodies.
         seed: The same seed gives the same bodies.
         pose_too: Random poses as well, from the Gaussian of the training poses; else all stand at rest.
+        sex: Women or men alone, as many of any size as there are among them. Without it every other body is a woman,
+            if the model tells women from men, as the built-in one does.
     """
     from scanprep.pictures.shading import save_png
 
     loaded = load_model(model)
-    drawn = sample_bodies(loaded, count, np.random.default_rng(seed), pose_too)
+    drawn = sample_bodies(loaded, count, np.random.default_rng(seed), pose_too, sex=sex)
     width = len(str(count))
     for i, vertices in enumerate(drawn.vertices):
         name = f"body_{i + 1:0{width}d}"
         write_mesh(output / f"{name}.ply", loaded.template.with_vertices(vertices))
-        storage.write_json(output / f"{name}.betas.json", {"betas": drawn.betas[i].tolist()})
+        known = {"sex": drawn.sexes[i]} if drawn.sexes[i] else {}
+        storage.write_json(output / f"{name}.betas.json", {"betas": drawn.betas[i].tolist(), **known})
         storage.write_json(output / f"{name}.pose.json",
                            dict(zip(loaded.skeleton.names, drawn.poses[i].tolist(), strict=True)))
     save_png(output / "sheet.png", picture_samples(loaded, drawn))
+    told = [Metric(WORDS[one], drawn.sexes.count(one)) for one in SEXES if one in drawn.sexes]
     extent = np.ptp(drawn.vertices, axis=1).max(axis=1)
     return Outcome(output, [
-        Metric("bodies", count), Metric("shape components", drawn.betas.shape[1]),
+        Metric("bodies", count), *told, Metric("shape components", drawn.betas.shape[1]),
         Metric("largest extent, smallest body", float(extent.min()), "m"),
-        Metric("largest extent, largest body", float(extent.max()), "m")], {"seed": seed, "pose_too": pose_too},
-        judgement=Judgement())
+        Metric("largest extent, largest body", float(extent.max()), "m")],
+        {"seed": seed, "pose_too": pose_too, "sex": sex}, judgement=Judgement())
 
 
 def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:

@@ -11,21 +11,26 @@ from model.priors import sample_poses
 from ..body import BodyModel, Progress
 from ..digests import checked_bodies
 from ..fitting.vertices import FitConfig, ShapeFitter
+from ..shape_statistics import Sex, draw_betas
 from .errors import checked_counts
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Random bodies: betas (n, k), k = 0 for a model without shape components, poses (n, J, 3), vertices (n, N, 3)."""
+    """Random bodies: betas (n, k), k = 0 for a model without shape components, poses (n, J, 3), vertices (n, N, 3).
+
+    `sexes` (n,) are "female" or "male", None where the model does not tell them apart.
+    """
 
     betas: np.ndarray
     poses: np.ndarray
     vertices: np.ndarray
+    sexes: tuple[Sex | None, ...]
 
 
 def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_too: bool = False,
-                  n_betas: int | None = None) -> Samples:
-    """Bodies with betas of the standard normal distribution.
+                  n_betas: int | None = None, sex: Sex | None = None) -> Samples:
+    """Bodies with betas of the model's people: see `draw_betas`.
 
     Parameters
     ----------
@@ -36,11 +41,21 @@ def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_t
         Poses from the Gaussian of the training poses; else all stand at rest.
     n_betas : int, optional
         Vary the first components only.
+    sex : {"female", "male"}, optional
+        Of a model that tells women from men; without it half of its bodies are women.
 
     Raises
     ------
     ValueError
-        A count below 1, more components than the model has, poses wanted of a model that lacks them.
+        A count below 1, more components than the model has, poses wanted of a model that lacks them, a sex of a model
+        that does not tell women from men.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> women = sample_bodies(load_built_in_model(), 3, np.random.default_rng(0), sex="female")
+    >>> women.vertices.shape == (3, len(load_built_in_model().template.vertices), 3)
+    True
 
     [SCAPE] Eq. 7
     """
@@ -51,10 +66,11 @@ def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_t
         raise ValueError(f"n_betas: expected 0..{model.n_betas}, the components of the model, got {K}")
     if not K and not pose_too:
         raise ValueError("n_betas: the model has no shape components, so only poses can be random (pose_too)")
-    betas, poses = rng.normal(size=(count, K)), np.zeros((count, J, 3))
+    betas, sexes = draw_betas(model, count, rng, sex)
+    betas, poses = betas[:, :K], np.zeros((count, J, 3))
     if pose_too:
         poses = sample_poses(model, count, rng)
-    return Samples(betas, poses, model.vertices(poses, betas if model.n_betas else None))
+    return Samples(betas, poses, model.vertices(poses, betas if model.n_betas else None), sexes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +94,7 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
                 progress: Progress | None = None) -> Specificity:
     """Distance of random bodies of the model to the nearest training person.
 
-    Random bodies have betas of the standard normal distribution and stand at rest. The people are brought to rest
+    Random bodies are drawn as `sample_bodies` does, and stand at rest. The people are brought to rest
     by `unposed`, and all bodies are centred, before vertices are compared.
 
     Parameters
@@ -112,7 +128,7 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
     rest = np.zeros((len(model.skeleton.parents), 3))
     mean = _centred(model.vertices(rest, np.zeros(wanted[-1]))[None])[0]
     change = np.moveaxis(_centred(np.moveaxis(model.shape_jacobian(rest), -1, 0)), 0, -1)
-    betas = rng.normal(size=(count, wanted[-1]))
+    betas = draw_betas(model, count, rng)[0]
     distances, nearest = np.empty((len(wanted), count)), np.empty((len(wanted), count), dtype=np.int64)
     for c, k in enumerate(wanted):
         for i, b in enumerate(betas):

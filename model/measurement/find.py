@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 
 from .marks import Places, places_of
 from .section import Carried, Curve, direction, mean_of, section, tape
-from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
+from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
 BAND = 0.10                          # how far from its place on the template a tape may run, along the surface
 
@@ -32,7 +32,7 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     ----------
     template : Mesh
     landmarks : name to vertex
-        Under the names of the synthetic people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
+        Under the names of the built-in people, the SCAPE meshes or CAESAR. Toes and heels are needed, and one of
         head or neck; what begins at another landmark is left out where there is none.
 
     Raises
@@ -89,8 +89,10 @@ class _Finder:
         yield "chest_width", lambda: self.span("chest_girth", 1)
         yield "chest_depth", lambda: self.span("chest_girth", 2)
         yield "hip_width", lambda: self.span("hip_girth", 1)
-        yield "back_length", lambda: self.way("neck back", self.at_back(self.girth("waist_girth")))
+        yield "back_length", lambda: self.way("neck back", self.at_back(self.girth("waist_girth"), "neck back"),
+                                              until="waist_girth")
         yield "shoulder_length_back", lambda: self.way("left shoulder", "neck back", "right shoulder")
+        yield "weight", self.weight
 
     def leg(self, side: str) -> Iterator[tuple[str, Callable[[], Found]]]:
         """Of one leg, from above."""
@@ -111,8 +113,14 @@ class _Finder:
             p.at(*elbow), p.at(tip), 0.42 + 0.26 * t), self.limb(
                 f"{side} forearm", p.at(*elbow), p.at(tip), 0.12, 0.45))
         yield f"arm_length_{side}", lambda: self.way(shoulder, elbow[0], self.nearest(
-            self.girth(f"wrist_girth_{side}"), elbow[0]))
+            self.girth(f"wrist_girth_{side}"), elbow[0]), until=f"wrist_girth_{side}")
         yield f"hand_length_{side}", lambda: Straight(self.girth(f"wrist_girth_{side}").centre, self.point(tip))
+
+    def weight(self) -> Weight:
+        """Of a surface that encloses a volume."""
+        if not self.mesh.is_closed:
+            raise _NotThere("the template is open, so it has no volume")
+        return Weight()
 
     def point(self, *names: str) -> Carried:
         """The mean of landmarks, all of which must be there."""
@@ -164,13 +172,17 @@ class _Finder:
 
     @cached_property
     def arms(self) -> np.ndarray:
-        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is."""
+        """(N,) bool, the vertices of the arms: nearer to the elbow, along the surface, than the armpit is.
+
+        And of the shoulders: above the armpit and farther out, where a tape at the nipples comes on some bodies.
+        """
         found = np.zeros(len(self.mesh.vertices), dtype=bool)
-        for side in ("left", "right"):
+        for side, sign in (("left", 1), ("right", -1)):
             elbow, armpit = (self.places.of.get(f"{side} {name}") for name in ("elbow inside", "armpit"))
             if elbow is not None and armpit is not None:
                 far = self.graph.distances(elbow)
-                found |= far < far[armpit]
+                up, left, _ = self.places.axes @ (self.mesh.vertices - self.mesh.vertices[armpit]).T
+                found |= (far < far[armpit]) | ((up > 0) & (sign * left > 0))
         return found
 
     def girth(self, name: str) -> Girth:
@@ -248,20 +260,31 @@ class _Finder:
         self.girth(girth)
         return Span(girth, axis)
 
+    def behind(self, girth: Girth, name: str) -> np.ndarray:
+        """Vertices of a girth's section that lie beyond its plane, seen from a landmark, so that a way crosses it.
+
+        Where triangles are as long as a forearm those before it are anywhere on the way.
+        """
+        vertices = self.mesh.vertices
+        normal = self.places.up if girth.axis is None else direction(girth.axis, vertices)
+        ring, origin = np.unique(girth.ring.edges), girth.centre.at(vertices)
+        side = np.sign((self.point(name).at(vertices) - origin) @ normal)
+        return ring[side * ((vertices[ring] - origin) @ normal) < 0]
+
     def nearest(self, girth: Girth, name: str) -> int:
-        """The vertex of a girth's section that is nearest to a landmark, along the surface."""
-        ring = np.unique(girth.ring.edges)
+        """The vertex behind a girth that is nearest to a landmark, along the surface."""
+        ring = self.behind(girth, name)
         return int(ring[self.graph.distances(self.point(name).vertices[0])[ring].argmin()])
 
-    def at_back(self, girth: Girth) -> int:
-        """The vertex of a girth's section in the middle of the back."""
-        ring = np.unique(girth.ring.edges)
+    def at_back(self, girth: Girth, name: str) -> int:
+        """The vertex behind a girth in the middle of the back."""
+        ring = self.behind(girth, name)
         apart = self.mesh.vertices[ring] - girth.centre.at(self.mesh.vertices)
-        behind = apart @ self.places.axes[2] < 0
-        return int(ring[behind][np.abs(apart[behind] @ self.places.axes[1]).argmin()])
+        back = apart @ self.places.axes[2] < 0
+        return int(ring[back][np.abs(apart[back] @ self.places.axes[1]).argmin()])
 
-    def way(self, *stations: str | int) -> Way:
-        """Along the surface, over landmarks or vertices."""
+    def way(self, *stations: str | int, until: str | None = None) -> Way:
+        """Along the surface, over landmarks or vertices, and as far as the plane of a girth."""
         vertices = [int(self.point(s).vertices[0]) if isinstance(s, str) else s for s in stations]
         faces = []
         for start, end in itertools.pairwise(vertices):
@@ -269,8 +292,8 @@ class _Finder:
             if not np.isfinite(over[start]):
                 raise _NotThere("no way along the surface joins its ends")
             # triangles count that a way crosses which is up to 5 cm longer than the shortest
-            faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + 0.05 * self.scale).all(axis=1)])
-        return Way(tuple(vertices), tuple(faces))
+            faces.append(self.mesh.faces[(over[self.mesh.faces] <= over[start] + 0.05 * self.scale).any(axis=1)])
+        return Way(tuple(vertices), tuple(faces), until)
 
     def foot(self, side: str) -> Extent:
         """From heel to toes, of what is low and on that side."""

@@ -53,7 +53,7 @@ def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndar
     for face, corners in enumerate(mesh.faces.tolist()):
         for corner in corners:
             of_vertex.setdefault(corner, []).append(face)
-    edges, share, grid = [(end, end)], [0.0], np.linspace(0, 1, 17)      # places tried on an edge
+    edges, share, grid = [(end, end)], [0.0], np.linspace(0, 1, 65)      # places tried on an edge
     for _ in range(len(far)):
         (a, b), s = edges[-1], share[-1]
         around = set(of_vertex[a]) & set(of_vertex[b])

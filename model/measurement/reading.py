@@ -10,9 +10,14 @@ from scanprep.geometry.mesh import Mesh
 
 from .path import shortest_path
 from .section import Carried, Curve, around, bulge, chain_length, direction, section, tape
-from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way
+from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
+# Kilograms of a person per cubic metre inside the skin. Tissue has 1,030 to 1,080, by the share of fat; lungs that are
+# half full hold 3 litres of air. The spread is that of fat (7% of the weight: 1.5%) and of air (0.8 of 78 litres: 1%).
+DENSITY, DENSITY_SPREAD = 985.0, 0.02
 ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
+
+STRAIGHT = 0.05                      # metres at the end of a way that tell where it goes on
 
 
 class NotMeasured(ValueError):
@@ -35,9 +40,10 @@ class Standing:
 class Reading:
     """One measurement of a body.
 
-    `value`, metres; `curve` (m, 3), metres, where the tape runs, its points one after the other; `vertices` (k,) and
-    `force` (k, 3) its derivative by them, of which one may come several times; `slope`, metres per metre, what sliding
-    its plane along the part, or its landmarks along the skin, changes.
+    `value`, metres, or kilograms of a weight; `curve` (m, 3), metres, where the tape runs, its points one after the
+    other; `vertices` (k,) and `force` (k, 3) its derivative by them, of which one may come several times; `slope`,
+    metres per metre, what sliding its plane along the part, or its landmarks along the skin, changes; `unknown`, in
+    its unit, a standard deviation of what no surface tells.
     """
 
     value: float
@@ -45,6 +51,7 @@ class Reading:
     vertices: np.ndarray
     force: np.ndarray
     slope: float = 0.0
+    unknown: float = 0.0
 
     def along(self, moves: np.ndarray) -> np.ndarray:
         """Change (...,) of the value by moves (N, 3, ...) of all vertices."""
@@ -74,13 +81,23 @@ def _girth(found: Girth, body: Standing, tapes: Tapes) -> Reading:
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """The section of a girth, its plane, its points (m, 3), and which of them the tape touches, in order."""
+    """The section of a girth, its plane, its points (m, 3), and which of them the tape touches, in order.
+
+    `change` (m, 3): how the bulge at a point changes as it goes along its edge, by the share of the edge.
+    """
 
     curve: Curve
     origin: np.ndarray
     normal: np.ndarray
     points: np.ndarray
+    change: np.ndarray
     hull: np.ndarray
+
+
+def _plane(found: Girth, body: Standing) -> tuple[np.ndarray, np.ndarray]:
+    """A point (3,) of the plane of a girth, and its normal."""
+    normal = body.axes[0] if found.axis is None else direction(found.axis, body.vertices)
+    return found.centre.at(body.vertices), normal
 
 
 def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
@@ -89,10 +106,7 @@ def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     A thigh or an upper arm is measured as near to the trunk as it is on its own: its plane moves on in twelve steps, of
     4 mm for somebody of 1.75 m. Where arms are left out the pieces of the section are taken together.
     """
-    vertices, normal = body.vertices, body.axes[0]
-    origin = found.centre.at(vertices)
-    if found.axis is not None:
-        normal = direction(found.axis, vertices)
+    vertices, (origin, normal) = body.vertices, _plane(found, body)
     step = 0.004 * (np.ptp(vertices @ body.axes[0]) / 1.75) * found.aside * normal
     for place in (origin + tried * step for tried in range(12 if found.aside else 1)):
         curves = section(vertices, found.faces, place, normal)
@@ -101,14 +115,15 @@ def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
         ends = np.concatenate([c.edges[[0, -1]] for c in curves if not c.closed] or [np.zeros((0, 2), int)])
         if np.isin(ends, body.mesh.boundary_vertices).all(axis=1).any():
             raise NotMeasured("a hole of the mesh crosses it")
-        if found.under_arms and not any(curve.closed for curve in curves):
-            curve = Curve(np.concatenate([c.edges for c in curves]), np.concatenate([c.share for c in curves]), True)
-        else:
-            far = [float(np.linalg.norm(c.at(vertices).mean(axis=0) - place)) for c in curves]
-            curve = curves[int(np.argmin(far))]
+        far = [float(np.linalg.norm(c.at(vertices).mean(axis=0) - place)) for c in curves]
+        curve = curves[int(np.argmin(far))]
+        if found.under_arms and not curve.closed:
+            pieces = [c for c in curves if not c.closed]
+            curve = Curve(np.concatenate([c.edges for c in pieces]), np.concatenate([c.share for c in pieces]), True)
         if curve.closed:
-            points = curve.at(vertices) + bulge(vertices, body.mesh.vertex_normals, curve)
-            return _Cut(curve, place, normal, points, tape(points, normal))
+            off, change = bulge(vertices, body.mesh.vertex_normals, curve)
+            points = curve.at(vertices) + off
+            return _Cut(curve, place, normal, points, change, tape(points, normal))
     raise NotMeasured("its plane runs out of the part it goes around")
 
 
@@ -117,23 +132,32 @@ def _moved(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: 
     """What vertices add where they pull at points of a section, the plane moving with them.
 
     `chosen` (m,) points of the section, `pull` (m, 3) the derivative by them; vertices (k,), their force (k, 3), and
-    the derivative by moving the plane along its normal. What the bulge between vertices changes is left out.
+    the derivative by moving the plane along its normal. What normals change at the bulge is left out.
     """
     vertices, edges, share = body.vertices, cut.curve.edges[chosen], cut.curve.share[chosen]
     along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    out = np.einsum("md,md->m", pull, along) / (along @ cut.normal)
+    out = np.einsum("md,md->m", pull, along + cut.change[chosen]) / (along @ cut.normal)
     on_edge = pull - out[:, None] * cut.normal
-    ids = [edges[:, 0], edges[:, 1], found.centre.vertices]
-    force = [(1 - share)[:, None] * on_edge, share[:, None] * on_edge,
-             found.centre.weights[:, None] * (out.sum() * cut.normal)]
+    by_plane = _plane_pull(found, out, cut.points[chosen] - cut.origin, cut.normal, vertices)
+    return (np.concatenate([edges[:, 0], edges[:, 1], by_plane[0]]),
+            np.concatenate([(1 - share)[:, None] * on_edge, share[:, None] * on_edge, by_plane[1]]), float(out.sum()))
+
+
+def _plane_pull(found: Girth, out: np.ndarray, apart: np.ndarray, normal: np.ndarray, vertices: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
+    """What vertices (k,) add, and their force (k, 3), where the plane of a girth takes points with it.
+
+    `out` (m,) derivative by the place of each point along the normal, `apart` (m, 3) the points from the plane's.
+    """
+    ids, force = [found.centre.vertices], [found.centre.weights[:, None] * (out.sum() * normal)]
     if found.axis is not None:                                            # the plane turns with the limb
         length = np.linalg.norm(found.axis[1].at(vertices) - found.axis[0].at(vertices))
-        by_normal = -(out @ (cut.points[chosen] - cut.origin))
-        by_end = (by_normal - (by_normal @ cut.normal) * cut.normal) / length
+        by_normal = -(out @ apart)
+        by_end = (by_normal - (by_normal @ normal) * normal) / length
         for point, sign in zip(found.axis, (-1, 1), strict=True):
             ids.append(point.vertices)
             force.append(sign * point.weights[:, None] * by_end)
-    return np.concatenate(ids), np.concatenate(force), float(out.sum())
+    return np.concatenate(ids), np.concatenate(force)
 
 
 @read.register
@@ -194,15 +218,59 @@ def _extent(found: Extent, body: Standing, tapes: Tapes) -> Reading:
 @read.register
 def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
     total, drawn, ids, force = 0.0, list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for start, end, faces in zip(found.vertices, found.vertices[1:], found.faces, strict=False):
+    last = len(found.faces) - 1
+    for k, (start, end, faces) in enumerate(zip(found.vertices, found.vertices[1:], found.faces, strict=False)):
         try:
             length, curve = shortest_path(body.vertices, faces, start, end)
         except ValueError as problem:
             raise NotMeasured(str(problem)) from None
         points = curve.at(body.vertices)
         _, pull = chain_length(points)
+        if k == last and found.until is not None:
+            girth = tapes.found[found.until]
+            assert isinstance(girth, Girth)
+            more, points, by_end = _until(girth, curve, body)
+            length += more
+            ids.append(by_end[0])
+            force.append(by_end[1])
         total += length
         drawn.append(points[::-1])                                        # the way is found from its end
         ids += [curve.edges[:, 0], curve.edges[:, 1]]
         force += [(1 - curve.share)[:, None] * pull, curve.share[:, None] * pull]
     return Reading(total, np.concatenate(drawn), np.concatenate(ids), np.concatenate(force), ENDS)
+
+
+def _until(girth: Girth, way: Curve, body: Standing) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """What a way, its last point first, lacks as far as the plane of a girth, straight on; or has too much.
+
+    Metres; the points that it then has; vertices (k,) and their force (k, 3).
+    """
+    (origin, normal), points = _plane(girth, body), way.at(body.vertices)
+    last = way.edges[0, 0]
+    k = int((np.linalg.norm(points - points[0], axis=1) > STRAIGHT).argmax()) or len(points) - 1
+    before = way.edges[k, int(way.share[k] > 0.5)]                        # a vertex, as points of ways slide
+    ahead = points[0] - body.vertices[before]
+    reach, rise, lack = float(np.linalg.norm(ahead)), ahead @ normal, (origin - points[0]) @ normal
+    by_ahead = lack * (ahead / (reach * rise) - reach / rise**2 * normal)
+    ids, force = _plane_pull(girth, np.array([reach / rise]), (points[0] - origin)[None], normal, body.vertices)
+    beyond = int(((points - origin) @ normal * np.sign(rise) < 0).argmax())      # so many points lie behind the plane
+    if beyond:
+        # the way crosses the plane: it ends there
+        step = points[beyond] - points[beyond - 1]
+        crossing = points[beyond - 1] + (origin - points[beyond - 1]) @ normal / (step @ normal) * step
+        more = -float(np.linalg.norm(np.diff(np.vstack([points[:beyond], crossing]), axis=0), axis=1).sum())
+    else:
+        crossing, more = points[0] + lack / rise * ahead, lack / rise * reach
+    return (more, np.vstack([crossing, points[beyond:]]),
+            (np.r_[last, before, ids], np.vstack([by_ahead - reach / rise * normal, -by_ahead, force])))
+
+
+@read.register
+def _weight(found: Weight, body: Standing, tapes: Tapes) -> Reading:
+    a, b, c = np.moveaxis(body.mesh.corners, 1, 0)
+    by_corner = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1) / 6      # of the volume
+    outside = np.sign(body.mesh.volume) * DENSITY
+    force = np.zeros_like(body.vertices)
+    np.add.at(force, body.mesh.faces, outside * by_corner)
+    value = abs(body.mesh.volume) * DENSITY
+    return Reading(value, np.zeros((0, 3)), np.arange(len(force)), force, unknown=DENSITY_SPREAD * value)

@@ -139,8 +139,9 @@ def chain_length(points: np.ndarray) -> tuple[float, np.ndarray]:
     return float(lengths.sum()), ways[:-1] - ways[1:]
 
 
-def bulge(body: np.ndarray, normals: np.ndarray, curve: Curve) -> np.ndarray:
+def bulge(body: np.ndarray, normals: np.ndarray, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
     """How far (m, 3), metres, the smooth surface lies from a curve's points on edges: coarse triangles cut corners.
+    And how that changes (m, 3) along the edges, of which each is 1 long.
 
     On an edge it is the cubic whose ends are at right angles to the vertex `normals` (N, 3).
     """
@@ -148,4 +149,6 @@ def bulge(body: np.ndarray, normals: np.ndarray, curve: Curve) -> np.ndarray:
     way, t = body[b] - body[a], curve.share
     first = np.einsum("md,md->m", way, normals[a])
     second = -np.einsum("md,md->m", way, normals[b])
-    return -(t * (1 - t))[:, None] * (((1 - t) * first)[:, None] * normals[a] + (t * second)[:, None] * normals[b])
+    at_a, at_b, t = first[:, None] * normals[a], second[:, None] * normals[b], t[:, None]
+    mixed = (1 - t) * at_a + t * at_b
+    return -t * (1 - t) * mixed, (2 * t - 1) * mixed + t * (1 - t) * (at_a - at_b)

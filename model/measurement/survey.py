@@ -10,19 +10,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-Sex = Literal["female", "male"]
+from ..shape_statistics import WORDS, Sex
+from .catalogue import plain
+
 TABLE = Path(__file__).with_name("ansur2.json")
 # Measures that bodies here and people of the survey have alike. Of every seventh man of SPRING they are 0.1 to 0.7
 # standard deviations from the survey on average. Others are taken elsewhere on the body and 0.8 to 3.1 off: ends of
 # hands, arms and shoulders, crotch, level of the waist, neck; heads wear hair or caps, hips stand with feet apart.
 ALIKE = ("stature", "neck_height", "shoulder_height", "chest_girth", "waist_girth", "hip_girth", "thigh_girth",
-         "calf_girth", "wrist_girth", "chest_depth", "foot_length")
-WORDS = {"female": "women", "male": "men"}
+         "calf_girth", "wrist_girth", "chest_depth", "foot_length", "weight")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Survey:
     people : int
         How many were measured.
     names : tuple of str
-        Measures, as in `CATALOGUE` without the side; "weight", "knee_height" and "age" beside them.
+        Measures, as in `CATALOGUE` without the side; "knee_height" and "age" beside them.
     mean, sd : (m,) float
         Metres; kilograms; years.
     shares : (q,) float
@@ -80,7 +80,7 @@ def percentiles(values: Mapping[str, float], sex: Sex) -> dict[str, float]:
     Parameters
     ----------
     values : name to float
-        Metres, by names of `CATALOGUE`.
+        Metres, and kilograms of the weight, by names of `CATALOGUE`.
     sex : {"female", "male"}
 
     Returns
@@ -96,10 +96,9 @@ def percentiles(values: Mapping[str, float], sex: Sex) -> dict[str, float]:
     table = survey(sex)
     scores, found = ndtri(table.shares), dict[str, float]()
     for name, value in values.items():
-        plain = name.removesuffix("_left").removesuffix("_right")
-        if plain not in ALIKE or not np.isfinite(value):
+        if plain(name) not in ALIKE or not np.isfinite(value):
             continue
-        x = table.quantiles[table.names.index(plain)]
+        x = table.quantiles[table.names.index(plain(name))]
         if value < x[0] or value > x[-1]:
             a, b = (0, 1) if value < x[0] else (-2, -1)
             score = scores[b] + (value - x[b]) * (scores[b] - scores[a]) / (x[b] - x[a])

@@ -62,13 +62,23 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """Shortest ways along the surface from vertex to vertex, one after the other, and the triangles for each."""
+    """Shortest ways along the surface from vertex to vertex, one after the other, and the triangles for each.
+
+    `until`: the last way goes on, or ends before, where it meets the plane of a girth: a vertex of the template's
+    section may lie 2 cm from the section of another body.
+    """
 
     vertices: tuple[int, ...]
     faces: tuple[np.ndarray, ...]
+    until: str | None = None
 
 
-Found = Girth | Span | Height | Straight | Extent | Way
+@dataclass(frozen=True, eq=False)
+class Weight:
+    """What the volume of a closed surface weighs."""
+
+
+Found = Girth | Span | Height | Straight | Extent | Way | Weight
 
 
 @dataclass(frozen=True, eq=False)

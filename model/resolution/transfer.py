@@ -34,8 +34,9 @@ def transfer_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
     if found.min() < LEAST:
         lost = int(found.argmin())
         share = old.face_areas[skeleton.part_of_face == lost].sum() / old.face_areas.sum()
+        needed = 2 * LEAST * max(1 / share, F / max(found[lost], 1))       # by its area, and by what it got
         raise ValueError(f"template: {F} triangles are too coarse, {found[lost]} are left for part "
-                         f"'{skeleton.names[lost]}'; expected some {2 * LEAST / share:.0f} or more")
+                         f"'{skeleton.names[lost]}'; expected some {needed:.0f} or more")
     carried = Skeleton(part, skeleton.parents, skeleton.joints, skeleton.names)
     for j in range(1, J):
         if not len(carried.ring(new, j)):

@@ -14,7 +14,7 @@ from .landmarks import landmarks as landmark_vertices
 from .people import NAMED_POSES, BodyShape, Person, mirrored_pose, named_pose, random_pose
 from .scanner import RangeView, Scan, ScannerConfig, scan
 
-VERSION = 1
+VERSION = 2                          # 1 was of people who were made up; their shapes mean nothing here
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ class SyntheticScan:
 
 
 WRIST, ANKLE = 0.6, 0.4                # radians by which hands and feet are held other than in named poses, at most
-SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
+SUBJECT = BodyShape.like("male", stature=1.78, weight=-0.5)
 
 
 def scan_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
@@ -175,10 +175,10 @@ def synthetic_scan(folder: Path, seed: int, k: int, is_pose: bool, config: Scann
         label, pose = subject_pose(k, rng)
         shape, subject, name = SUBJECT, "subject", f"subject_{k:02d}_{label}"
     else:
-        shape = BodyShape.random(rng, sex=-1.0 if k % 2 == 0 else 1.0)
+        shape = BodyShape.random(rng, sex="female" if k % 2 == 0 else "male")
         pose, label, subject = near_rest(rng), "rest", f"person{k:02d}"
         name = f"person_{k:02d}_{'female' if k % 2 == 0 else 'male'}"
-    entry = SyntheticScan(name, subject, label, "male" if shape.sex > 0 else "female", folder)
+    entry = SyntheticScan(name, subject, label, shape.sex, folder)
     if not entry.path.exists():
         truth = stand(_person(shape), pose)
         scanned = scan(truth.mesh, config, rng)

@@ -1,21 +1,25 @@
 """Muscles and folds: where the surface rises or sinks, and which angle of which joint makes it do so."""
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..geometry import rotations
-from .anatomy import Anatomy, tables
+from .anatomy import Anatomy
 from .topology import blending, load
 
 Put = Callable[[str, str, float], None]
+_TABLES = json.loads(Path(__file__).with_name("muscles.json").read_text(encoding="utf-8"))
+LIMB, TRUNK = _TABLES["limb"]["rows"], _TABLES["trunk"]["rows"]          # what the columns are stands in the file
 
 def _columns() -> list[tuple[str, str]]:
-    limbs = [(name, side) for name, *_ in tables.limb_muscles for side in "lr"]
-    trunk = [(name, side) for name, paired, *_ in tables.trunk_muscles for side in ("lr" if paired else "m")]
+    limbs = [(name, side) for name, *_ in LIMB for side in "lr"]
+    trunk = [(name, side) for name, paired, *_ in TRUNK for side in ("lr" if paired else "m")]
     return limbs + trunk
 
 
@@ -29,11 +33,11 @@ def masks() -> np.ndarray:
     v, a = template.mesh.vertices, template.anatomy
     weights = blending()[0]
     columns = []
-    for _, part, along, direction, wide, spread, height in tables.limb_muscles:
+    for _, part, along, direction, wide, spread, height in LIMB:
         left = _limb_mask(v, a, weights, part, along, direction, wide, spread) * height
         columns += [left, left[template.mirror]]
     normals = template.mesh.vertex_normals
-    for _, paired, facing, sideways, level, wx, wz, height in tables.trunk_muscles:
+    for _, paired, facing, sideways, level, wx, wz, height in TRUNK:
         d = (v[:, 0] - sideways) / wx, (v[:, 2] - a.at(level)) / wz
         mask = np.exp(-0.5 * (d[0]**2 + d[1]**2)) * (1 - weights[:, [5, 6, 8, 9, 11, 14]].sum(axis=1))
         mask *= np.clip(0.5 - 0.9 * facing * normals[:, 1], 0, 1) if facing else 1
@@ -62,8 +66,9 @@ def _limb_mask(v: np.ndarray, a: Anatomy, weights: np.ndarray, part: int, along:
 def drivers(anatomy: Anatomy, axes: np.ndarray, relative: np.ndarray) -> np.ndarray:
     """How far every muscle acts (muscles,) in a pose given by relative rotations (16, 3, 3); zero at rest."""
     s = anatomy.shape
-    strong = np.clip(1 + 0.35 * s.muscle + 0.15 * (s.sex - 0.0), 0.4, 2.4)
-    soft = np.clip(1 + 0.35 * s.weight, 0.45, 2.2)
+    # muscles of men swell more, and so does the flesh of who is heavy
+    strong = 1.15 if s.sex == "male" else 0.85
+    soft = float(np.clip(1 + 0.35 * (s.betas[1] if len(s.betas) > 1 else 0.0), 0.45, 2.2))
     out = np.zeros(len(COLUMNS))
 
     def put(name: str, side: str, value: float) -> None:

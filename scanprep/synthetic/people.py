@@ -12,11 +12,11 @@ import numpy as np
 
 from ..geometry.mesh import Mesh
 from ..skeleton.tree import Skeleton
-from .anatomy import PARENTS, PARTS, BodyShape
+from .anatomy import PARENTS, PARTS, Anatomy, BodyShape
 from .landmarks import landmarks, markers
 from .poses import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose, walk
 from .posing import Poser
-from .topology import carry, load
+from .topology import load
 
 __all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose", "named_pose",
            "random_pose", "walk"]
@@ -35,8 +35,8 @@ class Person:
     def __init__(self, shape: BodyShape | None = None) -> None:
         self.shape = shape or BodyShape()
         template = load()
-        vertices, self.anatomy = carry(self.shape)
-        self.mesh = Mesh(vertices, template.mesh.faces)
+        self.anatomy = Anatomy(self.shape)
+        self.mesh = Mesh(self.anatomy.vertices, template.mesh.faces)
         self.part_of_face = template.part_of_face
         self.part_of_vertex = template.part_of_vertex
         self.joints = self.anatomy.joints.copy()

@@ -11,6 +11,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
+from .landmarks import landmarks
+from .topology import load
 
 
 @lru_cache(maxsize=1)
@@ -164,22 +166,24 @@ def _stride(phase: float) -> np.ndarray:
 
 def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lift of the root (T,) that puts the lower foot on the floor, and how far it moves ahead (T - 1,)."""
-    a = average()
-    soles = []
-    for foot in (12, 15):
-        toe = a.ends[foot] * [1, 1, 0]
-        heel = a.joints[foot] * [1, 1, 0] + [0, 0.055, 0]
-        soles.append([_carry(a, pose, foot, np.stack([heel, toe])) for pose in poses])
-    points = np.swapaxes(np.array(soles), 0, 1).reshape(len(poses), 4, 3)
-    lowest = points[:, :, 2].min(axis=1)
-    weight = np.exp(-(points[:, :, 2] - lowest[:, None]) / 0.01)
+    a, part = average(), load().part_of_vertex
+    lowest, treads = [], []
+    for foot, side in ((12, "left"), (15, "right")):
+        sole = a.vertices[(part == foot) & (a.vertices[:, 2] < a.joints[foot, 2])]
+        # toes bend, which parts do not: a foot rolls from the heel over its ball, where its bone ends
+        tread = np.array([a.vertices[landmarks()[f"{side} heel"]], a.ends[foot]]) * [1, 1, 0]
+        moved = np.stack([_carry(a, pose, foot, np.vstack([tread, sole])) for pose in poses])
+        treads.append(moved[:, :2])
+        lowest.append(moved[:, 2:, 2].min(axis=1))
+    points, lift = np.concatenate(treads, axis=1), -np.min(lowest, axis=0)
+    weight = np.exp(-(points[:, :, 2] - points[:, :, 2].min(axis=1, keepdims=True)) / 0.01)
     weight = 0.5 * (weight[1:] + weight[:-1])
     weight /= weight.sum(axis=1, keepdims=True)
     advance = (weight * np.diff(points[:, :, 1], axis=0)).sum(axis=1)
     kernel = np.hanning(15) / np.hanning(15).sum()
-    smooth = np.convolve(np.r_[lowest[-8:-1], lowest, lowest[1:8]], kernel, "valid")
+    lift = np.convolve(np.r_[lift[-8:-1], lift, lift[1:8]], kernel, "valid")
     advance = np.convolve(np.r_[advance[-7:], advance, advance[:7]], kernel, "valid")
-    return -smooth, advance
+    return lift, advance
 
 
 def _carry(a: Anatomy, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:

@@ -1,34 +1,27 @@
-"""The topology that all people share, and how it is carried onto another body."""
+"""The topology that all people share, and how much each part carries of its vertices."""
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from ..geometry import storage
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from ..skeleton.tree import Skeleton
-from .anatomy import PARENTS, Anatomy, BodyShape
-from .body_parts import body_surface
-from .implicit_surface import Field, project, value_and_gradient
-
-STORED = Path(__file__).with_name("topology.npz")         # made by tests/people_maker.py
-CANONICAL = BodyShape(sex=0.0, stature=1.69)
-VERSION = 1
+from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
+from .population import population
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """The shared triangulation on the canonical body."""
+    """The shared triangulation on the average of women and men."""
 
     mesh: Mesh
     mirror: np.ndarray  # (N,) int: the vertex at the mirrored place
     part_of_face: np.ndarray  # (F,) int
-    anatomy: Anatomy  # anatomy of the canonical body
+    anatomy: Anatomy
 
     @cached_property
     def part_of_vertex(self) -> np.ndarray:
@@ -38,15 +31,45 @@ class Template:
 
 @lru_cache(maxsize=1)
 def load() -> Template:
-    """The stored template."""
-    _, arrays = storage.load(STORED, "people template", (VERSION,))
-    anatomy = Anatomy(CANONICAL)
-    vertices = arrays["vertices"] / 1e5
-    mirror = arrays["mirror"].astype(np.int64)
-    vertices = project(body_surface(anatomy), vertices, 2)
-    vertices = 0.5 * (vertices + vertices[mirror] * [-1, 1, 1])
-    mesh = Mesh(vertices, arrays["faces"].astype(np.int64))
-    return Template(mesh, mirror, arrays["part_of_face"].astype(np.int64), anatomy)
+    """The template of the built-in people."""
+    people = population()
+    anatomy = Anatomy(BodyShape("male", (0.0,)))
+    mesh = Mesh(anatomy.vertices, people.faces)
+    part = label_faces(mesh, anatomy, people.weights)
+    # mirror images have mirrored parts, whatever rounding does at a border
+    left = mesh.corners.mean(axis=1)[:, 0] > 0
+    twin = {tuple(sorted(face)): f for f, face in enumerate(people.mirror[people.faces].tolist())}
+    other = np.array([twin[tuple(sorted(face))] for face in people.faces.tolist()])
+    part[~left] = MIRROR_PART[part[other[~left]]]
+    return Template(mesh, people.mirror, part, anatomy)
+
+
+def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray:
+    """Part of every triangle (F,) of the left half: cut by a plane through each joint; arms by weights."""
+    c, j = mesh.corners.mean(axis=1), anatomy.joints
+    arm = weights[mesh.faces][:, :, 4:7].sum(axis=(1, 2)) > 0.75              # a quarter of each corner
+    part = np.zeros(len(c), dtype=np.int64)
+
+    def beyond(joint: int, normal: np.ndarray, by: float = 0.0) -> np.ndarray:
+        return (c - j[joint]) @ normal > by * anatomy.scale
+
+    # crest and spines of the hip bone, ends of forearm and shin bones, which carry markers, are on the part of the bone
+    part[c[:, 2] > j[1, 2] + 0.015 * anatomy.scale] = 1
+    part[c[:, 2] > j[2, 2]] = 2
+    part[beyond(3, np.array([0, -0.35, 1.0])) & (np.abs(c[:, 0]) < 0.12)] = 3
+    # the shoulder is cut from the armpit outwards and up
+    up = anatomy.upper_arm_frame[2]
+    armpit = j[4] - [0.012 * anatomy.scale, 0, 0]
+    mine = arm & ((c - armpit) @ (0.75 * up + 0.66 * np.array([1, 0, 0.25])) > 0)
+    part[mine] = 4
+    part[mine & beyond(5, up + anatomy.forearm_frame[2])] = 5
+    part[mine & beyond(6, anatomy.forearm_frame[2], 0.018)] = 6
+    # the hip from the groin to its crest
+    mine = ((c - j[10]) @ np.array([0.72, 0, -1.0]) > 0) & (c[:, 0] > 0) & (c[:, 2] < j[0, 2] + 0.02) & ~arm
+    part[mine] = 10
+    part[mine & (c[:, 2] < j[11, 2])] = 11
+    part[mine & beyond(12, np.array([0, -0.3, -1.0]), 0.012)] = 12         # with all of the heel
+    return part
 
 
 @lru_cache(maxsize=1)
@@ -81,86 +104,3 @@ def neighbour_mean() -> csr_array:
     """(N, N) the mean of a vertex's neighbours."""
     A = load().mesh.vertex_adjacency
     return csr_array(diags_array(1 / A.sum(axis=1)) @ A)
-
-
-def frames(anatomy: Anatomy) -> np.ndarray:
-    """(16, 3, 3) affine frames of the bones: columns across (2) and along, lengths included."""
-    g = anatomy.scale
-    out = np.zeros((16, 3, 3))
-    along = anatomy.ends - anatomy.joints
-    for p in range(16):
-        z = along[p]
-        front = np.array([0, -1.0, 0]) if p not in (12, 15) else np.array([0, 0, 1.0])
-        length = np.linalg.norm(z)
-        y = front - (front @ z) * z / length**2
-        y /= np.linalg.norm(y)
-        x = np.cross(y, z / length)
-        thick = anatomy.head_scale if p == 3 else anatomy.width["hand"] / 0.19 if p in (6, 9) else \
-            anatomy.width["foot"] / 0.26 if p in (12, 15) else g
-        if p in (0, 1, 2):
-            thick = anatomy.joints[4, 0] / 0.176
-        out[p] = np.stack([x * thick, y * thick, z], axis=1)
-    return out
-
-
-def carry(shape: BodyShape, stages: int = 3) -> tuple[np.ndarray, Anatomy]:
-    """The template's vertices (N, 3) on the body of another shape, metres, and that body's anatomy.
-
-    Moved with the skeleton, projected on the implicit surface and evened out in it, in a few stages from
-    the canonical body to the wanted one.
-    """
-    template = load()
-    weights, _ = blending()
-    at, goal = CANONICAL.array(), shape.array()
-    before, vertices = template.anatomy, template.mesh.vertices
-    x0 = template.mesh.vertices
-    mean = neighbour_mean()
-    offset = x0 - mean @ x0
-    for stage in range(1, stages + 1):
-        now = Anatomy(BodyShape.from_array(at + (goal - at) * stage / stages))
-        field = body_surface(now)
-        change = frames(now) @ np.linalg.inv(frames(before))
-        shift = now.joints - np.einsum("pij,pj->pi", change, before.joints)
-        blend = np.einsum("np,pij->nij", weights, change)
-        vertices = np.einsum("nij,nj->ni", blend, vertices) + weights @ shift
-        total = frames(now) @ np.linalg.inv(frames(template.anatomy))
-        wanted = np.einsum("np,pij,nj->ni", weights, total, offset)
-        gradient = None
-        for _ in range(2):
-            vertices, gradient = _relax(field, vertices, wanted, gradient)
-        before = now
-    value, gradient = _symmetric(field, vertices)
-    step = np.clip(value / np.maximum((gradient**2).sum(axis=1), 0.1), -0.005, 0.005)
-    vertices = vertices - step[:, None] * gradient
-    return 0.5 * (vertices + vertices[template.mirror] * [-1, 1, 1]), now
-
-
-def _symmetric(field: Field, vertices: np.ndarray, gradient: np.ndarray | None = None
-               ) -> tuple[np.ndarray, np.ndarray]:
-    """Field (N,) and gradient (N, 3), worked out on the left half; a known gradient is kept."""
-    twin = load().mirror
-    left = np.flatnonzero(load().mesh.vertices[:, 0] >= -1e-9)
-    value = np.empty(len(vertices))
-    if gradient is None:
-        gradient = np.empty_like(vertices)
-        value[left], gradient[left] = value_and_gradient(field, vertices[left])
-        gradient[twin[left]] = gradient[left] * [-1, 1, 1]
-    else:
-        value[left] = field(vertices[left])
-    value[twin[left]] = value[left]
-    return value, gradient
-
-
-def _relax(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
-            ) -> tuple[np.ndarray, np.ndarray]:
-    """One Newton step onto the surface, then tangential steps towards the canonical neighbourhoods."""
-    value, gradient = _symmetric(field, vertices, gradient)
-    length = np.sqrt(np.maximum((gradient**2).sum(axis=1), 0.05))
-    normal = gradient / length[:, None]
-    vertices = vertices - np.clip(value / length, -0.03, 0.03)[:, None] * normal
-    mean = neighbour_mean()
-    for _ in range(6):
-        step = mean @ vertices + wanted - vertices
-        step -= np.einsum("nd,nd->n", step, normal)[:, None] * normal
-        vertices = vertices + 0.5 * step
-    return vertices, gradient

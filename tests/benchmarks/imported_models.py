@@ -18,18 +18,18 @@ from typing import Any
 import numpy as np
 from protocols import half_view, machine, write_report
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "people")]
 RATE = 60.0
 
 
 def models(faces: int, which: list[str]) -> dict[str, tuple[Any, np.ndarray]]:
     """The models with the vertices of `Person` that they have."""
+    from make_model import learn_people_model
     from published_bodies import as_smplx, as_star, synthetic_smpl
 
-    from completion.synthetic_people import SyntheticRecipe, build_synthetic
     from model.importing import import_model
 
-    scape = build_synthetic(SyntheticRecipe(poses=60, people=30, faces=faces))
+    scape = learn_people_model(60, faces)
     made, out = synthetic_smpl(faces, 30, 60), {"SCAPE": (scape, np.array(scape.info["people_vertices"]))}
     with tempfile.TemporaryDirectory() as folder:
         for name, make in (("SMPL layout", dict), ("STAR layout", as_star), ("SMPL-X layout", as_smplx)):

@@ -87,7 +87,7 @@ def write_user_files(work: Path) -> None:
         write_user_scan(scans, name, stand(person, pose), config, rng, (".ply", ".obj", ".stl")[k % 3])
         rows.append(f"{name},anna,{label},male")
     for k in range(PEOPLE):
-        other = Person(BodyShape.random(rng, sex=-1.0 if k % 2 else 1.0))
+        other = Person(BodyShape.random(rng, sex="female" if k % 2 else "male"))
         name = f"2024.06.{k + 1:02d} person"
         write_user_scan(scans, name, stand(other, near_rest(rng)), config, rng)
         rows.append(f"{name},person {k},rest,{'female' if k % 2 else 'male'}")

@@ -25,8 +25,8 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.subject.person import find_person
 from completion.partial.completion import Completion, complete
-from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
+from model.built_in import load_built_in_model
 from model.posing.transfer import subject_from_body
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -55,7 +55,7 @@ def kept(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.
 def somebody(k: int) -> tuple[Person, np.random.Generator]:
     """The k-th person, women and men in turn."""
     rng = np.random.default_rng([18, k])
-    return Person(BodyShape.random(rng, 1.0 if k % 2 else -1.0)), rng
+    return Person(BodyShape.random(rng, "male" if k % 2 else "female")), rng
 
 
 def registered(person: Person, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -141,7 +141,7 @@ def main() -> None:
     parser.add_argument("--men", type=int, default=6)
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
-    model = synthetic_model()
+    model = load_built_in_model()
     for k in range(max(args.people, args.men)):
         if k < args.people:
             of_person(model, args.output, k)

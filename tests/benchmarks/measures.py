@@ -20,8 +20,9 @@ from measured_bodies import of_man, of_person, somebody
 from protocols import load_real, machine, write_report
 from scans import HELD_MEN
 
-from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
+from model.built_in import load_built_in_model
+from model.measurement.catalogue import CATALOGUE
 from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, laid_on, measure
 from model.measurement.section import around, tape
@@ -107,7 +108,7 @@ def rows_of(k: int, how: str, found: Measurements, girths: dict[str, float], oth
     """A row for every girth, and for what else was measured of the true vertices."""
     true = {**(others.values if others else {}), **girths}
     for name, value in true.items():
-        if name in found.values:
+        if name in found.values and CATALOGUE[name].unit == "m":
             yield {"person": k, "how": how, "name": name, "girth": name in girths,
                    "off_mm": 1e3 * (found.values[name] - value),
                    **({"stated_mm": 1e3 * found.errors[name]} if name in found.errors else {})}
@@ -144,7 +145,8 @@ def of_men(folder: Path, men: list[int]) -> list[dict[str, object]]:
             both.append({"cut anew": measure(body, tapes, axes).values, **carried_otherwise(tapes, body, axes)})
         rows += [{"man": man, "way": way, "name": name, "girth": isinstance(tapes.found[name], Girth),
                   "apart_mm": 1e3 * abs(value - both[1][way][name])}
-                 for way, values in both[0].items() for name, value in values.items() if name in both[1][way]]
+                 for way, values in both[0].items() for name, value in values.items()
+                 if name in both[1][way] and CATALOGUE[name].unit == "m"]
     return rows
 
 
@@ -180,7 +182,7 @@ def main() -> None:
     parser.add_argument("-o", "--output")
     args = parser.parse_args()
     args.bodies.mkdir(parents=True, exist_ok=True)
-    model = synthetic_model()
+    model = load_built_in_model()
     tapes = find_tapes(model.template, model.info["landmarks"])
     rows = list[dict]()
     for k in range(args.people):

@@ -11,7 +11,12 @@ frames: what body and pose are off, without where somebody happened to put the m
 Tuned on these four files: the places of loose markers in the layout `cmu41` and of feet and hands, from markers that
 are not held out; the weights of the poses of every frame. The held-out ones got the mirror image of their partners, and
 T10 went 23 mm up to the level of the sternum's tip, after pictures and figures with the held-out markers had been seen.
-The weights of the person come from simulated men.
+On the built-in people `cmu41` has the markers where this layout has them on real men, brought there by registration
+(trunk, head) and by men's motion with these markers (limbs); hips and T10 stayed. The weights of the person are rounded
+variances of what is left of all markers of these files, and were checked on simulated men (mosh_people.py).
+
+Each half of a file is also taken as a recording of its own: how far the two bodies are apart, standing in the rest pose
+and with the pose of one fitted to the other, and how much their stature differs.
 """
 from __future__ import annotations
 
@@ -23,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 from c3d import HELD_OUT
+from mosh_people import apart, at_rest
 from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
@@ -38,8 +44,12 @@ from completion.mocap.subject.person import PersonFit, find_person, spread_frame
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
+from model.fitting.vertices import fit_pose
+from model.measurement.find import find_tapes
+from model.measurement.measure import measure
 
 CALIBRATED = 12                      # frames that tell where a held-out marker sits
+MEASURES = ("stature", "chest_girth", "waist_girth", "hip_girth")
 
 
 def held_out(model: BodyModel, motion: Motion, soft: SoftTissue | None, markers: MarkerSequence, layout: MarkerLayout
@@ -122,6 +132,24 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, conf
     return person, motion, row | held_out(model, motion, soft, markers, layout)
 
 
+def two_halves(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, config: MoshConfig
+               ) -> dict[str, object]:
+    """The person of the whole file in figures, and what the persons of its two halves differ by, millimetres."""
+    middle = len(markers.positions) // 2
+    halves = [MarkerSequence(some, markers.labels, markers.rate)
+              for some in (markers.positions[:middle], markers.positions[middle:])]
+    subjects = [model.subject(find_person(model, each, layout, config.person).betas) for each in (markers, *halves)]
+    bodies = [at_rest(subject) for subject in subjects]
+    row: dict[str, object] = {"halves_mm": apart(*bodies[1:]),
+                              "halves_fitted_mm": 1e3 * fit_pose(subjects[2], bodies[1]).mean}
+    if "landmarks" not in model.info:
+        return row
+    tapes = find_tapes(model.template, model.info["landmarks"])
+    whole, one, two = (measure(body, tapes, only=MEASURES).values for body in bodies)
+    return row | {"halves_stature_mm": 1e3 * abs(one["stature"] - two["stature"]),
+                  "measures_mm": {name: round(1e3 * value) for name, value in whole.items()}}
+
+
 def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: int, path: Path, columns: int = 10
             ) -> None:
     """Every so many frames with the markers as dots."""
@@ -160,7 +188,7 @@ def main() -> None:
     for path in sorted(args.folder.glob("*.c3d")):
         markers = read_markers(path)
         _, motion, row = follow(model, markers, layout, config)
-        rows.append({"file": path.name, **row})
+        rows.append({"file": path.name, **row, **two_halves(model, markers, layout, config)})
         print("  ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
                         for name, value in rows[-1].items()), flush=True)
         if args.pictures:

@@ -31,8 +31,8 @@ from completion.mocap.retargeting.soft_tissue import (
     write_character,
 )
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
-from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
+from model.built_in import load_built_in_model
 from model.fitting.bodies import at_rest
 from model.posing.character import Character, register_character
 from scanprep.geometry.mesh import Mesh
@@ -128,7 +128,7 @@ def main() -> None:
     from model.files import load_model
 
     args.folder.mkdir(parents=True, exist_ok=True)
-    model = load_model(args.model) if args.model else synthetic_model()
+    model = load_model(args.model) if args.model else load_built_in_model()
     markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
         (read_markers(args.c3d), named_layout("cmu41", model.template))
     soft = mosh(model, markers, layout).soft_tissue[0]

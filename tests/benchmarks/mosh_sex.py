@@ -9,6 +9,7 @@ the other way to tell, to fit the women's and the men's model and to take the on
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -19,33 +20,35 @@ from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.subject.person import find_person
-from completion.synthetic_people import SyntheticRecipe, _decimated
 from model.body import BodyModel
 from model.files import load_model
+from model.learning.config import LearnConfig
 from model.learning.sexes import guess_sex, learn_by_sex, sex_plane
 from scanprep.geometry.surface import Surface
 from scanprep.synthetic.data_set import SUBJECT, near_rest, subject_pose
 from scanprep.synthetic.people import BodyShape, Person, walk
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "people"))
 MM = 1000.0
 RATE = 20.0
 NAMES = ("neutral", "female", "male")
 
 
 def learned(folder: Path) -> dict[str, BodyModel]:
-    """The models of the synthetic people by sex, from the folder or learned now, by the recipe of `synthetic_model`."""
+    """The models of the synthetic people by sex, from the folder or learned now, of 40 poses and 120 people."""
     paths = {name: folder / f"{name}.npz" for name in NAMES}
     if not all(path.exists() for path in paths.values()):
         folder.mkdir(parents=True, exist_ok=True)
-        recipe = SyntheticRecipe()
-        rng = np.random.default_rng(recipe.seed)
-        man, sexes = Person(SUBJECT), [("female", "male")[k % 2] for k in range(recipe.people)]
-        poses = np.stack([man.posed(subject_pose(k, rng)[1]) for k in range(recipe.poses)])
-        shapes = np.stack([Person(BodyShape.random(rng, sex=1.0 if sex == "male" else -1.0)).posed(near_rest(rng))
+        from make_model import decimate_person
+
+        rng = np.random.default_rng(5)
+        man, sexes = Person(SUBJECT), [("female", "male")[k % 2] for k in range(120)]
+        poses = np.stack([man.posed(subject_pose(k, rng)[1]) for k in range(40)])
+        shapes = np.stack([Person(BodyShape.random(rng, sex=sex)).posed(near_rest(rng))
                            for sex in sexes])
-        small = _decimated(man, poses, recipe.faces)
+        small = decimate_person(man, poses, 10000)
         found = learn_by_sex(small.template, small.transfer(poses), small.transfer(shapes), sexes, small.skeleton,
-                             recipe.learn)
+                             LearnConfig(components=30, refinements=2))
         for name, model in found.items():
             model.info["people_vertices"] = small.vertex_map.tolist()
             model.save(paths[name])

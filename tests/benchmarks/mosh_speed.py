@@ -30,7 +30,8 @@ from protocols import machine, write_report
 from completion.mocap.files.markers import MarkerSequence, read_markers, write_markers
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.marked_body import supports
-from completion.synthetic_people import synthetic_model, synthetic_path
+from model.built_in import load_built_in_model
+from model.files import BUILT_IN
 from model.fitting import energy
 from scanprep.synthetic.people import walk
 
@@ -42,7 +43,7 @@ Row = dict[str, float | str | dict[str, float]]
 
 def walking(frames: int, faulty: bool, rng: np.random.Generator) -> MarkerSequence:
     """Markers of a synthetic person who walks."""
-    model = synthetic_model()
+    model = load_built_in_model()
     layout = named_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
     subject, (poses, trans) = model.subject(0.5 * rng.normal(size=model.n_betas)), walk(frames, RATE)
     points = subject.points(*supports(model.template, layout))
@@ -96,7 +97,7 @@ def main() -> None:
         parser.error("a folder of real files and --model go together")
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as temporary:
-        cases = [(Path(temporary) / f"{kind}.c3d", synthetic_path()) for kind in args.kinds]
+        cases = [(Path(temporary) / f"{kind}.c3d", Path(BUILT_IN)) for kind in args.kinds]
         for file, _ in cases:
             write_markers(file, walking(round(60 * RATE * args.minutes), file.stem == "faulty",
                                         np.random.default_rng(0)))

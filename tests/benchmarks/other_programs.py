@@ -28,13 +28,14 @@ FRAMES = 10
 def synthetic_walk(path):
     """The files of the model of synthetic people, and of a walk of two seconds of one of them."""
     from completion.motion import Motion
-    from completion.synthetic_people import synthetic_model, synthetic_path
+    from model.built_in import load_built_in_model
+    from model.files import BUILT_IN
     from scanprep.synthetic.people import walk
 
-    betas = np.random.default_rng(0).normal(0, 0.7, synthetic_model().n_betas)
+    betas = np.random.default_rng(0).normal(0, 0.7, load_built_in_model().n_betas)
     poses, trans = walk(120, 60.0)
     Motion(poses, trans, betas, 60.0, np.zeros((len(poses), 0)), ()).save(path)
-    return synthetic_path(), path
+    return Path(BUILT_IN), path
 
 
 def cases(model_file, motion_file, folder):

@@ -29,8 +29,9 @@ from protocols import half_view, machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.named import named_layout
-from completion.synthetic_people import synthetic_model, synthetic_path
 from model.body import BodyModel
+from model.built_in import load_built_in_model
+from model.files import BUILT_IN
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.synthetic.people import BodyShape, Person, walk
@@ -43,7 +44,7 @@ BUSY = "while True: pass"
 def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, list[str]]:
     """What the commands read, and their arguments."""
     rng = np.random.default_rng(0)
-    person = Person(BodyShape.random(rng, sex=-1.0))
+    person = Person(BodyShape.random(rng, sex="female"))
     marks = {name: int(v) for name, v in model.info["landmarks"].items()}
     kept = np.array(model.info["people_vertices"])
     scan = model.template.with_vertices(person.mesh.vertices[kept])
@@ -133,10 +134,10 @@ def main() -> None:
     parser.add_argument("--busy", type=int, nargs="*", default=[0, 1], help="processes that compute beside")
     parser.add_argument("--rounds", type=int, default=1)
     args = parser.parse_args()
-    model = synthetic_model()
+    model = load_built_in_model()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        cases = make_cases(folder, model, synthetic_path())
+        cases = make_cases(folder, model, Path(BUILT_IN))
         rows = []
         settings = list(product(args.busy, args.threads))
         for name in args.cases or cases:

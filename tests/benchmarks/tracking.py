@@ -18,9 +18,9 @@ from protocols import load_real, machine, scape_fold, write_report
 from scipy.spatial.transform import Rotation, Slerp
 
 from completion import TrackConfig, track
-from completion.synthetic_people import synthetic_model
 from model import Subject, fit_pose, load_model
 from model.body import BodyModel
+from model.built_in import load_built_in_model
 from model.posing.transfer import subject_from_body
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -102,7 +102,7 @@ def measure(body: BodyModel | Subject, model: BodyModel, frames: list, truth: np
 
 def procedural(only: list[str], count: int) -> dict[str, object]:
     """The walk, with everything that may go wrong."""
-    model = synthetic_model()
+    model = load_built_in_model()
     kept = np.array(model.info["people_vertices"])
     person = Person(BodyShape.random(np.random.default_rng(SEED)))
     poses, trans = walk(count, RATE)

@@ -26,9 +26,9 @@ from scans import HELD_MEN, HELD_POSES, test_scan
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import layout_on, named_layout
 from completion.partial.completion import complete
-from completion.synthetic_people import synthetic_model
 from model import LearnConfig, learn_scape
 from model.body import BodyModel
+from model.built_in import load_built_in_model
 from model.files import load_model
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -86,14 +86,14 @@ def real_cases(data: RealData, model: BodyModel, kind: str, numbers: list[int]) 
 
 def synthetic_cases(count: int) -> Iterator[Case]:
     """Women and men in turn, none of whom the model was learned from, in random poses."""
-    model = synthetic_model()
+    model = load_built_in_model()
     kept = np.array(model.info["people_vertices"])
     layout, marks = named_layout("cmu41", model.template, kept), model.info["landmarks"]
     chosen = np.array([v for name, v in marks.items() if name in (
         "left toe", "right toe", "left knee", "left middle finger", "right middle finger", "top of head", "navel")])
     for k in range(count):
         rng = np.random.default_rng(1000 + k)
-        person = Person(BodyShape.random(rng, float(k % 2)))
+        person = Person(BodyShape.random(rng, "male" if k % 2 else "female"))
         posed = person.mesh.with_vertices(person.posed(0.6 * random_pose(rng)))
         truth = model.template.with_vertices(posed.vertices[kept])
         whole = scan(posed, ScannerConfig(), rng).merged

@@ -27,7 +27,7 @@ from protocols import machine, write_report
 from completion.__main__ import main as scape
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.named import choose_layout
-from completion.synthetic_people import synthetic_model
+from model.built_in import load_built_in_model
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
@@ -65,7 +65,7 @@ class Case:
 def subject(seed: int, posed: bool = True, views: int = 4) -> Subject:
     """A person of some seed, who stands at rest where not `posed`."""
     rng = np.random.default_rng([seed, 77])
-    person, model = Person(BodyShape.random(rng)), synthetic_model()
+    person, model = Person(BodyShape.random(rng)), load_built_in_model()
     pose = random_pose(rng) if posed else np.zeros((16, 3))
     body = Mesh(person.posed(pose), person.mesh.faces)
     kept = np.array(model.info["people_vertices"])
@@ -76,7 +76,7 @@ def subject(seed: int, posed: bool = True, views: int = 4) -> Subject:
 
 def write(folder: Path, mesh: Mesh, marks: dict[str, np.ndarray] | None = None) -> None:
     """The scan, the template and landmarks of a case."""
-    model = synthetic_model()
+    model = load_built_in_model()
     write_mesh(folder / "scan.ply", mesh)
     write_mesh(folder / "template.ply", model.template)
     write_landmarks(folder / "template.landmarks.json", {n: int(v) for n, v in model.info["landmarks"].items()})
@@ -217,7 +217,7 @@ def statue_cases() -> Iterator[Case]:
 def measured_cases() -> Iterator[Case]:
     """Bodies that are measured or made: of another unit, of another size, of a report that failed."""
     def body(folder: Path, scale: float | np.ndarray, told: str = "") -> None:
-        model = synthetic_model()
+        model = load_built_in_model()
         betas = np.random.default_rng(401).normal(size=model.n_betas)
         standing = model.vertices(np.zeros((16, 3)), betas)
         write_mesh(folder / "scan.ply", model.template.with_vertices(standing * scale))
@@ -231,7 +231,7 @@ def measured_cases() -> Iterator[Case]:
                    lambda folder, scale=scale, told=told: body(folder, scale, told))
     yield Case("measure: a person", "measure scan.ply -o out.csv", lambda folder: body(folder, 1.0), False)
     def model_file(folder: Path) -> None:
-        synthetic_model().save(folder / "model.npz")
+        load_built_in_model().save(folder / "model.npz")
     for what, betas, wrong in (("betas of 20", "20", True), ("betas of 9 and -9, -9", "9 -9 -9", True),
                                ("betas of 2 and -1", "2 -1", False)):
         yield Case(f"model mesh: {what}", f"model mesh model.npz --betas {betas} -o out.ply", model_file, wrong)
@@ -239,7 +239,7 @@ def measured_cases() -> Iterator[Case]:
 
 def recording(seed: int) -> tuple[MarkerSequence, np.ndarray]:
     """A person who walks, with the 41 markers where their layout has them, some on bars; the vertices (T, N, 3)."""
-    rng, model = np.random.default_rng([seed, 78]), synthetic_model()
+    rng, model = np.random.default_rng([seed, 78]), load_built_in_model()
     person, kept = Person(BodyShape.random(rng)), np.array(model.info["people_vertices"])
     bodies = np.stack([person.posed(pose, trans)[kept] for pose, trans in zip(*walk(FRAMES, RATE), strict=True)])
     layout = choose_layout(model, None, tuple(MARKERS))[0]
@@ -309,7 +309,7 @@ def run(case: Case, folder: Path) -> dict[str, object]:
 
 def errors(body: Path, truth: np.ndarray) -> dict[str, float]:
     """Millimetres that vertices (N, 3), or (T, N, 3) of a motion, are off on average, and those of the worst part."""
-    model = synthetic_model()
+    model = load_built_in_model()
     if body.suffix == ".npz":
         with np.load(body) as a:             # `Motion.load` refuses the betas of bodies that nobody has
             found = model.subject(a["betas"]).vertices(a["poses"].reshape(len(truth), -1, 3), a["trans"])

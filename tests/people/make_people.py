@@ -9,7 +9,8 @@
    the one nearest to a loose prior (least Kullback-Leibler divergence, in closed form where measures are linear).
 3. Bodies are drawn from both, brought into the standard pose, and their principal components are the shapes. Axes
    are turned so that the first beta is stature, the second weight, the third from woman to man.
-4. A Gaussian of betas for each sex, corrected once more so that the measures of bodies meet the survey.
+4. A Gaussian of betas for each sex, corrected once more so that the measures of bodies meet the survey; betas then have
+   mean 0 and variance 1 over both.
 
 Nothing is drawn at random but from a fixed seed, so the same wheel and table give the same file.
 """
@@ -27,6 +28,7 @@ from makehuman import MakeHuman
 
 from model.measurement.find import find_tapes
 from model.measurement.measure import measure
+from model.measurement.reading import DENSITY
 from model.measurement.survey import TABLE, Survey, survey
 from model.measurement.tapes import Tapes
 from scanprep.geometry import storage
@@ -35,10 +37,10 @@ from scanprep.geometry.mesh import Mesh
 HERE = Path(__file__).parent
 SEXES = ("female", "male")
 SIDED = {"thigh_girth", "calf_girth", "wrist_girth", "arm_length", "hand_length", "foot_length"}
-DENSITY = 985.0                      # kilograms of a person per cubic metre of the surface, lungs half full
 # Share of a standard deviation to which the mean person meets a measure. The survey measured hips with feet together,
 # chests while breathing quietly and the middle of the kneecap, which bodies that stand apart do not show.
 TOLERANCE = {"hip_width": 0.35, "chest_depth": 0.15, "knee_height": 0.15}
+CLOSE = 0.2                          # the same of betas
 MACRO_SD, LOCAL_SD = 0.25, 0.17      # prior of sliders; looser ones make barrels and waists like wasps
 LIMITS = ((-0.65, 0.95), (-1.2, 1.2))          # of macro and of local sliders from their middle
 # local sliders: pairs of targets for less and for more, those of left and right together
@@ -208,19 +210,39 @@ def shape_space(rows: np.ndarray, male: np.ndarray, count: int, slopes: Callable
     U = np.linalg.eigh(D @ D.T)[1][:, ::-1][:, :count]
     betas = U * np.sqrt(len(rows) - 1)
     directions = (U.T @ D / np.sqrt(len(rows) - 1)).reshape(count, *mean.shape)
-    # turn: stature, weight, sex, then by how much they move the surface
-    axes = list[np.ndarray]()
-    for axis in (*slopes(mean, directions), betas[male].mean(axis=0) - betas[~male].mean(axis=0)):
+    turn = meaningful_axes(directions, *slopes(mean, directions), betas[male].mean(axis=0) - betas[~male].mean(axis=0))
+    return mean, np.tensordot(turn.T, directions, 1), betas @ turn
+
+
+def meaningful_axes(directions: np.ndarray, *wanted: np.ndarray) -> np.ndarray:
+    """(k, k) rotation of betas: the first axes are those wanted (k,), the others by how much they move the surface."""
+    count, axes = len(directions), list[np.ndarray]()
+    for axis in wanted:
         for known in axes:
             axis = axis - (axis @ known) * known
         axes.append(axis / np.linalg.norm(axis))
     first = np.array(axes).T
     rest = np.eye(count) - first @ first.T
     flat = rest @ directions.reshape(count, -1)
-    others = np.linalg.eigh(flat @ flat.T)[1][:, ::-1][:, :count - 3]
-    others *= np.sign(others[np.abs(others).argmax(axis=0), np.arange(count - 3)])
-    turn = np.hstack([first, others])
-    return mean, np.tensordot(turn.T, directions, 1), betas @ turn
+    others = np.linalg.eigh(flat @ flat.T)[1][:, ::-1][:, :count - len(axes)]
+    others *= np.sign(others[np.abs(others).argmax(axis=0), np.arange(count - len(axes))])
+    return np.hstack([first, others])
+
+
+def standardise(mean: np.ndarray, directions: np.ndarray, moments: dict[str, tuple[np.ndarray, np.ndarray]],
+                slopes: Callable[[np.ndarray, np.ndarray], np.ndarray]
+                ) -> tuple[np.ndarray, np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """The same people with betas of mean 0 and variance 1 over women and men together, which the correction changed."""
+    means, covariances = (np.array([moments[sex][i] for sex in SEXES]) for i in (0, 1))
+    middle = means.mean(axis=0)
+    root = np.linalg.cholesky(covariances.mean(axis=0) + np.cov(means.T, bias=True))       # b = middle + root b'
+    mean = mean + np.tensordot(middle, directions, 1)
+    directions = np.tensordot(root.T, directions, 1)
+    inverse = np.linalg.inv(root)
+    turn = meaningful_axes(directions, *slopes(mean, directions), inverse @ (means[1] - means[0]))
+    back = turn.T @ inverse
+    return mean, np.tensordot(turn.T, directions, 1), {
+        sex: (back @ (m - middle), back @ S @ back.T) for sex, (m, S) in moments.items()}
 
 
 def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, betas: np.ndarray, table: Survey
@@ -228,14 +250,17 @@ def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, betas:
     """Mean (k,) and covariance (k, k) of the betas of a sex, corrected so that measures meet the survey."""
     kept = [i for i, name in enumerate(table.names) if name != "age"]
     goal, C, sd = table.mean[kept], covariance(table)[np.ix_(kept, kept)], table.sd[kept]
+    # Bodies hardly vary in some combinations of measures, as of neck and shoulder height. Where these are to be met
+    # more closely, or more often, the average woman gets knees like barrels.
+    near = sd * [max(TOLERANCE.get(table.names[i], 0), CLOSE) for i in kept]
     m, S = betas.mean(axis=0), np.cov(betas.T)
-    for _ in range(5):
+    for _ in range(3):
         values, J = bodies.measures(mean + np.tensordot(m, directions, 1), directions)
         assert J is not None
         values, J = values[kept], J[kept]
         M = J @ S @ J.T
-        m = m + S @ J.T @ np.linalg.solve(M + np.diag((0.03 * sd)**2), goal - values)
-        K = S @ J.T @ np.linalg.inv(M + np.diag((0.1 * sd)**2))
+        m = m + S @ J.T @ np.linalg.solve(M + np.diag(near**2), goal - values)
+        K = S @ J.T @ np.linalg.inv(M + np.diag((CLOSE * sd)**2))
         S = S + K @ (C - M) @ K.T
         S = (S + S.T) / 2
     return m, S
@@ -273,20 +298,20 @@ def make(wheel: Path, table: Path, count: int, people: int, say: Callable[[str],
     all_rows = np.array(rows)
     bodies.tapes = find_tapes(Mesh(all_rows.mean(axis=0)[:mesh.count], mesh.faces), bodies.places)
     mean, directions, betas = shape_space(all_rows, male, count, slopes)
-    n = mesh.count
+    moments = {sex: sex_moments(bodies, mean, directions, betas[chosen], surveys[sex])
+               for sex, chosen in (("female", ~male), ("male", male))}
+    mean, directions, moments = standardise(mean, directions, moments, slopes)
     scale = np.abs(directions).max(axis=(1, 2)) / 32767
     out = {"mean": mean.astype(np.float32), "faces": mesh.faces.astype(np.uint16),
            "directions": np.round(directions / scale[:, None, None]).astype(np.int16), "scale": scale,
            "weights": np.round(255 * mesh.weights).astype(np.uint8), "mirror": mesh.mirror.astype(np.uint16)}
-    directions = out["directions"] * scale[:, None, None]
-    for sex, chosen in (("female", ~male), ("male", male)):
-        m, S = sex_moments(bodies, mean, directions, betas[chosen], surveys[sex])
+    for sex, (m, S) in moments.items():
         out |= {f"{sex}_mean": m, f"{sex}_covariance": S}
         say(f"{sex}: betas around {m[:3].round(2)}")
     for kind in ("landmarks", "markers"):
         out[kind] = np.array(list(places[kind]))
         out[f"{kind}_vertices"] = np.array([mesh.vertex_of[v] for v in places[kind].values()], dtype=np.uint16)
-    assert n < 2**16
+    assert mesh.count < 2**16
     return out
 
 

@@ -56,7 +56,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     Args:
         markers: C3D, TRC, CSV or TSV of markers, BVH or .npz of a motion, CSV of key poses, or a folder of these.
         output: Folder to write to.
-        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
+        model: Model of `scape learn`; without it that of the built-in people.
         layout: Where the markers sit: cmu41, plugingait39, biomech57, helenhayes29, or a JSON file {"markersets":
             [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.
         subject: Whose body it is: "markers" to find it from them, "template" for the one the model's poses were learned

@@ -44,7 +44,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
     Args:
         bodies: Folder of meshes in the model's triangles, in any poses, or a registered set.
         output: Folder to write to.
-        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
+        model: Model of `scape learn`; without it that of the built-in people.
         candidates: Layout whose markers may be chosen, one of `scape layout list` or a file; without it 114 places,
             left and right the same, spread between the markers of --keep, or of vicon47.
         keep: Layout whose markers stay in the set.

@@ -56,7 +56,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
     Args:
         markers: C3D, TRC, CSV or TSV files, or folders of these.
         output: Folder to write to.
-        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use. Given three
+        model: Model of `scape learn`; without it that of the built-in people. Given three
             times, a model of both sexes, one of women and one of men: the markers tell the sex, by the first.
         layout: Where the markers usually sit: one of `scape layout list`, or a JSON file {"markersets":
             [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.

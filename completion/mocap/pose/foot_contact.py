@@ -66,12 +66,13 @@ class FootContact:
         pose, trans, _ = body.body.split(x[np.unique(np.linspace(0, len(x) - 1, 150).astype(int))])
         vertices = subject.vertices(pose, trans)
         self.floor = Floor.below(vertices) if floor is None else Floor.given(floor)
-        # the soles: at most 24 vertices spread over what comes near the floor
+        # the soles: at most 24 vertices spread over what comes near the floor, and the lowest of every frame, as heels
+        # are round
         rest, height = subject.template.vertices, self.floor.above(vertices)
         near = np.flatnonzero((height < TOUCH).mean(axis=0) > 0.05)
         near = near if len(near) else np.array([int(height.min(axis=0).argmin())])
-        self.shapes = part_shapes(subject.points(
-            near[farthest_points(rest[near], 24, height[:, near].mean(axis=0).argmin())]))
+        spread = farthest_points(rest[near], 24, height[:, near].mean(axis=0).argmin())
+        self.shapes = part_shapes(subject.points(near[np.union1d(spread, height[:, near].argmin(axis=1))]))
         self.stands = self._standing_places(self._points(x), rate)
 
     def held(self, x: np.ndarray) -> np.ndarray:

@@ -1,0 +1,110 @@
+"""How the betas of people are spread: a Gaussian, one of each sex where a model tells women from men."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from .body import BodyModel
+
+Sex = Literal["female", "male"]
+SEXES: tuple[Sex, Sex] = ("female", "male")
+WORDS = {"female": "women", "male": "men"}
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeStatistics:
+    """A Gaussian of betas.
+
+    Attributes
+    ----------
+    mean : (K,) float
+    covariance : (K, K) float
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    @cached_property
+    def root(self) -> np.ndarray:
+        """(K, K) that turns standard normal numbers z into betas, `mean + root @ z`; root rootᵀ is the covariance."""
+        variance, axes = np.linalg.eigh(self.covariance)
+        return axes * np.sqrt(np.maximum(variance, 0))
+
+
+def known_sexes(model: BodyModel) -> tuple[Sex, ...]:
+    """The sexes whose statistics a model keeps; none of most models."""
+    return tuple(sex for sex in SEXES if sex in model.info.get("sexes", {}))
+
+
+def shape_statistics(model: BodyModel, sex: Sex | None = None) -> ShapeStatistics:
+    """Mean and covariance of the betas of people, or of those of one sex.
+
+    Parameters
+    ----------
+    model : BodyModel
+    sex : {"female", "male"}, optional
+        Of a model of one sex alone, as `learn_by_sex` makes them, only its own.
+
+    Returns
+    -------
+    ShapeStatistics
+        Without a sex mean 0 and covariance 1, which betas have over all people that the model was learned from.
+
+    Raises
+    ------
+    ValueError
+        Another word, a sex asked of a model that does not tell women from men, or damaged statistics.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> men, women = (shape_statistics(load_built_in_model(), sex) for sex in ("male", "female"))
+    >>> bool(men.mean[0] > women.mean[0])               # the first beta is stature
+    True
+
+    [SCAPE] Eq. 7
+    """
+    K = model.n_betas
+    if sex is None or model.info.get("sex") == sex:
+        return ShapeStatistics(np.zeros(K), np.eye(K))
+    if sex not in SEXES:
+        raise ValueError(f"sex: expected 'female' or 'male', got {sex!r}")
+    if sex not in known_sexes(model):
+        raise ValueError(f"sex: the model does not tell women from men, so it has no {WORDS[sex]}; leave it out, or "
+                         "take the built-in model, which is named people")
+    kept = model.info["sexes"][sex]
+    try:
+        mean, covariance = (np.array(kept[name], dtype=np.float64) for name in ("mean", "covariance"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"model: its statistics of {WORDS[sex]} are damaged ({error})") from None
+    if mean.shape != (K,) or covariance.shape != (K, K) or not np.isfinite([*mean, *covariance.ravel()]).all():
+        raise ValueError(f"model: its statistics of {WORDS[sex]} are damaged: expected finite numbers of {K} betas")
+    return ShapeStatistics(mean, covariance)
+
+
+def draw_betas(model: BodyModel, count: int, rng: np.random.Generator, sex: Sex | None = None
+               ) -> tuple[np.ndarray, tuple[Sex | None, ...]]:
+    """Betas (n, K) of random people, and their sexes.
+
+    Without a sex, of a model that knows both, every other one is a woman: one Gaussian over both would make people in
+    between. Of a model that knows none they are standard normal, and of no sex.
+
+    Examples
+    --------
+    >>> from model import load_built_in_model
+    >>> betas, sexes = draw_betas(load_built_in_model(), 4, np.random.default_rng(0))
+    >>> betas.shape, sexes
+    ((4, 30), ('female', 'male', 'female', 'male'))
+    """
+    z = rng.normal(size=(count, model.n_betas))
+    both = known_sexes(model)
+    if sex is not None or len(both) < 2:
+        people = shape_statistics(model, sex)
+        # a unit covariance has roots in any direction: those who ask for none get the numbers as they are drawn
+        return (z if sex is None else people.mean + z @ people.root.T), (sex,) * count
+    of = {one: shape_statistics(model, one) for one in both}
+    sexes = tuple(both[i % 2] for i in range(count))
+    return np.array([of[one].mean + of[one].root @ z[i] for i, one in enumerate(sexes)]), sexes
