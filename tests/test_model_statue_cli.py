@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from trimesh.remesh import subdivide_to_size
 
 from completion.__main__ import main
 from model import load_model
@@ -38,7 +39,9 @@ def made(tmp_path_factory, person):
     folder = tmp_path_factory.mktemp("statue")
     mesh = person.mesh
     arm = np.isin(person.part_of_face, (8, 9))
-    scan, _ = Mesh(1000 * mesh.vertices, mesh.faces, np.clip(mesh.vertices / 2 + 0.5, 0, 1)).submesh(~arm)
+    # as dense on legs as on hands
+    dense, faces, before = subdivide_to_size(mesh.vertices, mesh.faces, 0.015, return_index=True)
+    scan, _ = Mesh(1000 * dense, faces, np.clip(dense / 2 + 0.5, 0, 1)).submesh(~arm[before])
     write_mesh(folder / "scan.ply", scan)
     joints = {name: (1000 * person.joints[j]).tolist() for name, j in JOINTS.items() if j not in (8, 9)}
     marks = {name: (1000 * mesh.vertices[v]).tolist() for name, v in LANDMARKS.items()
