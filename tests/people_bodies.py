@@ -27,11 +27,16 @@ def small_people() -> BodyModel:
     path = Path(os.environ[SHARED]) / "small_people.npz"
     with locked(path.with_suffix(".lock"), path, wait=True):
         if not path.exists():
-            model = make_model.learn_people_model(12, 3000, LearnConfig(refinements=0), n_betas=4)
-            sexes = {sex: {"mean": m[:4].tolist(), "covariance": C[:4, :4].tolist()}
-                     for sex, (m, C) in population().moments.items()}
-            replace(model, info={**model.info, "sexes": sexes}).save(path)
+            make_model.learn_people_model(12, 3000, LearnConfig(refinements=0), n_betas=4).save(path)
     return load_model(path)
+
+
+def with_sexes(model: BodyModel) -> BodyModel:
+    """A small model that tells women from men, as the built-in one does."""
+    k = model.n_betas
+    sexes = {sex: {"mean": mean[:k].tolist(), "covariance": C[:k, :k].tolist()}
+             for sex, (mean, C) in population().moments.items()}
+    return replace(model, info={**model.info, "sexes": sexes})
 
 
 def kept() -> np.ndarray:

@@ -2,7 +2,7 @@
 from contextlib import contextmanager
 
 import pytest
-from people_bodies import small_people
+from people_bodies import small_people, with_sexes
 from quiet_pictures import coarse_pictures
 
 from model import files
@@ -26,7 +26,7 @@ def once(find):
 @contextmanager
 def of_a_user(folder):
     """Work in a folder; the model of those without one is small, and so are all pictures."""
-    small, load_model = small_people(), files.load_model
+    small, load_model = with_sexes(small_people()), files.load_model
     with pytest.MonkeyPatch.context() as here, coarse_pictures():
         here.setattr(person, "_person_on", once(person._person_on))
         here.chdir(folder)

@@ -237,8 +237,8 @@ def test_a_click_on_a_cylinder_finds_its_axis_though_it_has_holes():
 
 def test_a_click_on_a_limb_finds_its_bone(control):
     medial, o, names = MedialAxis(control.mesh), control.skeleton.joints, control.skeleton.names
-    # calves lie behind the line from knee to ankle
-    for first, second, most in (("l_shoulder", "l_elbow", 0.015), ("r_elbow", "r_wrist", 0.015),
+    # calves lie behind the line from knee to ankle, the flesh of upper arms behind their bone
+    for first, second, most in (("l_shoulder", "l_elbow", 0.025), ("r_elbow", "r_wrist", 0.015),
                                 ("l_knee", "l_ankle", 0.030)):
         middle = 0.5 * (o[names.index(first)] + o[names.index(second)])
         for way in (np.array([0.0, 1, 0]), np.array([0.3, -1, 0.1])):
