@@ -27,7 +27,7 @@ def small_people() -> BodyModel:
     path = Path(os.environ[SHARED]) / "small_people.npz"
     with locked(path.with_suffix(".lock"), path, wait=True):
         if not path.exists():
-            make_model.learn_people_model(12, 3000, LearnConfig(refinements=0), n_betas=4).save(path)
+            make_model.learn_people_model(24, 3000, LearnConfig(refinements=0), n_betas=4).save(path)
     return load_model(path)
 
 

@@ -3,7 +3,6 @@ import csv
 
 import numpy as np
 import pytest
-from people_bodies import kept, small_people
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.files.motion_files import write_motion
@@ -11,9 +10,11 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.coverage import between, find_coverage, marker_labels
 from completion.motion import Motion
+from model.built_in import load_built_in_model
 
-MODEL = small_people()
-LAYOUT = named_layout("plugingait39", MODEL.template, kept())
+MODEL = load_built_in_model()         # small models have triangles that reach from the hip bone to the waist
+KEPT = np.array(MODEL.info["people_vertices"])
+LAYOUT = named_layout("plugingait39", MODEL.template, KEPT)
 SUBJECT = MODEL.subject(np.zeros(MODEL.n_betas))
 NAMES = np.array(SUBJECT.skeleton.names)
 LEGS = tuple(label for label in LAYOUT.labels if label[1:] in ("ASI", "PSI", "THI", "KNE", "TIB", "ANK", "HEE", "TOE"))

@@ -37,7 +37,7 @@ from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.people import BodyShape, Person
 from scanprep.synthetic.population import STORED as PEOPLE
 from scanprep.synthetic.population import population
-from scanprep.synthetic.poses import arm
+from scanprep.synthetic.poses import arm, mirrored_pose
 
 STANDING = 0.4                       # poses near rest for each other one: bodies at rest are 0.3 mm off, 0.5 without
 STOOD = 60                           # examples of poses of people who stand
@@ -54,19 +54,22 @@ def learn_people_model(poses: int, faces: int, config: LearnConfig = LEARN, n_be
                        seed: int = 5) -> ScapeModel:
     """The model of the built-in people: poses of the mean person, and the population's shape space."""
     rng, person = np.random.default_rng(seed), Person(BodyShape("male", (0.0,) * len(population().directions)))
-    at = [subject_pose(k, rng)[1] for k in range(poses)] + [near_rest(rng) for _ in range(round(STANDING * poses))]
+    at = [subject_pose(k, rng)[1] for k in range(poses // 2)]
+    at += [near_rest(rng) for _ in range(round(STANDING * poses / 2))]
+    # with mirror images: else the mean of the poses leaves the body at rest turned to one side
+    at = [side for pose in at for side in (pose, mirrored_pose(pose))]
     posed = np.stack([person.posed(pose) for pose in at])
     small = decimate_person(person, posed, faces)
     assert small.skeleton is not None, "a skeleton was given"
     model = learn_scape(small.template, small.transfer(posed), None, small.skeleton, config)
     standing = np.array([standing_pose(rng) for _ in range(STOOD)])
-    mean, covariance = pose_prior(small.template, small.skeleton, model.pose_examples[:poses], standing)
+    mean, covariance = pose_prior(small.template, small.skeleton, model.pose_examples[:2 * (poses // 2)], standing)
     info = {key: value for key, value in model.info.items() if key not in ("digest", "digests")}
     return replace(
         model, shape_space=shape_space(population(), small.vertex_map, model.template,
                                        model.pose_space).first(n_betas),
         pose_mean=mean, pose_covariance=covariance,
-        pose_examples=np.concatenate([model.pose_examples[:poses], standing]),
+        pose_examples=np.concatenate([model.pose_examples[:2 * (poses // 2)], standing]),
         info={**info, "landmarks": small.landmarks(landmarks()), "markers": small.landmarks(markers()),
               "people_vertices": small.vertex_map.tolist()})
 
