@@ -54,7 +54,7 @@ def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray
         return (c - j[joint]) @ normal > by * anatomy.scale
 
     # crest and spines of the hip bone, ends of forearm and shin bones, which carry markers, are on the part of the bone
-    part[c[:, 2] > j[1, 2] + 0.015 * anatomy.scale] = 1
+    part[c[:, 2] > j[1, 2] + 0.005 * anatomy.scale] = 1
     part[c[:, 2] > j[2, 2]] = 2
     part[beyond(3, np.array([0, -0.35, 1.0])) & (np.abs(c[:, 0]) < 0.12)] = 3
     # the shoulder is cut from the armpit outwards and up
