@@ -10,9 +10,10 @@ from scanprep.geometry import storage
 
 from .body import BodyModel
 
-# by the name of the kind in files: the module and the class; a new kind is a new line
 BUILT_IN = "people"                   # the name of the built-in model wherever a model file is asked for
-LOADERS = {BUILT_IN: "load_built_in_model", "people-fingers": "load_fingered_model"}     # of `model.built_in`
+LOADERS = {BUILT_IN: ("model.built_in", "load_built_in_model"),
+           "people-fingers": ("model.built_in", "load_fingered_model")}     # as for `KINDS`, of models in the wheel
+# by the name of the kind in files: the module and the class; a new kind is a new line
 KINDS = {"scape": ("model.scape", "ScapeModel"), "blendscape": ("model.scape", "BlendScapeModel"),
          "skinning": ("model.skinning", "SkinningModel")}
 
@@ -27,7 +28,8 @@ def load_model(path: str | Path) -> BodyModel:
     """
     # a folder of that name, as people keep, is no model file
     if str(path) in LOADERS and not Path(path).is_file():
-        load: Callable[[], BodyModel] = getattr(importlib.import_module("model.built_in"), LOADERS[str(path)])
+        module, name = LOADERS[str(path)]
+        load: Callable[[], BodyModel] = getattr(importlib.import_module(module), name)
         return load()
     kind = storage.kind_of(path)
     if kind not in KINDS:
