@@ -3,13 +3,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
+from scanprep.synthetic.anatomy import Sex
+
 from .body import BodyModel
 
-Sex = Literal["female", "male"]
 SEXES: tuple[Sex, Sex] = ("female", "male")
 WORDS = {"female": "women", "male": "men"}
 

@@ -17,10 +17,10 @@ from ..body import BodyModel
 from ..digests import body_digests, digest
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
+from ..shape_statistics import SEXES
 from .config import LearnConfig
 from .scape import POSES, Progress, Work, checked_training, learn_pose, seen_in_training, shape_deformations
 
-SEXES = ("female", "male")
 PLANE = "sex_plane"                  # its place in a model's info
 
 

@@ -39,7 +39,7 @@ from scanprep.synthetic.population import STORED as PEOPLE
 from scanprep.synthetic.population import population
 from scanprep.synthetic.poses import arm, mirrored_pose
 
-STANDING = 0.4                       # poses near rest for each other one: bodies at rest are 0.3 mm off, 0.5 without
+STANDING = 0.4                       # poses near rest for each other one: bodies at rest were 0.3 mm off, 0.5 without
 STOOD = 60                           # examples of poses of people who stand
 # Share of bodies that stand. Of nine half views of SPRING men one lacked an arm: it was 28 mm off with a half, 18 so;
 # of seven of SCAPE poses none changed by more than 0.6 mm.
