@@ -22,7 +22,7 @@ ModelArg = Annotated[Path, Place("MODEL.npz")]
 
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),
-    "import": ("A body model of the SMPL family's layout as ours.", "model.cli:import_file"),
+    "import": ("A body model of the SMPL family's layout, MHR or SOMA-X as ours.", "model.cli:import_file"),
     "mesh": ("The mesh of one pose and shape.", "model.posing.cli:mesh"),
     "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
     "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),
@@ -76,25 +76,28 @@ def about(model: BodyModel) -> list[Metric]:
 def import_file(model: ModelArg, output: Output) -> Outcome:
     """A body model of the SMPL family's layout (SMPL, SMPL-H, SMPL-X, STAR, `scape model export -o body.npz`) as ours.
 
-    Vertices are those of the published formula. The file's licence holds for the model that is written.
+    Vertices are those of the published formula. A folder of MHR or SOMA-X is read by the library body-models; the table
+    says how near these come. The licence of the files holds for the model that is written.
 
     Example: scape model import SMPL_NEUTRAL.npz -o smpl.npz
 
     Args:
-        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f.
+        model: File with v_template, shapedirs, posedirs, J_regressor, weights, kintree_table and f, or a folder.
         output: Model file to write.
     """
-    from .importing import import_model
+    from .body_library import import_any
 
-    found = import_model(model)
+    found = import_any(model)
     found.save(output)
-    rows = [Metric("vertices", len(found.template.vertices)), Metric("triangles", len(found.template.faces)),
-            Metric("joints", len(found.skeleton.parents)), Metric("betas", found.n_betas),
-            Metric("pose columns", len(found.correctives)), Metric("pose features", found.features.lift.kind),
-            Metric("height of the template", float(np.ptp(found.template.vertices, axis=0).max()), "m"),
-            Metric("parts", ", ".join(found.skeleton.names))]
-    return Outcome(output, rows + [Metric("note", note) for note in found.info["notes"].split("; ") if note],
-                   judgement=Judgement())
+    off, notes = found.info.get("left_out_error"), found.info["notes"].split("; ")
+    return Outcome(output, [
+        *([] if off is None else [Metric(LEFT_OUT, MM * float(off), "mm")]),
+        *(Metric("note", note) for note in notes if note),
+        Metric("vertices", len(found.template.vertices)), Metric("triangles", len(found.template.faces)),
+        Metric("joints", len(found.skeleton.parents)), Metric("betas", found.n_betas),
+        Metric("pose columns", len(found.correctives)), Metric("pose features", found.features.lift.kind),
+        Metric("height of the template", float(np.ptp(found.template.vertices, axis=0).max()), "m"),
+        Metric("parts", ", ".join(found.skeleton.names))], judgement=Judgement())
 
 
 def read_body(path: Path, template: Mesh, unit: Unit | None = None) -> Mesh:
