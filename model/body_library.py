@@ -29,6 +29,7 @@ from scanprep.geometry.storage import StorageError, taking_apart
 from scanprep.skeleton.roles import part_kind
 from scanprep.skeleton.tree import affine_weights
 
+from .body import Progress
 from .importing import Published, as_skinning, import_model
 from .skinning import SkinningModel, unblended
 
@@ -42,7 +43,7 @@ KNUCKLES = {"cmc": 1, "mcp": 1, "thumb_mcp": 2, "pip": 2, "dip": 3, "ip": 3}
 STEP = 1e-4                          # of a control, to see what it does
 BONE = 0.1                           # of a control of bones, to learn what it does: about 7% of a length
 LONGER = 0.04                        # share of what a bone carries that a beta of it adds: statures spread by it
-BENT, POSES = 0.7, 16                # radians, standard deviation, and number of the poses of a joint to learn from
+BENT, POSES = 0.5, 32                # radians, standard deviation, and number of the poses of a joint to learn from
 LEFT_OUT, TESTS = 0.3, 20            # the same of all controls together, of the bodies that tell the error
 AT_ONCE = 8                          # bodies that the library makes together: 18,000 vertices with a matrix each
 ROUNDING = 1e-6                      # metres below which a change is none
@@ -50,8 +51,15 @@ BONES, NOTHING = -2, -1              # what a control may lead in the place of a
 NEAR = 200                           # vertices that a joint is a combination of
 
 
-def import_any(path: str | Path) -> SkinningModel:
+def import_any(path: str | Path, progress: Progress | None = None) -> SkinningModel:
     """A model of ours of a file of the SMPL family's layout, or of a folder with the files of MHR or SOMA-X.
+
+    Parameters
+    ----------
+    path : path
+        A file for `import_model`, a folder of the files that the library names, or the first of these, see `FOLDERS`.
+    progress : callable, optional
+        Called with the joints learned so far and their number.
 
     Raises
     ------
@@ -75,10 +83,10 @@ def import_any(path: str | Path) -> SkinningModel:
             theirs = kind(model_path=folder)           # it downloads only where no folder is given
         except FileNotFoundError as problem:           # tells which file is missing
             raise ValueError(str(problem)) from None
-        return as_ours(theirs, name)
+        return as_ours(theirs, name, progress)
 
 
-def as_ours(theirs: Any, name: str) -> SkinningModel:
+def as_ours(theirs: Any, name: str, progress: Progress | None = None) -> SkinningModel:
     """A skinning model of a model of the library."""
     rng, body = np.random.default_rng(0), Library(theirs)
     template = Mesh(body.vertices(body.rest)[0], np.asarray(theirs.skinning_spec.triangles, dtype=np.int64))
@@ -92,9 +100,13 @@ def as_ours(theirs: Any, name: str) -> SkinningModel:
     found = Published(template, np.moveaxis(shapes, 0, -1), np.zeros((*template.vertices.shape, 0)), regressor,
                       body.weights, body.parents, body.names, {}, ())
     plain = as_skinning(found, {})
-    bends = np.concatenate([corrective_shapes(body, plain, j, rng) for j in range(1, J)])
-    model = replace(as_skinning(replace(found, bends=np.moveaxis(bends, 0, -1)), {"imported": name, "notes": notes}),
-                    joint_components=moved)
+    bends = []
+    for j in range(1, J):
+        bends.append(corrective_shapes(body, plain, j, rng))
+        if progress is not None:
+            progress(j, J - 1)
+    found = replace(found, bends=np.moveaxis(np.concatenate(bends), 0, -1))
+    model = replace(as_skinning(found, {"imported": name, "notes": notes}), joint_components=moved)
     # poses and shapes that nothing was learned from
     controls, betas = body.draw(range(1, J), LEFT_OUT, TESTS, rng), rng.normal(size=(TESTS, len(units)))
     exact = body.vertices(controls + betas @ units[:, :C], betas @ units[:, C:])

@@ -9,7 +9,7 @@ import numpy as np
 from scanprep.arguments import Place
 from scanprep.cli import MM, Output, Unit
 from scanprep.command_line import dispatch
-from scanprep.console import Metric, Outcome
+from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, read_registered
 from scanprep.geometry.mesh import Mesh
@@ -87,7 +87,8 @@ def import_file(model: ModelArg, output: Output) -> Outcome:
     """
     from .body_library import import_any
 
-    found = import_any(model)
+    with bar("learning how joints bend") as progress:
+        found = import_any(model, progress)
     found.save(output)
     off, notes = found.info.get("left_out_error"), found.info["notes"].split("; ")
     return Outcome(output, [

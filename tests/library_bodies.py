@@ -149,7 +149,7 @@ def mhr_folder(folder: Path, seed: int = 0, plain: bool = False) -> Path:
 
     shapes = np.zeros((117, N, 3))
     carried = np.column_stack(bones.weights)                # flesh about joints that stay
-    shapes[:10] = (carried @ rng.normal(0, 0.1, (10, 126, 1))) * 100 * (bones.x - carried @ np.array(bones.places))
+    shapes[:10] = (carried @ rng.normal(0, 0.04, (10, 126, 1))) * 100 * (bones.x - carried @ np.array(bones.places))
     shapes[10:45] = bump(100 * bones.x, 100 * bones.places[9], rng, 35, 0.3, 30)
     shapes[45:60] = bump(100 * bones.x, 100 * bones.tip("c_head"), rng, 15, 0.2, 5)
     # two layers of correctives: 24 hidden numbers a joint of 6 numbers of its rotation and of its parent's

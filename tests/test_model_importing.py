@@ -15,6 +15,7 @@ from model.features import QuaternionLift, RotationLift, lifted, lifted_slopes
 from model.files import load_model
 from model.fitting.vertices import fit_shape
 from model.importing import NAMES, import_model
+from model.learning.scape import judge_model
 from model.linear import check_pose
 from model.products import Products, Terms
 from model.resolution.change import change_resolution, resample
@@ -120,6 +121,10 @@ def test_parts_have_the_names_of_the_family_and_poses_are_those_of_people(both):
     if J == 55:
         np.testing.assert_array_equal(model.pose_mean[25:40].ravel(), smplx_hand())
         assert sd["index2_left"] == 0.05
+
+
+def test_joints_that_rest_in_poses_of_nobody_are_no_doubt(both):
+    assert judge_model(both[1]).verdict == judge_model(load_model("people-fingers")).verdict == "good"
 
 
 def smplx_hand():

@@ -318,7 +318,8 @@ def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
 
 def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement:
     """What a model learned with people (S, N, 3), metres, is worth: whether it means nothing, what it never saw."""
-    stiff = stiff_joints(model.pose_examples[:model.info.get("poses")]) if model.pose_examples is not None else ()
+    learned = model.info.get("poses", 0)                # of nobody's poses are the examples of imported models
+    stiff = stiff_joints(model.pose_examples[:learned]) if learned else ()
     never, doubts = f"never bent more than {np.degrees(STIFF):.0f} degrees in your poses", []
     if len(stiff) and len(stiff) == len(model.skeleton.parents) - 1:
         doubts = [f"the poses are all alike: joints {never}"]
