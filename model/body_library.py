@@ -44,7 +44,7 @@ STEP = 1e-4                          # of a control, to see what it does
 BONE = 0.1                           # of a control of bones, to learn what it does: about 7% of a length
 LONGER = 0.04                        # share of what a bone carries that a beta of it adds: statures spread by it
 BENT, POSES = 0.5, 32                # radians, standard deviation, and number of the poses of a joint to learn from
-LEFT_OUT, TESTS = 0.3, 20            # the same of all controls together, of the bodies that tell the error
+LEFT_OUT, TESTS = 0.3, 60            # the same of all controls together, of the bodies that tell the error
 AT_ONCE = 8                          # bodies that the library makes together: 18,000 vertices with a matrix each
 ROUNDING = 1e-6                      # metres below which a change is none
 BONES, NOTHING = -2, -1              # what a control may lead in the place of a joint
@@ -281,6 +281,8 @@ class Library:
         for rows in np.array_split(np.arange(len(controls)), -(-len(controls) // AT_ONCE)):
             shape = {"identity": self._mean} if identity is None else self._arguments("identity", identity[rows])
             out.append(np.asarray(forward(**self._arguments("pose", controls[rows]), **shape), dtype=np.float64))
+            if not np.isfinite(out[-1]).all():
+                raise ValueError("the library makes numbers of them that are not finite")
         return np.concatenate(out)
 
     @cached_property

@@ -46,8 +46,8 @@ def distances(body, model, spread, betas, seed=7):
     """(T, N) metres between a model and the library, in random poses and shapes of so many radians and deviations."""
     rng, C = np.random.default_rng(seed), body.rest.shape[1]
     units = body.directions[0]
-    controls = body.draw(range(1, len(body.joints)), spread, 10, rng)
-    b = betas * rng.normal(size=(10, len(units)))
+    controls = body.draw(range(1, len(body.joints)), spread, 60, rng)
+    b = betas * rng.normal(size=(60, len(units)))
     exact = body.vertices(controls + b @ units[:, :C], b @ units[:, C:])
     return np.linalg.norm(model.vertices(body.poses(controls), b) - exact, axis=-1)
 
@@ -116,8 +116,11 @@ def test_a_folder_that_lacks_a_file_is_told(name, lost, library, tmp_path):
 
 def test_damaged_files_are_told(library, tmp_path):
     folder = mhr_folder(tmp_path / "mhr")
+    shapes = folder / "corrective_blendshapes_lod1.npz"
+    np.savez(shapes, corrective_blendshapes=np.full_like(np.load(shapes)["corrective_blendshapes"], np.nan))
+    refused(folder, "expected the files of MHR.*not finite")
     (folder / "mhr_model.pt").write_bytes(b"no archive")
-    refused(folder, "expected the files of MHR")
+    refused(folder, "expected the files of MHR.*zip")
     folder = soma_folder(tmp_path / "soma")
     np.savez(folder / "SOMA_neutral.npz", mean=np.zeros((3, 3)))
     refused(folder, "expected the files of SOMA.*missing required NPZ fields")
