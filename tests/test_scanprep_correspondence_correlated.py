@@ -195,7 +195,7 @@ def test_energies_of_true_images_are_zero_and_mirrors_cost():
 
 def test_a_cloud_without_normals_gets_them_outward(kicking):
     rng = np.random.default_rng(0)
-    points, _, _ = kicking.sample(9000, rng)
+    points, _, _ = kicking.sample(15000, rng)
     sheet = Sheet(target_of(points), 0.02)
     near = Surface(kicking).closest(sheet.points)
     agree = np.einsum("nd,nd->n", sheet.normals, kicking.face_normals[near.faces])
