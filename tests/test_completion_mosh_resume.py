@@ -62,9 +62,7 @@ def test_killed_in_the_middle_of_a_recording_it_goes_on(copied, stage, call, kep
         assert run(HERE, *BOB, "-o", "killed") == 0
     assert {name for name, count in calls.items() if not count} == kept
     if stage == "solve":
-        with counted() as all_calls:
-            assert run(HERE, *BOB, "-o", "fresh") == 0
-        assert calls["solve"] == all_calls["solve"] - 1              # the first had been done
+        assert calls["solve"] == 1                                   # of two, of which the first had been done
     assert contents(out) == contents(copied / "whole")
     assert not (out / HOME / "making").exists() and not list((out / HOME).rglob(".*"))
 

@@ -23,7 +23,6 @@ from .latent_fit import ON_SKIN, LatentFit, PersonConfig
 
 __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
-SETTLING = 4                         # times at most that markers are hung on their nearest triangles at the end
 HAND_WIDTH = 0.08                    # metres: a marker that is moved farther is to be looked at
 
 
@@ -155,13 +154,6 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
         state, steps = state.moved(rows), steps + taken
         tell(len(chosen) + i + 1, total)
-    # triangles that markers have slid off would leave them where rounding had put them
-    for again in range(SETTLING):
-        hung = fit.hung_anew(state, False, True)
-        if np.array_equal(hung.markers.corners, state.markers.corners):
-            break
-        rows, converged, taken = step(f"person, settling {again}", given, partial(fit.solve, hung, 1.0, True))
-        state, steps = hung.moved(rows), steps + taken
 
     ends, (pose, trans) = np.cumsum([len(each) for each in positions]), fit.split(state.x)
     which = np.searchsorted(ends, chosen, side="right")
