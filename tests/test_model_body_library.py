@@ -58,7 +58,7 @@ def test_what_is_blend_skinning_in_the_library_is_the_same_here(name, library, t
     body, model = Library(found), as_ours(found, name)
     assert np.abs(model.correctives).max(initial=0) == 0
     assert distances(body, model, 0.5, 0.0).max() < 1e-6
-    assert distances(body, model, 0.0, 0.08).max() < 2e-4          # shapes of SOMA-X turn its bones
+    assert distances(body, model, 0.0, 0.1).max() < 2e-4          # shapes of SOMA-X turn its bones
 
 
 def test_correctives_and_shapes_come_near_the_library(both):

@@ -195,6 +195,7 @@ def test_energies_of_true_images_are_zero_and_mirrors_cost():
 
 def test_a_cloud_without_normals_gets_them_outward(kicking):
     rng = np.random.default_rng(0)
+    # 1.2 cm apart: of 9,000, which are 1.5 cm apart, 3% came out inward, most of them on hands
     points, _, _ = kicking.sample(15000, rng)
     sheet = Sheet(target_of(points), 0.02)
     near = Surface(kicking).closest(sheet.points)

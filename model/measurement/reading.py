@@ -251,24 +251,18 @@ def _until(girth: Girth, way: Curve, body: Standing) -> tuple[float, np.ndarray,
     before = way.edges[k, int(way.share[k] > 0.5)]                        # a vertex, as points of ways slide
     ahead = points[0] - body.vertices[before]
     reach, rise, lack = float(np.linalg.norm(ahead)), ahead @ normal, (origin - points[0]) @ normal
+    by_ahead = lack * (ahead / (reach * rise) - reach / rise**2 * normal)
+    ids, force = _plane_pull(girth, np.array([reach / rise]), (points[0] - origin)[None], normal, body.vertices)
     beyond = int(((points - origin) @ normal * np.sign(rise) < 0).argmax())      # so many points lie behind the plane
-    if not beyond:
-        by_ahead = lack * (ahead / (reach * rise) - reach / rise**2 * normal)
-        ids, force = _plane_pull(girth, np.array([reach / rise]), (points[0] - origin)[None], normal, body.vertices)
-        return (lack / rise * reach, np.vstack([points[0] + lack / rise * ahead, points]),
-                (np.r_[last, before, ids], np.vstack([by_ahead - reach / rise * normal, -by_ahead, force])))
-    # the way crosses the plane and ends there: what lies behind is taken off
-    step = points[beyond] - points[beyond - 1]
-    t = (origin - points[beyond - 1]) @ normal / (step @ normal)
-    crossing = points[beyond - 1] + t * step
-    length, pull = chain_length(np.vstack([points[:beyond], crossing]))
-    out = pull[-1] @ step / (step @ normal)
-    at_crossing = pull[-1] - out * normal
-    pull[-2:] = [pull[-2] + (1 - t) * at_crossing, t * at_crossing]              # of the points beside it
-    edges, share = way.edges[:beyond + 1], way.share[:beyond + 1, None]
-    ids, force = _plane_pull(girth, np.array([out]), (crossing - origin)[None], normal, body.vertices)
-    return (-length, np.vstack([crossing, points[beyond:]]),
-            (np.r_[edges[:, 0], edges[:, 1], ids], -np.vstack([(1 - share) * pull, share * pull, force])))
+    if beyond:
+        # the way crosses the plane: it ends there
+        step = points[beyond] - points[beyond - 1]
+        crossing = points[beyond - 1] + (origin - points[beyond - 1]) @ normal / (step @ normal) * step
+        more = -float(np.linalg.norm(np.diff(np.vstack([points[:beyond], crossing]), axis=0), axis=1).sum())
+    else:
+        crossing, more = points[0] + lack / rise * ahead, lack / rise * reach
+    return (more, np.vstack([crossing, points[beyond:]]),
+            (np.r_[last, before, ids], np.vstack([by_ahead - reach / rise * normal, -by_ahead, force])))
 
 
 @read.register
