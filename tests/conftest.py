@@ -3,6 +3,7 @@
 Files of tests run side by side, one process for each core.
 """
 import os
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 
 if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not take each other's cores
+    # whoever was loaded before keeps all cores, and then sums otherwise than the commands that the tests start
+    assert "numpy" not in sys.modules, "a plugin of pytest loads numpy: switch it off in pyproject.toml, as the others"
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.cpu_count = lambda: 1
     os.sched_getaffinity = lambda pid: {0}
