@@ -15,8 +15,8 @@ from .population import MIRROR_PART, PARENTS, PARTS, population
 __all__ = ["MIRROR_PART", "PARENTS", "PARTS", "Anatomy", "BodyShape"]
 
 Sex = Literal["female", "male"]
-# of arms from the vertical, of forearms further ahead, of legs sideways, of feet from straight ahead
-ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, TOE_OUT = np.radians([36.0, 14.0, 4.5, 9.0])
+# of arms from the vertical, of forearms further ahead, of legs sideways and to behind, of feet from straight ahead
+ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, LEG_LEAN, TOE_OUT = np.radians([36.0, 14.0, 6.5, 3.2, 9.0])
 RAREST = 3.0                         # standard deviations: rarer people are so small or odd that results are doubted
 AVERAGE_STATURE = 1.75               # metres: lengths in tables of muscles and poses are those of somebody this tall
 
@@ -95,13 +95,15 @@ class Anatomy:
         def put(side: float, front: float, up: float) -> np.ndarray:
             return np.array([side, -front, up])
 
-        a, b, c, t = ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, TOE_OUT
+        a, b, c, lean, t = ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, LEG_LEAN, TOE_OUT
         down = put(np.sin(a), 0, -np.cos(a))
         out = put(np.cos(a), 0, np.sin(a))
         ahead = put(0, 1, 0)
         self.upper_arm_frame = np.array([out, ahead, down])
         self.forearm_frame = np.array([out, np.cos(b) * ahead - np.sin(b) * down, np.cos(b) * down + np.sin(b) * ahead])
-        self.leg_frame = np.array([put(np.cos(c), 0, np.sin(c)), ahead, put(np.sin(c), 0, -np.cos(c))])
+        leg = put(np.sin(c), 0, -np.cos(c))
+        self.leg_frame = np.array([put(np.cos(c), 0, np.sin(c)), np.cos(lean) * ahead + np.sin(lean) * leg,
+                                   np.cos(lean) * leg - np.sin(lean) * ahead])
         self.foot_frame = np.array([put(np.cos(t), -np.sin(t), 0), put(0, 0, 1), put(np.sin(t), np.cos(t), 0)])
         # exactly, where stored places are rounded; the axis of a foot is level: it rolls about that, not the instep
         for first, frame in ((4, self.upper_arm_frame), (5, self.forearm_frame), (10, self.leg_frame),

@@ -84,7 +84,7 @@ def blending() -> tuple[np.ndarray, np.ndarray]:
     share /= share.sum(axis=1, keepdims=True)
     a, b = mesh.edges.T
     # over how many metres (N,) the motion of one part passes into that of the next
-    wide = {1: 0.075, 2: 0.075, 3: 0.040, 4: 0.052, 5: 0.030, 6: 0.020, 10: 0.060, 11: 0.034, 12: 0.020}
+    wide = {1: 0.075, 2: 0.075, 3: 0.040, 4: 0.052, 5: 0.030, 6: 0.020, 10: 0.080, 11: 0.034, 12: 0.020}
     v = np.abs(template.mesh.vertices * [1, 0, 0]) + template.mesh.vertices * [0, 1, 1]
     d = np.stack([np.linalg.norm(v - template.anatomy.joints[j], axis=1) for j in wide], axis=1)
     near = np.exp(-0.5 * ((d - d.min(axis=1, keepdims=True)) / 0.04)**2)

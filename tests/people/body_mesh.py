@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from makehuman import MakeHuman
@@ -18,9 +20,10 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from scanprep.geometry import rotations
-from scanprep.synthetic.anatomy import PARENTS, PARTS
+from scanprep.synthetic.anatomy import ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, LEG_LEAN, PARENTS, PARTS, TOE_OUT
 
 BULGE = 0.0025                       # metres that an eye stands before the rims of its lids
+LIP = 0.05                           # decimetres along the rims of the lips that move alike
 CAVITIES = ("mouth_cavity", "eye_cavity.L", "eye_cavity.R")
 JOINTS = ("", "spine-4", "spine-2", "neck", "{}-shoulder", "{}-elbow", "{}-hand", "{}-upper-leg", "{}-knee", "{}-ankle")
 BONES = {                            # how names of bones of the default rig begin: our part
@@ -28,8 +31,11 @@ BONES = {                            # how names of bones of the default rig beg
     "clavicle": "chest", "shoulder": "chest", "upperarm": "upper_arm_", "lowerarm": "forearm_", "wrist": "hand_",
     "metacarpal": "hand_", "finger": "hand_", "upperleg": "thigh_", "lowerleg": "shin_", "foot": "foot_",
     "toe": "foot_", "root": "pelvis", "pelvis": "pelvis"}
-# degrees from the vertical at rest: arms sideways, forearms further ahead, legs sideways; of feet from straight ahead
-ARM, ELBOW, LEG, TOES = np.radians([36.0, 14.0, 4.5, 9.0])
+# Hip joints of MakeHuman lie 12 cm behind the iliac spines. People have them 0.24 of the depth of the pelvis and 1 cm
+# behind, 0.3 of its width and 1 cm below (Harrington 2007), a little ahead of the trochanter: this share of the way to
+# the skin of the groin, in front of them.
+HIP = 0.35
+GROINS = json.loads(Path(__file__).with_name("places.json").read_text(encoding="utf-8"))["groins"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +70,7 @@ def body_mesh(source: MakeHuman) -> BodyMesh:
     left = base[quads].mean(axis=1)[:, 0] > 0
     twin = _twins(base[:source.count])
     rows: list[dict[int, float]] = [{v: 1.0} for v in range(source.count)]
-    lift = dict[int, float]()
+    lift, lips = dict[int, float](), dict[int, np.ndarray]()
     faces = [quads[(cavity < 0) & left][:, corners] for corners in ([0, 1, 2], [0, 2, 3])]
     for number, name in enumerate(CAVITIES):
         if name.endswith(".R"):
@@ -76,6 +82,13 @@ def body_mesh(source: MakeHuman) -> BodyMesh:
             middle = np.flatnonzero(np.abs(base[rim, 0]) < 1e-6)
             first, second = rim[:middle[0] + 1], np.r_[rim[0], rim[middle[1]:][::-1]]
             faces.append(_zip(first, second, base))
+            # both lips go along with the mean of what is near on their rims: where they went each for itself, closed
+            # mouths turned inside out
+            for v in rim:
+                share = np.exp(-0.5 * (np.linalg.norm(base[rim] - base[v], axis=1) / LIP)**2)
+                share /= share.sum()
+                rows[v] = {int(u): float(w) for u, w in zip(rim, share, strict=True)}
+                lips[int(v)] = base[v] - share @ base[rim]
             continue
         far = int(base[rim, 0].argmin())
         first, second = rim[:far + 1], np.r_[rim[0], rim[far:][::-1]]
@@ -111,6 +124,8 @@ def body_mesh(source: MakeHuman) -> BodyMesh:
                           np.array([v for row in places for v in row]))), shape=(len(places), len(base)))
     shift = np.zeros((len(places), 3))
     shift[:len(used), 1] = [-lift.get(int(v), 0.0) for v in used]
+    for v, (x, y, z) in lips.items():
+        shift[number[v]] = [0.1 * x, -0.1 * z, 0.1 * y]
     weights = combine[:len(used)] @ _part_weights(source)
     return BodyMesh(number[whole], combine, shift, weights / weights.sum(axis=1, keepdims=True), number[twin[used]],
                     {int(v): i for i, v in enumerate(used) if v < source.count})
@@ -138,13 +153,13 @@ def _direction(part: int) -> np.ndarray:
     """(3,) where a limb's bone points at rest."""
     kind, side = PARTS[part].rsplit("_", 1)
     if kind == "foot":
-        way = np.array([np.sin(TOES), -np.cos(TOES), 0])
+        way = np.array([np.sin(TOE_OUT), -np.cos(TOE_OUT), 0])
     elif kind in ("thigh", "shin"):
-        way = np.array([np.sin(LEG), 0, -np.cos(LEG)])
+        way = np.array([np.sin(LEG_ANGLE), np.tan(LEG_LEAN), -np.cos(LEG_ANGLE)])
     else:
-        way = np.array([np.sin(ARM), 0, -np.cos(ARM)])
+        way = np.array([np.sin(ARM_ANGLE), 0, -np.cos(ARM_ANGLE)])
         if kind != "upper_arm":
-            way = np.cos(ELBOW) * way + np.sin(ELBOW) * np.array([0, -1.0, 0])
+            way = np.cos(ELBOW_ANGLE) * way + np.sin(ELBOW_ANGLE) * np.array([0, -1.0, 0])
     return way * ([1, 1, 1] if side == "left" else [-1, 1, 1])
 
 
@@ -167,8 +182,14 @@ def _joint_rows(source: MakeHuman) -> list[dict[int, float]]:
                 row[int(v)] = row.get(int(v), 0) + 1 / len(ids) / len(names)
         return row
 
-    limb = {side: [mean(name.format(side)) for name in JOINTS[4:]] for side in "lr"}
-    trunk = [mean("l-upper-leg", "r-upper-leg"), *(mean(name) for name in JOINTS[1:4])]
+    def hip(side: str) -> dict[int, float]:
+        row = {v: (1 - HIP) * weight for v, weight in mean(f"{side}-upper-leg").items()}
+        return row | {GROINS[side]: HIP + row.get(GROINS[side], 0)}
+
+    limb = {side: [mean(name.format(side)) if "upper-leg" not in name else hip(side) for name in JOINTS[4:]]
+            for side in "lr"}
+    hips = [(v, 0.5 * weight) for side in "lr" for v, weight in hip(side).items()]
+    trunk = [dict(hips), *(mean(name) for name in JOINTS[1:4])]
     joints = trunk + limb["l"][:3] + limb["r"][:3] + limb["l"][3:] + limb["r"][3:]
     tips = {side: (mean(f"{side}-finger-3-4"), mean(f"{side}-foot-1")) for side in "lr"}
     ends = [*joints[1:4], mean("head-2")]

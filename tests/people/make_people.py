@@ -8,9 +8,10 @@
 2. How people of a sex differ: of all Gaussian distributions of sliders that give the survey's covariance of measures,
    the one nearest to a loose prior (least Kullback-Leibler divergence, in closed form where measures are linear).
 3. Bodies are drawn from both, brought into the standard pose, and their principal components are the shapes. Axes
-   are turned so that the first beta is stature, the second weight, the third from woman to man.
-4. A Gaussian of betas for each sex, corrected once more so that the measures of bodies meet the survey; betas then have
-   mean 0 and variance 1 over both.
+   are turned so that the first beta is stature, the second weight, the third from woman to man. Skin that would run
+   through itself is moved apart (`contact`).
+4. A Gaussian of betas for each sex, corrected so that the measures of bodies meet the survey: first those that are
+   linear in the betas, then those of bodies drawn; betas then have mean 0 and variance 1 over both.
 
 Nothing is drawn at random but from a fixed seed, so the same wheel and table give the same file.
 """
@@ -24,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from body_mesh import BodyMesh, body_mesh, stand
+from contact import keep_apart, whitened
 from makehuman import MakeHuman
 
 from model.measurement.find import find_tapes
@@ -41,6 +43,7 @@ SIDED = {"thigh_girth", "calf_girth", "wrist_girth", "arm_length", "hand_length"
 # chests while breathing quietly and the middle of the kneecap, which bodies that stand apart do not show.
 TOLERANCE = {"hip_width": 0.35, "chest_depth": 0.15, "knee_height": 0.15}
 CLOSE = 0.2                          # the same of betas
+DRAWN = 80                           # people, whose measures are taken
 MACRO_SD, LOCAL_SD = 0.25, 0.17      # prior of sliders; looser ones make barrels and waists like wasps
 LIMITS = ((-0.65, 0.95), (-1.2, 1.2))          # of macro and of local sliders from their middle
 # local sliders: pairs of targets for less and for more, those of left and right together
@@ -245,22 +248,31 @@ def standardise(mean: np.ndarray, directions: np.ndarray, moments: dict[str, tup
         sex: (back @ (m - middle), back @ S @ back.T) for sex, (m, S) in moments.items()}
 
 
-def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, betas: np.ndarray, table: Survey
-                ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (k,) and covariance (k, k) of the betas of a sex, corrected so that measures meet the survey."""
+def sex_moments(bodies: Bodies, mean: np.ndarray, directions: np.ndarray, m: np.ndarray, S: np.ndarray, table: Survey,
+                drawn: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Mean m (k,) and covariance S (k, k) of the betas of a sex, corrected so that measures meet the survey.
+
+    Measures are taken as linear in the betas, or, of so many `drawn` people, as they are: tapes span hollows, so their
+    mean is not that of the mean person.
+    """
     kept = [i for i, name in enumerate(table.names) if name != "age"]
     goal, C, sd = table.mean[kept], covariance(table)[np.ix_(kept, kept)], table.sd[kept]
     # Bodies hardly vary in some combinations of measures, as of neck and shoulder height. Where these are to be met
     # more closely, or more often, the average woman gets knees like barrels.
     near = sd * [max(TOLERANCE.get(table.names[i], 0), CLOSE) for i in kept]
-    m, S = betas.mean(axis=0), np.cov(betas.T)
+    Z = whitened(np.random.default_rng(2), drawn, len(m)) if drawn else np.zeros((0, len(m)))
     for _ in range(3):
         values, J = bodies.measures(mean + np.tensordot(m, directions, 1), directions)
         assert J is not None
         values, J = values[kept], J[kept]
-        M = J @ S @ J.T
-        m = m + S @ J.T @ np.linalg.solve(M + np.diag(near**2), goal - values)
-        K = S @ J.T @ np.linalg.inv(M + np.diag((CLOSE * sd)**2))
+        M = linear = J @ S @ J.T
+        if drawn:
+            people = m + Z @ np.linalg.cholesky(S).T
+            found = np.array([bodies.measures(mean + np.tensordot(b, directions, 1))[0][kept] for b in people])
+            found = found[np.isfinite(found).all(axis=1)]
+            values, M = found.mean(axis=0), np.cov(found.T, bias=True)
+        m = m + S @ J.T @ np.linalg.solve(linear + np.diag(near**2), goal - values)
+        K = S @ J.T @ np.linalg.inv(linear + np.diag((CLOSE * sd)**2))
         S = S + K @ (C - M) @ K.T
         S = (S + S.T) / 2
     return m, S
@@ -298,8 +310,13 @@ def make(wheel: Path, table: Path, count: int, people: int, say: Callable[[str],
     all_rows = np.array(rows)
     bodies.tapes = find_tapes(Mesh(all_rows.mean(axis=0)[:mesh.count], mesh.faces), bodies.places)
     mean, directions, betas = shape_space(all_rows, male, count, slopes)
-    moments = {sex: sex_moments(bodies, mean, directions, betas[chosen], surveys[sex])
-               for sex, chosen in (("female", ~male), ("male", male))}
+    moments = {sex: sex_moments(bodies, mean, directions, betas[chosen].mean(axis=0), np.cov(betas[chosen].T),
+                                surveys[sex]) for sex, chosen in (("female", ~male), ("male", male))}
+    n = mesh.count
+    mean[:n], directions[:, :n] = keep_apart(mean[:n], directions[:, :n], mesh.faces, mesh.mirror,
+                                             list(moments.values()))
+    say("skin kept apart")
+    moments = {sex: sex_moments(bodies, mean, directions, m, S, surveys[sex], DRAWN) for sex, (m, S) in moments.items()}
     mean, directions, moments = standardise(mean, directions, moments, slopes)
     scale = np.abs(directions).max(axis=(1, 2)) / 32767
     out = {"mean": mean.astype(np.float32), "faces": mesh.faces.astype(np.uint16),
@@ -317,7 +334,8 @@ def make(wheel: Path, table: Path, count: int, people: int, say: Callable[[str],
 
 def recipe_digest(table: Path) -> str:
     """A digest of the recipe: this program, its parts, the places and the table."""
-    files = [HERE / name for name in ("makehuman.py", "body_mesh.py", "make_people.py", "places.json")] + [table]
+    files = [HERE / name for name in ("makehuman.py", "body_mesh.py", "contact.py", "make_people.py",
+                                     "places.json")] + [table]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
 
 
