@@ -15,7 +15,7 @@ from completion.mocap.joint_angles import JointAngles, anatomy, angles_of, decom
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp, log
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.anatomy import PARENTS, PARTS, Anatomy, BodyShape
+from scanprep.synthetic.anatomy import LEG_ANGLE, LEG_LEAN, PARENTS, PARTS, Anatomy, BodyShape
 
 __all__ = ["original"]
 JOINTS = Anatomy(BodyShape()).joints                    # z is up, the face looks along -y, the left side is +x
@@ -41,6 +41,9 @@ def posed(part, rotation):
 
 
 def axes(segment, column):
+    if segment.startswith("hip"):      # its second axis is across that which flexes, the pelvis', and the thigh's own
+        floating = np.cross(axes(segment.replace("hip", "thigh"), 1), axes("pelvis", 2))
+        return floating / np.linalg.norm(floating)
     return BODY.frames[segment][:, column]
 
 
@@ -53,7 +56,9 @@ def test_axes_of_the_body_at_rest():
         hip, knee = (JOINTS[PARTS.index(f"{part}_{name}")] for part in ("thigh", "shin"))
         np.testing.assert_allclose(axes(f"thigh_{side}", 1), (hip - knee) / np.linalg.norm(hip - knee), err_msg=name)
     rest = angles(np.tile(np.eye(3), (1, 16, 1, 1)))
-    assert rest["hip_adduction_r"] == pytest.approx(-4.5) and rest["hip_flexion_l"] == pytest.approx(0, abs=1e-9)
+    aside, ahead, down = np.cos(LEG_LEAN) * np.sin(LEG_ANGLE), -np.sin(LEG_LEAN), np.cos(LEG_LEAN) * np.cos(LEG_ANGLE)
+    assert rest["hip_adduction_r"] == pytest.approx(-np.degrees(np.arcsin(aside)))
+    assert rest["hip_flexion_l"] == pytest.approx(np.degrees(np.arctan2(ahead, down)))
     assert rest["shoulder_elevation_l"] == pytest.approx(36) and rest["shoulder_plane_r"] == pytest.approx(0, abs=1e-6)
     assert rest["elbow_flex_r"] == pytest.approx(14) and rest["forearm_pronation_l"] == pytest.approx(90)
     for joint in ("pelvis_tilt", "lumbar_extension", "neck_rotation", "knee_angle_r", "wrist_flex_l"):
@@ -63,7 +68,7 @@ def test_axes_of_the_body_at_rest():
 # What turns which angle up, on the right side: the part, the segment whose axis it is at rest, the axis and its sign.
 # A flexed hip carries the knee ahead, and so on; about right, ahead and up of the other side the last two turn back.
 SIDED = [("hip_flexion", "thigh", "pelvis", 2, 1), ("hip_rotation", "thigh", "thigh", 1, 1),
-         ("hip_adduction", "thigh", "pelvis", 0, 1), ("knee_angle", "shin", "thigh", 2, -1),
+         ("hip_adduction", "thigh", "hip", 0, 1), ("knee_angle", "shin", "thigh", 2, -1),
          ("knee_rotation", "shin", "shank", 1, 1), ("ankle_angle", "foot", "shank", 2, 1),
          ("arm_flex", "upper_arm", "trunk", 2, 1), ("arm_rot", "upper_arm", "humerus", 1, 1),
          ("shoulder_rotation", "upper_arm", "humerus", 1, 1), ("shoulder_elevation", "upper_arm", "trunk", 0, -1),

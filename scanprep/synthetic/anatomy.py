@@ -16,7 +16,7 @@ __all__ = ["MIRROR_PART", "PARENTS", "PARTS", "Anatomy", "BodyShape"]
 
 Sex = Literal["female", "male"]
 # of arms from the vertical, of forearms further ahead, of legs sideways and to behind, of feet from straight ahead
-ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, LEG_LEAN, TOE_OUT = np.radians([36.0, 14.0, 6.5, 3.2, 9.0])
+ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, LEG_LEAN, TOE_OUT = np.radians([36.0, 14.0, 6.0, 2.3, 9.0])
 RAREST = 3.0                         # standard deviations: rarer people are so small or odd that results are doubted
 AVERAGE_STATURE = 1.75               # metres: lengths in tables of muscles and poses are those of somebody this tall
 

@@ -34,7 +34,7 @@ BONES = {                            # how names of bones of the default rig beg
 # Hip joints of MakeHuman lie 12 cm behind the iliac spines. People have them 0.24 of the depth of the pelvis and 1 cm
 # behind, 0.3 of its width and 1 cm below (Harrington 2007), a little ahead of the trochanter: this share of the way to
 # the skin of the groin, in front of them.
-HIP = 0.35
+HIP = 0.25
 GROINS = json.loads(Path(__file__).with_name("places.json").read_text(encoding="utf-8"))["groins"]
 
 
