@@ -77,7 +77,8 @@ def other(person):
     """A template with feet that are as much unlike the person's as those of synthetic and real men: 6 to 8 mm."""
     x = person.mesh.vertices
     low, side = np.clip(1 - x[:, 2] / 0.12, 0, 1), np.sign(x[:, 0])
-    narrow = np.c_[-0.6 * (x[:, 0] - 0.13 * side), 0 * x[:, 0], 0.8 * x[:, 2]]
+    middle = np.abs(x[low > 0, 0]).mean()
+    narrow = np.c_[-0.6 * (x[:, 0] - middle * side), 0 * x[:, 0], 0.8 * x[:, 2]]
     return person.mesh.with_vertices(x + low[:, None] * narrow)
 
 

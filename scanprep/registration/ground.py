@@ -17,7 +17,7 @@ from ..geometry.target import orient, target_of
 from ..judgement import size
 from ..skeleton.roles import above, limb_parts
 from ..skeleton.tree import Skeleton
-from .folds import inverted_triangles
+from .folds import inverted_triangles, without_inverted
 from .limb_ends import bending
 from .matches import NORMALS, tukey
 from .nonrigid import Registration
@@ -66,8 +66,9 @@ def with_soles(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts
     found = grounded(template, fit.mesh, foot_of_vertex(template, parts.skeleton), target.points, target.normals)
     if found is None:
         return fit
-    return replace(fit, mesh=template.with_vertices(found.vertices), soles=found.beyond,
-                   inverted=int(inverted_triangles(template, found.vertices).sum()))
+    vertices = without_inverted(template, found.vertices)          # narrow ones at rims of soles may turn over
+    return replace(fit, mesh=template.with_vertices(vertices), soles=found.beyond,
+                   inverted=int(inverted_triangles(template, vertices).sum()))
 
 
 def soles_row(beyond: tuple[float, float] | None) -> list[Metric]:
