@@ -7,13 +7,13 @@ import pytest
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 from scanprep.registration import person as person_module
-from scanprep.registration.deformation_graph import build_graph, deform
+from scanprep.registration.deformation_graph import build_graph, deform, motion_of
 from scanprep.registration.graph_fit import start_fit
 from scanprep.registration.limbs import beyond_people, exchanged_sides, frames, joint_angles, limb_doubts
 from scanprep.registration.matches import prepare
 from scanprep.registration.nonrigid import Registration, measure_fit
 from scanprep.registration.person import PersonParts, average_person, person_parts
-from scanprep.registration.repair import better, motion_of, repaired, rolled
+from scanprep.registration.repair import better, repaired, rolled
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.tree import Skeleton

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from ..geometry import rotations
 from ..geometry.farthest_points import farthest_points
 from ..geometry.mesh import Mesh
+from ..geometry.sparse import gatherer, sum_groups
 from ..geometry.surface import Rays
 
 
@@ -161,3 +162,14 @@ def refine_motion(old: DeformationGraph, motion: NodeMotion, new: DeformationGra
     w, carriers = old.weights[at], old.carriers[at]
     R = rotations.project(np.einsum("mk,mkij->mij", w, motion.R[carriers]))
     return NodeMotion(R, np.einsum("mk,mk->m", w, motion.log_scale[carriers]), deform(old, motion)[at])
+
+
+def motion_of(graph: DeformationGraph, x: np.ndarray) -> NodeMotion:
+    """The motion of the nodes that takes the template to vertices (N, 3), metres: what best carries their links."""
+    i, j = graph.edges.T
+    at = x[graph.node_vertices]
+    now, rest = at[j] - at[i], graph.edge_vectors
+    gather = gatherer(i, len(at))
+    R = rotations.project(sum_groups(gather, np.einsum("ei,ej->eij", now, rest)))
+    grown = gather @ (now**2).sum(axis=1) / (gather @ (rest**2).sum(axis=1))
+    return NodeMotion(R, 0.5 * np.log(grown), at)

@@ -17,7 +17,7 @@ from ..geometry.farthest_points import thin
 from ..geometry.least_squares import Sparse, levenberg_marquardt
 from ..geometry.mesh import Mesh
 from ..geometry.target import orient
-from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, refine_motion
+from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, motion_of, refine_motion
 from .graph_energy import UNKNOWNS, node_pattern, terms
 from .limb_ends import End, RigidFit, bending, find_ends, rotate_ends
 from .matches import NORMALS, Fit, Inputs, Pull, landmark_pull, pull, pull_of_stage
@@ -63,12 +63,22 @@ class GraphFit(Fit):
                        iterations=self.iterations + found.iterations)
 
 
-def register_graph(inputs: Inputs, T: np.ndarray, config: RegistrationConfig, progress: Callable[[int, int], None]
-                   ) -> GraphFit:
-    """The template bent onto the scan by all stages of the schedule; see `Method`."""
-    stages = [stage for stage in config.graph if stage.positions == 1 or inputs.descriptors is not None]
-    fit = start_fit(inputs.template, T, stages[0].nodes if stages else 300)
+def register_graph(inputs: Inputs, start: np.ndarray, config: RegistrationConfig,
+                   progress: Callable[[int, int], None]) -> GraphFit:
+    """The template bent onto the scan by the stages of the schedule, from vertices by those near; see `Method`."""
+    near = start.shape == inputs.template.vertices.shape
+    stages = config.near if near else [
+        stage for stage in config.graph if stage.positions == 1 or inputs.descriptors is not None]
+    nodes = stages[0].nodes if stages else 300
+    fit = posed_fit(inputs.template, start, nodes) if near else start_fit(inputs.template, start, nodes)
     return fit_stages(inputs, fit, stages, progress)
+
+
+def posed_fit(template: Mesh, vertices: np.ndarray, nodes: int) -> GraphFit:
+    """The template where nodes carry it nearest to vertices (N, 3), on a graph of so many nodes."""
+    graph = build_graph(template, nodes)
+    motion = motion_of(graph, vertices)
+    return GraphFit(deform(graph, motion), graph=graph, motion=motion)
 
 
 def start_fit(template: Mesh, T: np.ndarray, nodes: int) -> GraphFit:

@@ -56,11 +56,11 @@ class Registration:
 class Method(Protocol):
     """A way to bring a template near a scan, of which `METHODS` holds those that can be chosen by name.
 
-    It takes the inputs, the rigid transform (4, 4) to begin with, the settings and a callback for (done, total), and
-    says where the template came to lie. The checks before, the last pass and the figures after are the same for all.
+    It takes the inputs, the rigid transform (4, 4) or the vertices (N, 3) to begin with, the settings and a callback for
+    (done, total), and says where the template came to lie. The checks before, the last pass and the figures after are the same for all.
     """
 
-    def __call__(self, inputs: Inputs, T: np.ndarray, config: RegistrationConfig,
+    def __call__(self, inputs: Inputs, start: np.ndarray, config: RegistrationConfig,
                  progress: Callable[[int, int], None]) -> Fit: ...
 
 
@@ -127,9 +127,10 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         Called as progress(done, total).
     correspondences : Correspondences, optional
         Hints, some of which may be wrong: they draw softly, and less the farther they are from all others.
-    start : (4, 4) float, optional
+    start : (4, 4) or (N, 3) float, optional
         The similarity that brings the template near the scan, where it is known: else landmarks tell, or the whole is
-        aligned, which a scan of a part leads astray.
+        aligned, which a scan of a part leads astray. Or where its vertices are nearly, metres, as a model finds them:
+        then only the last stages are needed, which match by place.
 
     Returns
     -------
@@ -146,12 +147,21 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {config.method!r}")
     # what is known of both, and how every point is told from others: by place, normal, and paths to landmarks
     inputs = prepare(template, scan, landmarks, correspondences)
-    T = initial_transform(inputs) if start is None else start
+    begin = initial_transform(inputs) if start is None else _checked_start(template, start)
     # near the scan, from stiff to soft; then onto it, below its noise
-    fit = METHODS[config.method](inputs, T, config, lambda done, total: tell(90 * done // total, 100))
+    fit = METHODS[config.method](inputs, begin, config, lambda done, total: tell(90 * done // total, 100))
     fit = fit_surface(inputs, fit, config)
     tell(100, 100)
     return measure_fit(inputs, fit, scan)
+
+
+def _checked_start(template: Mesh, start: np.ndarray) -> np.ndarray:
+    """A transform (4, 4) or vertices (N, 3) to begin with; ValueError for anything else."""
+    found = np.asarray(start, dtype=np.float64)
+    if found.shape not in ((4, 4), template.vertices.shape) or not np.isfinite(found).all():
+        raise ValueError(f"start: expected a finite transform (4, 4) or vertices {template.vertices.shape}, "
+                         f"got {found.shape}")
+    return found
 
 
 def fit_surface(inputs: Inputs, fit: Fit, config: RegistrationConfig) -> Fit:

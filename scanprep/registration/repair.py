@@ -14,10 +14,9 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from ..correspondence.correspondences import Correspondences
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
-from ..geometry.sparse import gatherer, sum_groups
 from ..judgement import size
 from ..threads import one_thread
-from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform
+from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, motion_of
 from .graph_fit import GraphFit, fit_stages
 from .limbs import Doubt, frames, limb_doubts
 from .matches import Landmarks, prepare
@@ -53,7 +52,7 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     Registration
     """
     config = config or RegistrationConfig()
-    stages = [stage for stage in config.graph if stage.positions == 1 and not stage.paths and stage.reach]
+    stages = config.near
     x = fit.mesh.vertices
     if parts is None or not config.rolls or not stages:
         return fit
@@ -105,17 +104,6 @@ def strain(template: Mesh, registered: Mesh) -> float:
     """The root mean square over the area of the logarithm of stretches."""
     logs = np.log(np.maximum(principal_stretches(template, registered), 1e-3))
     return float(np.sqrt(np.average((logs**2).mean(axis=0), weights=template.face_areas)))
-
-
-def motion_of(graph: DeformationGraph, x: np.ndarray) -> NodeMotion:
-    """The motion of the nodes that takes the template to vertices (N, 3), metres: what best carries their links."""
-    i, j = graph.edges.T
-    at = x[graph.node_vertices]
-    now, rest = at[j] - at[i], graph.edge_vectors
-    gather = gatherer(i, len(at))
-    R = rotations.project(sum_groups(gather, np.einsum("ei,ej->eij", now, rest)))
-    grown = gather @ (now**2).sum(axis=1) / (gather @ (rest**2).sum(axis=1))
-    return NodeMotion(R, 0.5 * np.log(grown), at)
 
 
 def rolled(graph: DeformationGraph, motion: NodeMotion, template: Mesh, parts: PersonParts, x: np.ndarray,

@@ -154,6 +154,11 @@ class RegistrationConfig(Settings):
     final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
     method: str = "graph"
 
+    @property
+    def near(self) -> list[GraphStage]:
+        """The stages that match by place alone, and need the template near the scan."""
+        return [stage for stage in self.graph if stage.positions == 1 and not stage.paths and stage.reach]
+
     @classmethod
     def quick(cls) -> RegistrationConfig:
         """Without the last steps: a third of the time, 7 mm from true landmarks instead of 6."""
