@@ -265,6 +265,7 @@ def soma_folder(folder: Path, seed: int = 1, plain: bool = False) -> Path:
         "segment_alignment_rotations": np.stack(align)}
     shapes = np.zeros((128, N, 3))
     shapes[:10] = 100 * np.moveaxis(a["shapedirs"], -1, 0)
+    shapes[:10] *= 3 / np.sqrt((shapes[:10]**2).sum(axis=2).mean(axis=1).max())          # the largest by 3 cm
     shapes[10:40] = bump(100 * bones.x, 100 * bones.places[9], rng, 30, 0.3, 30)
     sizes = np.linalg.norm(shapes.reshape(128, -1), axis=1)
     folder.mkdir(parents=True)

@@ -128,7 +128,7 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     Path("scans").mkdir()
     for name in ("ten", "good"):
         Path(f"{name}.ply").rename(f"scans/{name}.ply")
-    command = "prep run scans --template template.ply -o set --init pose --workers 1 --config quick_set.toml"
+    command = "prep run scans --template template.ply -o set --through pose --workers 1 --config quick_set.toml"
     assert main(command.split()) == 1
     assert "ten.ply: the template is not on it" in capsys.readouterr().err
     assert "ten" not in Path("set/registration.csv").read_text()

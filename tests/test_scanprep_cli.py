@@ -135,7 +135,7 @@ def test_no_landmarks_wanted(place, tmp_path, capsys, quick):
     words = ["run", scans, "--template", tmp_path / "bare.ply", "-o", tmp_path / "set", "--config", quick]
     assert run(*words) == 1
     assert "expected its landmarks in bare.landmarks.json" in capsys.readouterr().err
-    assert run(*words, "--init", "pose") == 0
+    assert run(*words, "--through", "pose") == 0
     assert report(tmp_path / "set" / "report.json")["led by pose"] == 1
 
 
@@ -268,7 +268,7 @@ def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     assert "at least three limbs" in capsys.readouterr().err
     few = read_mesh(scan).vertices[::90]
     write_correspondences(tmp_path / "few.json", Correspondences(np.arange(642)[::90], few, np.ones(len(few))))
-    assert run("register", scan, "--template", place / "template.ply", "--correspondences", tmp_path / "few.json",
+    assert run("register", scan, "--template", place / "template.ply", "--through", tmp_path / "few.json",
                "-o", tmp_path / "registered.ply") == 0
     assert report(tmp_path / "registered.ply.report.json")["vertices with data"] > 95
 

@@ -192,14 +192,12 @@ def test_a_scan_in_another_unit_is_refused_at_once(scans, template, tmp_path):
 
 def test_what_leads_the_template(scans, template, tmp_path):
     (scans / "body0.landmarks.json").unlink()
-    settings = {init: dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, init=init))
-                for init in ("landmarks", "pose")}
+    pose = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, through="pose"))
     tasks = find_scans(scans)[:2]
-    asked = prepare(tasks, template, MARKS, tmp_path / "asked", settings["landmarks"])
-    assert asked.registered.names == ("body1",) and "body0" in asked.failures[0]
     best = prepare(tasks, template, MARKS, tmp_path / "best", QUICK)
-    assert best.registered.names == ("body1",) and "or --init pose" in best.failures[0]          # it has no limbs
-    near = prepare(tasks, template, {}, tmp_path / "near", settings["pose"])
+    assert best.registered.names == ("body1",) and "or --through pose" in best.failures[0]          # it has no limbs
+    assert not any(task.landmarks for task in find_scans(scans, "none"))
+    near = prepare(tasks, template, {}, tmp_path / "near", pose)
     assert [f.init for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
 
 

@@ -34,18 +34,18 @@ class Call(KeptCall):
 
     def inputs(self, tell: Callable[[str], None]) -> tuple[list[ScanTask], Mesh, dict[str, int]]:
         """Scans, template and its landmarks, as their files are now; told of scans without landmarks."""
-        body, tasks, init = read_mesh(self.template), self.tasks(), self.config.scan.init
+        body, tasks, through = read_mesh(self.template), self.tasks(), self.config.scan.through
         without = [task.name for task in tasks if task.landmarks is None]
         # the set keeps those of the template in any case: what is learned from it is measured by them
         named = self.template_landmarks or landmarks_beside(self.template)
         marks = read_template_landmarks(self.template, body, self.template_landmarks) if named else {}
-        if init == "pose":
+        if through == "pose":
             tell("note: no landmarks are used; all scans must be near the template's pose")
-        elif init == "automatic" or (init == "best" and len(without) == len(tasks)):
+        elif len(without) == len(tasks):
             tell("note: no landmarks are used; look at the page for scans turned round or mirrored")
         else:                                          # some scan is led by landmarks
             marks = marks or read_template_landmarks(self.template, body, self.template_landmarks)
-            if without and init == "best":
+            if without:
                 tell(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
                      "look at the page for those turned round or mirrored")
         return tasks, body, marks

@@ -39,13 +39,17 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         scans: Folder of meshes or point clouds. scans.csv in it may say more: name,subject,pose,sex.
         template: Mesh to bring onto the scans: one closed or bordered manifold component.
         output: Folder of the registered set; open report.html in it.
-        landmarks: Folder of landmark files with the names of the scans; else scans/landmarks, or beside the scans.
+        landmarks: Folder of landmark files with the names of the scans; else scans/landmarks, or beside the scans; the
+            word none leaves them out.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
         clean: Take floor, furniture and specks off each scan before.
         subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
     """
     if clean and config.scan.clean is None:
         config = replace(config, scan=replace(config.scan, clean=CleanScanConfig()))
+    if Path(config.scan.through).is_file():
+        # the set is mended from other places
+        config = replace(config, scan=replace(config.scan, through=str(Path(config.scan.through).absolute())))
     call = Call(scans, template, landmarks, template_landmarks, subject, config)
     given = call.inputs(say)
     with bar("finding the parts of a person") as naming, bar("registering scans") as registering, \

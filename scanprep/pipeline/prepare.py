@@ -19,6 +19,7 @@ from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
 from ..registration.figures import ScanFigures, write_doubts, write_failures, write_figures
+from ..registration.lead import Lead, lead_of
 from ..registration.person import PersonParts, person_parts
 from ..registration.schedule import RegistrationConfig
 from ..skeleton.find import find_skeleton
@@ -90,7 +91,8 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         # without what the template has worked out about itself: it is sent around
         bare = Mesh(template.vertices, template.faces, template.colors)
         parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
-        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan, parts)
+        lead = _lead(space, bare, parts, tasks, config.scan, person_progress)
+        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan, parts, lead)
         if not space.results(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
         failures: dict[str, str] = {}
@@ -118,16 +120,29 @@ class RegisterScan:
     landmarks: Mapping[str, int]
     settings: ScanSettings
     parts: PersonParts | None = None         # of the template, where it is a person
+    # what finds bodies on scans, where some have few landmarks or none: it follows from template and settings
+    lead: Lead | None = field(default=None, metadata={"digest": False})
 
     def __call__(self, task: ScanTask, room: Room) -> ScanFigures:
         found = register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts,
-                              room.tell)
+                              room.tell, self.lead)
         write_mesh(room.folder / mesh_file(task.name), self.template.with_vertices(found.vertices))
         if found.picture:
             (room.folder / PICTURES).mkdir()
             (room.folder / PICTURES / f"{task.name}.webp").write_bytes(found.picture)
             (room.folder / PICTURES / f"{task.name}.scene").write_bytes(found.scene)
         return found.figures
+
+
+def _lead(space: Workspace, template: Mesh, parts: PersonParts | None, tasks: Sequence[ScanTask],
+          settings: ScanSettings, progress: Progress | None) -> Lead | None:
+    """What finds bodies on the scans, if they need it: a model laid on the template, once for the set."""
+    through = settings.through
+    if through in ("none", "pose") or (through == "auto" and (
+            parts is None or all(task.landmarks is not None for task in tasks))):
+        return None
+    model = Path(through) if through != "auto" and Path(through).exists() else through
+    return space.step("lead", (template, model), lambda folder: lead_of(template, through, progress))
 
 
 def mesh_file(name: str) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 
 from ..batch.room import Progress
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
-from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, read_landmarks, shared_landmarks
@@ -18,17 +17,16 @@ from ..judgement import beyond_people, extent
 from ..ranges import FLAG, Settings
 from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
+from ..registration.lead import Lead
 from ..registration.limbs import Doubt, exchanged_sides, limb_doubts
 from ..registration.nonrigid import Registration, register, registration_problem
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
-from ..registration.unmarked import register_unmarked
+from ..registration.unmarked import FEW, register_led
 from ..threads import one_thread
 from ..words import number_of
 from .scans import ScanTask
-
-Init = Literal["best", "landmarks", "automatic", "pose"]
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 
@@ -42,10 +40,10 @@ class ScanSettings(Settings):
     registration : RegistrationConfig
     unit : 'm', 'mm', 'cm' or 'in', optional
         Of the scan and its landmarks, where the files cannot tell.
-    init : 'best', 'landmarks', 'automatic' or 'pose'
-        What leads the template to the scan: its landmark file (a scan without is a failure); correspondences that
-        are found with no landmarks; or nothing but the pose, which must be near that of the template. 'best' takes
-        landmarks where there are some and correspondences elsewhere.
+    through : str
+        What leads the template to scans without landmarks, or with fewer than seven: 'auto', the built-in people where
+        the template is a person; the file of a model; 'none', correspondences; or 'pose', nothing on any scan, all of
+        which must be near the template's pose.
     correspondences : CorrelatedConfig
         How correspondences are found.
     clean : CleanScanConfig, optional
@@ -56,7 +54,7 @@ class ScanSettings(Settings):
 
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     unit: Annotated[Literal["m", "mm", "cm", "in"] | None, FLAG] = None
-    init: Annotated[Init, FLAG] = "best"
+    through: Annotated[str, FLAG] = "auto"
     correspondences: CorrelatedConfig = field(default_factory=CorrelatedConfig)
     clean: CleanScanConfig | None = None
     pictures: bool = True
@@ -73,8 +71,11 @@ class RegisteredScan:
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], settings: ScanSettings,
-                  parts: PersonParts | None = None, progress: Progress | None = None) -> RegisteredScan:
+                  parts: PersonParts | None = None, progress: Progress | None = None, lead: Lead | None = None
+                  ) -> RegisteredScan:
     """Read and register one scan, and try other rolls of limbs where the template has the parts of a person.
+
+    A `lead` finds a body on scans without landmarks, or with few.
 
     ValueError for files that cannot be read, or a registration that means nothing.
     """
@@ -89,11 +90,10 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         if settings.clean is not None:
             cleaned = clean_scan(scan, settings.clean, None if landmarks is None else landmarks[1])
             scan, removed = cleaned.scan, 1 - float(cleaned.kept.mean())
-        fit, pairs, init = _registered(template, scan, landmarks, settings, progress)
+        fit, init = _registered(template, scan, landmarks, settings, parts, lead, progress)
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        fit = repaired(template, scan, fit, parts, landmarks, settings.registration, correspondences=pairs)
         if parts is not None and (problem := exchanged_sides(template, parts, fit.mesh.vertices)):
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         fit = with_soles(template, scan, fit, parts)
@@ -117,27 +117,25 @@ def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tup
 
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
                ) -> Landmarks | None:
-    """Vertices of the template and points of the scan, or None where landmarks are not wanted or not there."""
-    if settings.init in ("automatic", "pose") or (task.landmarks is None and settings.init == "best"):
+    """Vertices of the template and points of the scan, or None where there are none."""
+    if task.landmarks is None or settings.through == "pose":
         return None
-    if task.landmarks is None:
-        raise ValueError(f"{task.scan}: expected a landmark file of the name {task.name}, found none")
     found = read_landmarks(task.landmarks, scan, settings.unit)
     check_on_surface(task.landmarks, found, scan.vertices if isinstance(scan, Mesh) else scan)
-    pairs = shared_landmarks(task.landmarks, template_landmarks, found)
-    if pairs is None and settings.init == "landmarks":
-        raise ValueError(f"{task.landmarks}: --init landmarks needs three names that the template has too")
-    return pairs
+    return shared_landmarks(task.landmarks, template_landmarks, found)
 
 
 def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings,
-                progress: Progress | None) -> tuple[Registration, Correspondences | None, str]:
-    """The template on the scan, and what led it there: landmarks, or correspondences, or its pose; that in words."""
-    if landmarks is not None or settings.init == "pose":
-        return (register(template, scan, landmarks, settings.registration, progress), None,
-                "pose" if landmarks is None else number_of(len(landmarks[0]), "landmark"))
+                parts: PersonParts | None, lead: Lead | None, progress: Progress | None) -> tuple[Registration, str]:
+    """The template on the scan, and what led it there: landmarks, a model, correspondences, or its pose, in words."""
+    config = settings.registration
+    if settings.through == "pose" or (landmarks is not None and (lead is None or len(landmarks[0]) >= FEW)):
+        fit = register(template, scan, landmarks, config, progress)
+        if not registration_problem(template, scan, fit, landmarks is not None):
+            fit = repaired(template, scan, fit, parts, landmarks, config)
+        return fit, "pose" if landmarks is None else number_of(len(landmarks[0]), "landmark")
     try:
-        fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences, progress)
-        return fit, pairs, number_of(len(pairs), "correspondence")
+        fit, led_by = register_led(template, scan, lead, parts, landmarks, config, settings.correspondences, progress)
     except ValueError as error:
-        raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
+        raise ValueError(f"{error} (a landmark file, or --through pose, needs no ends of limbs)") from None
+    return fit, led_by if landmarks is None else f"{number_of(len(landmarks[0]), 'landmark')}, {led_by}"

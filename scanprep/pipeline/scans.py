@@ -29,8 +29,9 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     """The scans of a folder sorted by name, their landmark files, and what `scans.csv` says of them.
 
     The name is that of the file without its ending; a landmark file has the same name, in `landmarks`, in the folder
-    `landmarks` inside, or beside the scan. Where `scans.csv` (name, subject, pose, sex) does not say whose
-    scan it is, it is of `subject`, or of a person of its own. ValueError for no scans, or two of one name.
+    `landmarks` inside, or beside the scan; where `landmarks` is the word none, nowhere. Where `scans.csv` (name,
+    subject, pose, sex) does not say whose scan it is, it is of `subject`, or of a person of its own. ValueError for no
+    scans, or two of one name.
     """
     folder = Path(folder)
     paths: dict[str, Path] = {}
@@ -51,9 +52,9 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     unknown = sorted(set(about) - set(paths))
     if unknown:
         raise ValueError(f"{folder / TABLE}: no scan is called {', '.join(unknown[:5])}")
-    if landmarks and not Path(landmarks).is_dir():
+    if landmarks and not left_out(landmarks) and not Path(landmarks).is_dir():
         raise ValueError(f"landmarks: expected a folder, there is none at {landmarks}")
-    places = [Path(landmarks)] if landmarks else [folder / "landmarks", folder]
+    places = [folder / "landmarks", folder] if not landmarks else [] if left_out(landmarks) else [Path(landmarks)]
     tasks = []
     for name, path in sorted(paths.items()):
         row = about.get(name, {})
@@ -61,6 +62,11 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
         tasks.append(ScanTask(name, path, next(filter(None, beside), None),
                               row.get("subject") or subject or name, row.get("pose") or "", row.get("sex") or ""))
     return tasks
+
+
+def left_out(landmarks: str | Path | None) -> bool:
+    """Whether a folder of landmarks is none, but the word."""
+    return landmarks is not None and Path(landmarks).name == "none" and not Path(landmarks).exists()
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:

@@ -30,11 +30,13 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement, beyond_people, size
 from .figures import UNSEEN, figures_of, review
 from .ground import soles_row, with_soles
+from .lead import lead_of
 from .limbs import exchanged_sides, limb_doubts
 from .nonrigid import Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
 from .repair import repaired
 from .schedule import RegistrationConfig
+from .unmarked import FEW, register_led
 
 
 def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
@@ -113,7 +115,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-                 template_landmarks: Path | None = None, correspondences: Path | None = None, unit: Unit | None = None,
+                 template_landmarks: Path | None = None, through: str = "auto", unit: Unit | None = None,
                  config: RegistrationConfig = RegistrationConfig()) -> Outcome:
     """Bend the template onto one scan.
 
@@ -124,21 +126,33 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         template: Mesh to bring onto it.
         output: Mesh to write.
         landmarks: Landmarks of the scan; else the file of its name beside it, where no correspondences are given;
-            the word none leaves it out. With neither it must be near the template's pose.
+            the word none leaves it out.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        correspondences: File of scape prep correspond; wrong pairs among them do little harm.
+        through: What leads the template where landmarks are fewer than seven: a model file that finds the body on the
+            scan; auto, the built-in people where the template is a person; a .json file of scape prep correspond;
+            or none: then without landmarks it must be near the template's pose.
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    pairs, led_by = (None, [Metric("landmarks", 0)]) if correspondences and landmarks is None else _read_landmarks(
+    given = Path(through) if through.endswith(".json") else None
+    pairs, led_by = (None, [Metric("landmarks", 0)]) if given and landmarks is None else _read_landmarks(
         template, body, scan, data, landmarks, template_landmarks, unit)
-    hints = read_correspondences(correspondences) if correspondences else None
-    with bar("registering") as progress:
-        fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
     with bar("finding the parts of a person") as progress:
         parts = person_parts(body, progress)
-    with bar("trying other rolls of limbs") as progress:
-        fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
+    lead = None
+    if given is None and (pairs is None or len(pairs[0]) < FEW) and (through != "auto" or parts is not None):
+        with bar("laying the model on the template") as progress:
+            lead = lead_of(body, through, progress)
+    if lead is None:
+        hints = read_correspondences(given) if given else None
+        with bar("registering") as progress:
+            fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
+        with bar("trying other rolls of limbs") as progress:
+            fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
+    else:
+        with bar("finding the body, and registering") as progress:
+            fit, way = register_led(body, data, lead, parts, pairs, config, progress=progress)
+        led_by.append(Metric("led by", way))
     fit = with_soles(body, data, fit, parts)
     write_mesh(output, fit.mesh)
     return Outcome(output, [

@@ -12,6 +12,7 @@ from functools import reduce
 
 import numpy as np
 from scipy.sparse import csc_array
+from scipy.spatial import cKDTree
 
 from ..geometry.farthest_points import thin
 from ..geometry.least_squares import Sparse, levenberg_marquardt
@@ -126,11 +127,14 @@ def rotate_end(inputs: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> Gr
     areas = template.vertex_areas
 
     def misfit(of: GraphFit) -> float:
-        """Error against the scan, strain, and twenty times what the end is bent in itself, as they are now."""
+        """Error against the scan, both ways, strain, and twenty times what the end is bent in itself, as it is now."""
         body = template.with_vertices(of.x)
+        # an end that is turned into the body lies near the scan everywhere, and leaves the scan of it uncovered
+        left = np.minimum(cKDTree(of.x).query(target.points)[0], 0.05 * size)
         strain = sum(term.value for term in terms(of.graph, of.motion, held, stage, size).values())
         bent = 20.0 * areas[end.vertices].sum() * bending(template.vertices[end.vertices], of.x[end.vertices])[0] ** 2
-        return float(scan.error(body.vertices, body.vertex_normals) @ areas) + strain + bent
+        there = float(scan.error(body.vertices, body.vertex_normals) @ areas)
+        return there + float((left**2).mean() * areas.sum()) + strain + bent
 
     trials = [fit]
     for places in rotate_ends(template, end, fit.x, scan):

@@ -1,7 +1,7 @@
 """What leads a template to a scan: something that finds a body on it, and where the template's vertices are then.
 
-The package `model` does so by a model of people, or by one of your own; it makes itself known by the entry point `model`
-of the group `scapekit.leads`, since nothing here may import it.
+The package `model` does so by a model of people, or by one of your own; it makes itself known by the entry point
+`model` of the group `scapekit.leads`, since nothing here may import it.
 """
 from __future__ import annotations
 
@@ -59,5 +59,6 @@ def lead_of(template: Mesh, through: str, progress: Callable[[int, int], None] |
         return None
     found = [entry for entry in entry_points(group=GROUP) if entry.name == "model"]
     if not found:
-        raise ValueError(f"--through {through}: scapekit is not installed whole (no '{GROUP}'); expected --through none")
+        raise ValueError(f"--through {through}: scapekit is not installed whole, nothing is known as '{GROUP}'; "
+                         "install it, or leave the model out with --through none")
     return found[0].load()(template, through, progress)

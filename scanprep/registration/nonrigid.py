@@ -56,8 +56,9 @@ class Registration:
 class Method(Protocol):
     """A way to bring a template near a scan, of which `METHODS` holds those that can be chosen by name.
 
-    It takes the inputs, the rigid transform (4, 4) or the vertices (N, 3) to begin with, the settings and a callback for
-    (done, total), and says where the template came to lie. The checks before, the last pass and the figures after are the same for all.
+    It takes the inputs, the rigid transform (4, 4) or the vertices (N, 3) to begin with, the settings and a callback
+    for (done, total), and says where the template came to lie. The checks before, the last pass and the figures after
+    are the same for all.
     """
 
     def __call__(self, inputs: Inputs, start: np.ndarray, config: RegistrationConfig,

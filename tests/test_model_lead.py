@@ -1,0 +1,112 @@
+"""Registration through a model: a body that is found on a scan takes the template along."""
+import json
+
+import numpy as np
+import pytest
+from jointed_bodies import bent, crab
+from test_scanprep_registration_start import BEND, small
+
+from model.coregistration.lead import model_lead
+from scanprep import read_mesh, write_mesh
+from scanprep.cli import group
+from scanprep.decimation.decimate import decimate
+from scanprep.geometry.rotations import exp
+from scanprep.geometry.surface import Surface
+from scanprep.registration.lead import Led, lead_of
+from scanprep.registration.nonrigid import register
+from scanprep.registration.unmarked import doubted, register_led
+from scanprep.synthetic.people import BodyShape, Person, named_pose
+
+
+def off(found, truth):
+    return float(np.linalg.norm(found - truth, axis=1).mean())
+
+
+@pytest.fixture(scope="module")
+def body():
+    return crab(81, 40)
+
+
+@pytest.fixture(scope="module")
+def scan(body):
+    return body.with_vertices(bent(body, *BEND) @ exp(np.array([2.5, 0.4, 1.0])).T + [3.0, -1.0, 2.0])
+
+
+def near(scan):
+    return scan.vertices + 0.01 * np.sin(20 * scan.vertices[:, ::-1])
+
+
+def test_a_registration_begins_at_vertices(body, scan):
+    found = register(body, scan, config=small(), start=near(scan))
+    assert off(found.mesh.vertices, scan.vertices) < 0.008 < off(near(scan), scan.vertices)
+    for start in (near(scan)[:-1], np.full(scan.vertices.shape, np.nan)):
+        with pytest.raises(ValueError, match=r"start: expected a finite transform \(4, 4\) or vertices"):
+            register(body, scan, start=start)
+
+
+@pytest.mark.parametrize("far", [0.0, 4e6])
+def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
+    """Of two bodies that were found one lies beside the scan; wherever the scan is."""
+    there = scan.with_vertices(scan.vertices + far)
+    asked = []
+
+    class TwoBodies:
+        name = "crabs"
+
+        def __call__(self, scan, landmarks=None):
+            asked.append(float(np.abs(scan.vertices).max()))
+            middle = scan.vertices.mean(axis=0)
+            right = near(scan)
+            return [Led((right - middle) @ exp(np.array([0, 0, np.pi])).T + middle, 0.7), Led(right, 0.99)]
+
+    fit, led_by = register_led(body, there, TwoBodies(), config=small())
+    assert off(fit.mesh.vertices, there.vertices) < 0.008 and led_by == "model crabs"
+    assert doubted(body, None, fit) == 0 and max(asked) < 100
+
+
+def test_without_a_lead_correspondences_lead(body):
+    with pytest.raises(ValueError, match="limbs"):
+        register_led(body, crab(20, 10).with_vertices(0.01 * np.random.default_rng(0).normal(size=(
+            len(crab(20, 10).vertices), 3))), None)
+
+
+def test_no_model_where_none_is_wanted_or_known(body, tmp_path):
+    assert lead_of(body, "none") is None
+    with pytest.raises(ValueError, match=r"gone\.npz"):
+        lead_of(body, str(tmp_path / "gone.npz"))
+
+
+def test_a_crab_is_no_person(body):
+    assert model_lead(body, "auto") is None
+    with pytest.raises(ValueError, match="--through people: the model does not come to lie on the template"):
+        model_lead(body, "people")
+
+
+@pytest.fixture(scope="module")
+def somebody():
+    return Person(BodyShape.like("female", weight=0.8))
+
+
+@pytest.fixture(scope="module")
+def template(somebody):
+    return decimate(somebody.mesh, 5000)
+
+
+def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(somebody, template, tmp_path, capsys):
+    """A template of other triangles than the model's; the scan lies on its side, and nobody says which way is up."""
+    place = Surface(somebody.mesh).closest(template.vertices)
+    posed = somebody.posed(named_pose("lunge_left")) @ exp(np.array([0.3, 1.4, 0.2])).T
+    scan = somebody.mesh.with_vertices(posed)
+    truth = np.einsum("nk,nkd->nd", place.bary, posed[somebody.mesh.faces[place.faces]])
+    points = scan.sample(20000, np.random.default_rng(0))[0]
+    lead = lead_of(template, "auto")
+    assert lead is not None and lead.name == "people"
+    led = lead(points)[0]
+    assert led.explained > 0.95 and off(led.vertices, truth) < 0.05
+    write_mesh(tmp_path / "scan.ply", scan)
+    write_mesh(tmp_path / "template.ply", template)
+    assert group(["register", str(tmp_path / "scan.ply"), "--template", str(tmp_path / "template.ply"),
+                  "-o", str(tmp_path / "found.ply")]) == 0
+    rows = {m["metric"]: m["value"] for m in json.loads((tmp_path / "found.ply.report.json").read_text())["metrics"]}
+    assert rows["led by"] == "model people" and "good" in capsys.readouterr().out
+    assert off(read_mesh(tmp_path / "found.ply").vertices, truth) < 0.015
