@@ -51,7 +51,7 @@ def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
     asked = []
 
     class TwoBodies:
-        name = "crabs"
+        name, parts = "crabs", None
 
         def __call__(self, scan, landmarks=None):
             asked.append(float(np.abs(scan.vertices).max()))
@@ -71,42 +71,27 @@ def test_without_a_lead_correspondences_lead(body):
 
 
 def test_no_model_where_none_is_wanted_or_known(body, tmp_path):
-    assert lead_of(body, "none") is None
+    assert lead_of(body, "none") is None and lead_of(body, "auto") is None          # a crab has two ends
     with pytest.raises(ValueError, match=r"gone\.npz"):
         lead_of(body, str(tmp_path / "gone.npz"))
 
 
 def test_a_crab_is_no_person(body):
-    assert model_lead(body, "auto") is None
     with pytest.raises(ValueError, match="--through people: the model does not come to lie on the template"):
         model_lead(body, "people")
 
 
-@pytest.fixture(scope="module")
-def somebody():
-    return Person(BodyShape.like("female", weight=0.8))
-
-
-@pytest.fixture(scope="module")
-def template(somebody):
-    return decimate(somebody.mesh, 5000)
-
-
-def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(somebody, template, tmp_path, capsys):
+def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(tmp_path):
     """A template of other triangles than the model's; the scan lies on its side, and nobody says which way is up."""
+    somebody = Person(BodyShape.like("female", weight=0.8))
+    template = decimate(somebody.mesh, 5000)
     place = Surface(somebody.mesh).closest(template.vertices)
-    posed = somebody.posed(named_pose("lunge_left")) @ exp(np.array([0.3, 1.4, 0.2])).T
-    scan = somebody.mesh.with_vertices(posed)
-    truth = np.einsum("nk,nkd->nd", place.bary, posed[somebody.mesh.faces[place.faces]])
-    points = scan.sample(20000, np.random.default_rng(0))[0]
-    lead = lead_of(template, "auto")
-    assert lead is not None and lead.name == "people"
-    led = lead(points)[0]
-    assert led.explained > 0.95 and off(led.vertices, truth) < 0.05
-    write_mesh(tmp_path / "scan.ply", scan)
+    scan = somebody.posed(named_pose("lunge_left")) @ exp(np.array([0.3, 1.4, 0.2])).T
+    truth = np.einsum("nk,nkd->nd", place.bary, scan[somebody.mesh.faces[place.faces]])
+    write_mesh(tmp_path / "scan.ply", somebody.mesh.with_vertices(scan))
     write_mesh(tmp_path / "template.ply", template)
     assert group(["register", str(tmp_path / "scan.ply"), "--template", str(tmp_path / "template.ply"),
                   "-o", str(tmp_path / "found.ply")]) == 0
     rows = {m["metric"]: m["value"] for m in json.loads((tmp_path / "found.ply.report.json").read_text())["metrics"]}
-    assert rows["led by"] == "model people" and "good" in capsys.readouterr().out
-    assert off(read_mesh(tmp_path / "found.ply").vertices, truth) < 0.015
+    assert rows["led by"] == "model people"
+    assert off(read_mesh(tmp_path / "found.ply").vertices, truth) < 0.01

@@ -59,7 +59,7 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
     """What a scan was registered with is what its limbs are tried again with, and the table says that they were."""
     given, stood, person = [], [], object()
 
-    def repaired(body, scan, fit, parts, landmarks, config, correspondences):
+    def repaired(body, scan, fit, parts, landmarks, config, correspondences=None):
         given.append((parts, len(landmarks[0]), config, correspondences))
         return dataclasses.replace(fit, rolled=parts is person)
 

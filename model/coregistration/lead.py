@@ -18,7 +18,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.registration.lead import Led
 from scanprep.registration.nonrigid import register, share_stretched
+from scanprep.registration.person import PersonParts
 from scanprep.skeleton.roles import joint_in_words
+from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.anatomy import PARENTS, PARTS
 from scanprep.threads import one_thread
 
 from ..body import BodyModel
@@ -50,6 +53,7 @@ class ModelLead:
     corners: np.ndarray
     weights: np.ndarray
     off: np.ndarray
+    parts: PersonParts | None = None
     config: ScanFitConfig = field(default_factory=ScanFitConfig)
 
     def carry(self, body: Mesh) -> np.ndarray:
@@ -119,7 +123,18 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     corners = laid.mesh.faces[place.faces]
     ahead = np.einsum("nk,nkd->nd", place.bary, laid.mesh.vertex_normals[corners])
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
-    return ModelLead(name, corners, place.bary, np.einsum("nd,nd->n", template.vertices - place.points, ahead))
+    off = np.einsum("nd,nd->n", template.vertices - place.points, ahead)
+    return ModelLead(name, corners, place.bary, off, _parts(model, laid.mesh, template))
+
+
+def _parts(model: BodyModel, laid: Mesh, template: Mesh) -> PersonParts | None:
+    """The parts of a template on which a model of people was laid; None for other models."""
+    if model.skeleton.names != PARTS:
+        return None
+    part = model.skeleton.part_of_face[Surface(laid).closest(template.corners.mean(axis=1)).faces]
+    joints = model.skeleton.joint_regressor(model.template) @ laid.vertices
+    return PersonParts(Skeleton(part, PARENTS, joints, PARTS),
+                       model.skeleton.fit_rotations(model.template, laid.vertices))
 
 
 @lru_cache(maxsize=2)

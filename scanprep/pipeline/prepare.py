@@ -91,8 +91,9 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         # without what the template has worked out about itself: it is sent around
         bare = Mesh(template.vertices, template.faces, template.colors)
         parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
-        lead = _lead(space, bare, parts, tasks, config.scan, person_progress)
-        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan, parts, lead)
+        lead = _lead(space, bare, tasks, config.scan, person_progress)
+        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan,
+                            parts or (lead and lead.parts), lead)
         if not space.results(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
         failures: dict[str, str] = {}
@@ -134,12 +135,11 @@ class RegisterScan:
         return found.figures
 
 
-def _lead(space: Workspace, template: Mesh, parts: PersonParts | None, tasks: Sequence[ScanTask],
-          settings: ScanSettings, progress: Progress | None) -> Lead | None:
+def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], settings: ScanSettings,
+          progress: Progress | None) -> Lead | None:
     """What finds bodies on the scans, if they need it: a model laid on the template, once for the set."""
     through = settings.through
-    if through in ("none", "pose") or (through == "auto" and (
-            parts is None or all(task.landmarks is not None for task in tasks))):
+    if through in ("none", "pose") or (through == "auto" and all(task.landmarks is not None for task in tasks)):
         return None
     model = Path(through) if through != "auto" and Path(through).exists() else through
     return space.step("lead", (template, model), lambda folder: lead_of(template, through, progress))

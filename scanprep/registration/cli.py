@@ -140,9 +140,10 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     with bar("finding the parts of a person") as progress:
         parts = person_parts(body, progress)
     lead = None
-    if given is None and (pairs is None or len(pairs[0]) < FEW) and (through != "auto" or parts is not None):
+    if given is None and (pairs is None or len(pairs[0]) < FEW):
         with bar("laying the model on the template") as progress:
             lead = lead_of(body, through, progress)
+        parts = parts or (lead and lead.parts)
     if lead is None:
         hints = read_correspondences(given) if given else None
         with bar("registering") as progress:

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from ..geometry.mesh import Mesh
+from .person import PersonParts, has_limbs
 
 GROUP = "scapekit.leads"
 
@@ -34,6 +35,7 @@ class Lead(Protocol):
     """Finds bodies on scans, the likeliest first; landmarks are vertices (L,) of the template and points (L, 3)."""
 
     name: str
+    parts: PersonParts | None        # of the template, where the model is of people
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None
                  ) -> Sequence[Led]: ...
@@ -55,7 +57,7 @@ def lead_of(template: Mesh, through: str, progress: Callable[[int, int], None] |
     ValueError
         A model that cannot lead the template, and why; or a file that is none.
     """
-    if through == "none":
+    if through == "none" or (through == "auto" and not has_limbs(template)):
         return None
     found = [entry for entry in entry_points(group=GROUP) if entry.name == "model"]
     if not found:

@@ -25,6 +25,7 @@ from ..synthetic.people import PARENTS, PARTS, Person
 from .nonrigid import Registration, register, share_stretched
 from .schedule import RegistrationConfig
 
+LIMB_ENDS = 5                          # head, hands and feet
 MATCHING = 30                          # per cent of the time, before the person is registered
 
 
@@ -81,6 +82,14 @@ def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts
                        person.skeleton.fit_rotations(person.mesh, fit.mesh.vertices))
 
 
+def has_limbs(template: Mesh) -> bool:
+    """Whether a template has the ends of five limbs, as head, hands and feet of a person."""
+    try:
+        return len(find_seeds(average_person().mesh, template)) >= LIMB_ENDS
+    except ValueError:             # it has too few ends of limbs
+        return False
+
+
 def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, config: RegistrationConfig,
                tell: Callable[[int, int], None]) -> Registration | None:
     """The average person on a template, led by landmarks or by the ends of limbs; None where it does not lie on it."""
@@ -88,13 +97,9 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
     if landmarks is not None:
         fit = register(person, template, landmarks, config, tell)
     else:
-        try:
-            seeds = find_seeds(person, template)
-        except ValueError:             # it has too few ends of limbs
+        if not has_limbs(template):
             return None
-        # of limbs: head, hands and feet
-        if len(seeds) < 5:
-            return None
+        seeds = find_seeds(person, template)
         pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
                                      progress=lambda done, total: tell(round(MATCHING * done / total), 100))
         fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(

@@ -23,6 +23,7 @@ from .repair import gravity, repaired
 from .schedule import RegistrationConfig
 
 FEW = 7                              # landmarks from which on they lead a template alone
+CLEARLY = 0.8                        # of the doubts that the first leaves, below which another registration is better
 UNCOVERED = 0.005                    # share of the scan off the template, from which on a limb may be lost
 
 
@@ -33,8 +34,9 @@ def register_led(template: Mesh, scan: Mesh | np.ndarray, lead: Lead | None, par
                  ) -> tuple[Registration, str]:
     """Bring a template onto a scan with few landmarks or none: as a `lead` finds a body on it, or by correspondences.
 
-    Returns the registration, its limbs repaired, and what led it, in words. ValueError as from `register_unmarked`
-    where that is all there is.
+    Returns the registration, its limbs repaired, and what led it, in words. The likeliest body is kept unless another
+    one, or correspondences, leave clearly less to doubt. ValueError as from `register_unmarked` where that is all
+    there is.
     """
     found = list[tuple[Registration, str]]()
     for led in () if lead is None else lead(scan, landmarks):
@@ -50,7 +52,9 @@ def register_led(template: Mesh, scan: Mesh | np.ndarray, lead: Lead | None, par
         else:
             fit = repaired(template, scan, fit, parts, None, config, correspondences=pairs)
             found.append((fit, number_of(len(pairs), "correspondence")))
-    return min(found, key=lambda one: doubted(template, parts, one[0]))
+    best = min(found, key=lambda one: doubted(template, parts, one[0]))
+    clear = doubted(template, parts, best[0]) < CLEARLY * doubted(template, parts, found[0][0])
+    return best if clear else found[0]
 
 
 def doubted(template: Mesh, parts: PersonParts | None, fit: Registration) -> float:

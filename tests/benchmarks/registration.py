@@ -1,10 +1,11 @@
 """Registration of mesh000 to the virtual scans of `scans.py`: accuracy beside time.
 
     SCAPEKIT_DATA=... python tests/benchmarks/registration.py [--marks 10|7|4|0] [--front] [--set tuning|held]
-        [--poses 3,8] [--men 3] [--published] [--method NAME] [--kept FOLDER] [-o FILE]
+        [--through auto|none|MODEL] [--poses 3,8] [--men 3] [--published] [--method NAME] [--kept FOLDER] [-o FILE]
 
-With `--marks 0` the template is led by `register_unmarked`, with no click. What we lose at: the surface is right
-long before the correspondence is; skin slides over muscles, and nothing in the shape says by how much.
+With fewer than seven marks the template is led through a model, the built-in people, and with none by correspondences
+where that leaves something to doubt; `--through none` leaves the model out. What we lose at: the surface is right long
+before the correspondence is; skin slides over muscles, and nothing in the shape says by how much.
 
 Every scan is judged as on the page of a set, and the verdicts are compared with the truth: `off`, by more than 30 mm on
 average or a limb by more than 150 mm; and `rolled`, a limb by more than 50 mm on average.
@@ -19,33 +20,39 @@ from typing import NamedTuple
 
 import numpy as np
 from protocols import RealData, load_real, machine, write_report
-from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES, TestScan, errors, test_scan
+from scans import HELD_MEN, HELD_POSES, MARKS, TUNING_MEN, TUNING_POSES, TestScan, errors, test_scan
 
 from scanprep.judgement import size
 from scanprep.registration.figures import ScanFigures, figures_of, review
+from scanprep.registration.lead import Lead, lead_of
 from scanprep.registration.limbs import Doubt, limb_doubts
 from scanprep.registration.nonrigid import METHODS, Registration, register, registration_problem
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.repair import repaired
 from scanprep.registration.schedule import RegistrationConfig
-from scanprep.registration.unmarked import register_unmarked
+from scanprep.registration.unmarked import FEW, register_led, register_unmarked
 
 SETS = {"tuning": (TUNING_POSES, TUNING_MEN), "held": (HELD_POSES, HELD_MEN)}
 COLUMNS = ("all_mm", "before_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped",
            "cpu_s", "wall_s")
 
 
-def registered(data: RealData, parts: PersonParts, item: TestScan, marks: str, config: RegistrationConfig
-               ) -> tuple[Registration, Registration]:
-    """The template on one scan, by clicks or by what is found without any, before and after limbs were repaired."""
+def registered(data: RealData, parts: PersonParts, item: TestScan, marks: str, config: RegistrationConfig,
+               lead: Lead | None) -> tuple[Registration, Registration, str]:
+    """The template on one scan, by clicks or by what is found without, before and after limbs were repaired; and what
+    led it."""
     landmarks, pairs = item.landmarks(data, marks), None
+    if lead is not None:
+        found, led_by = register_led(data.template, item.scan, lead, parts, landmarks, config)
+        return found, found, led_by
     if landmarks is not None:
         found = register(data.template, item.scan, landmarks, config)
     else:
         found, pairs = register_unmarked(data.template, item.scan, config)
+    led_by = "correspondences" if landmarks is None else "landmarks"
     if registration_problem(data.template, item.scan, found, marks != "0"):
-        return found, found                      # as in a folder: it means nothing, whatever its limbs do
-    return found, repaired(data.template, item.scan, found, parts, landmarks, config, correspondences=pairs)
+        return found, found, led_by              # as in a folder: it means nothing, whatever its limbs do
+    return found, repaired(data.template, item.scan, found, parts, landmarks, config, correspondences=pairs), led_by
 
 
 class Judged(NamedTuple):
@@ -58,18 +65,19 @@ class Judged(NamedTuple):
 
 
 def measure(data: RealData, parts: PersonParts, kind: str, index: int, marks: str, front: bool,
-            config: RegistrationConfig, kept: Path | None) -> Judged:
+            config: RegistrationConfig, lead: Lead | None, kept: Path | None) -> Judged:
     """Register one virtual scan, compare with the truth and judge it; the vertices are `kept` in a folder."""
     item = test_scan(data, kind, index, front)
     start = time.perf_counter(), time.process_time()
-    before, found = registered(data, parts, item, marks, config)
+    before, found, led_by = registered(data, parts, item, marks, config, lead)
     wall, cpu = time.perf_counter() - start[0], time.process_time() - start[1]
     if kept:
         kept.mkdir(exist_ok=True)
         np.save(kept / f"{item.name}_{marks}.npy", found.mesh.vertices)
-    row = {"scan": item.name, "kind": kind, **errors(found.mesh.vertices, item), "repaired": found is not before,
-           "before_mm": errors(before.mesh.vertices, item)["all_mm"], "flipped": found.inverted,
-           "converged": found.converged, "seen_agrees": float((found.seen == item.seen).mean()),
+    row = {"scan": item.name, "kind": kind, "led_by": led_by, **errors(found.mesh.vertices, item),
+           "repaired": found is not before, "before_mm": errors(before.mesh.vertices, item)["all_mm"],
+           "flipped": found.inverted, "converged": found.converged,
+           "seen_agrees": float((found.seen == item.seen).mean()),
            **worst_limb(found.mesh.vertices, item, parts), "cpu_s": cpu, "wall_s": wall}
     problem = registration_problem(data.template, item.scan, found, marks != "0")
     doubts = limb_doubts(data.template, parts, found.mesh.vertices)
@@ -111,6 +119,7 @@ def main() -> None:
     parser.add_argument("--marks", choices=("10", "7", "4", "0"), default="10")
     parser.add_argument("--front", action="store_true", help="one view from the front instead of four all around")
     parser.add_argument("--set", choices=SETS, default="tuning", dest="chosen")
+    parser.add_argument("--through", default="auto", help="model that leads where marks are few: auto, none, a file")
     parser.add_argument("--poses", help="numbers of SCAPE poses instead of those of the set")
     parser.add_argument("--men", help="numbers of SPRING men instead of those of the set")
     parser.add_argument("--published", action="store_true", help="the registration of [SCAPE] instead of ours [Hahnel]")
@@ -124,9 +133,10 @@ def main() -> None:
     config = replace(RegistrationConfig.published() if args.published else RegistrationConfig(), method=args.method)
     parts = person_parts(data.template)
     assert parts is not None, "the template is a person"
+    lead = lead_of(data.template, args.through) if len(MARKS[args.marks]) < FEW else None
     judged: list[Judged] = []
     for kind, index in [("pose", i) for i in poses] + [("man", i) for i in men]:
-        judged.append(measure(data, parts, kind, index, args.marks, args.front, config, args.kept))
+        judged.append(measure(data, parts, kind, index, args.marks, args.front, config, lead, args.kept))
         row = judged[-1].row
         print(" ".join(f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()), flush=True)
     told, rows = flags(data, judged), [j.row for j in judged]
@@ -140,6 +150,7 @@ def main() -> None:
     print("flags:", told)
     if args.output:
         write_report(args.output, {"marks": args.marks, "front": args.front, "published": args.published,
+                                 "through": args.through if lead else "none",
                                  "method": args.method,
                                  "machine": machine(), "summary": summary, "flags": told, "rows": rows})
 
