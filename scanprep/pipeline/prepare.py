@@ -93,7 +93,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
         lead = _lead(space, bare, tasks, config.scan, person_progress)
         work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan,
-                            parts or (lead and lead.parts), lead)
+                            parts if lead is None else parts or lead.parts, lead)
         if not space.results(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
         failures: dict[str, str] = {}

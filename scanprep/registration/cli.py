@@ -143,7 +143,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     if given is None and (pairs is None or len(pairs[0]) < FEW):
         with bar("laying the model on the template") as progress:
             lead = lead_of(body, through, progress)
-        parts = parts or (lead and lead.parts)
+        parts = parts if lead is None else parts or lead.parts
     if lead is None:
         hints = read_correspondences(given) if given else None
         with bar("registering") as progress:

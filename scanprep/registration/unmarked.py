@@ -39,10 +39,11 @@ def register_led(template: Mesh, scan: Mesh | np.ndarray, lead: Lead | None, par
     there is.
     """
     found = list[tuple[Registration, str]]()
-    for led in () if lead is None else lead(scan, landmarks):
-        fit = register(template, scan, landmarks, config, progress, start=led.vertices)
-        fit = repaired(template, scan, fit, parts, landmarks, config)
-        found.append((fit, f"model {lead.name}"))
+    if lead is not None:
+        for led in lead(scan, landmarks):
+            fit = register(template, scan, landmarks, config, progress, start=led.vertices)
+            fit = repaired(template, scan, fit, parts, landmarks, config)
+            found.append((fit, f"model {lead.name}"))
     if landmarks is None and all(doubted(template, parts, fit) > 0 for fit, _ in found):
         try:
             fit, pairs = register_unmarked(template, scan, config, search, progress)

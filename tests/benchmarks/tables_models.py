@@ -84,3 +84,38 @@ def flat(value: dict, before: str = "") -> list[tuple[str, Any]]:
         path = f"{before}{name}"
         out += flat(inner, path + ", ") if isinstance(inner, dict) else [(path, inner)]
     return out
+
+
+def population(report: dict) -> str:
+    """Measures of drawn people against the survey's, a row for each; then those of people made from three measures."""
+    sexes = [sex for sex in ("female", "male") if sex in report]
+    rows: Rows = []
+    for name in report[sexes[0]]["measures"]:
+        row: list[Any] = [name.replace("_", " ")]
+        for sex in sexes:
+            m = report[sex]["measures"][name]
+            anew = report[sex].get("made_anew", {}).get(name, np.nan)
+            unit = 1 if name == "weight" else 1000
+            row += [unit * m["survey_mean"], unit * (m["mean"] - m["survey_mean"]), m["sd"] / m["survey_sd"],
+                    *(unit * (m["quantiles"][k] - m["survey_quantiles"][k]) for k in (0, 2)), unit * anew]
+        rows.append(tuple(row))
+    head = [f"{sex}: {word}" for sex in sexes for word in (
+        "survey's mean", "off", "SD ratio", "5th percentile off", "95th off", "made from stature, weight, waist: off")]
+    told: Rows = [(sex, report[sex]["drawn"], report[sex]["correlation_off_mean"], report[sex]["correlation_off_max"],
+                   *report[sex]["bmi"], f"{report[sex]['impossible']} of {report[sex]['looked_at']}") for sex in sexes]
+    return "\n\n".join((
+        "Millimetres, kilograms of the weight.\n\n" + table(("measure", *head), rows),
+        table(("sex", "drawn", "correlations off, mean", "at most", "BMI", "its SD", "skin crosses, or turns over"),
+              told)))
+
+
+def strangers(report: dict) -> str:
+    """Whole scans and half views of men that no model saw, by each model."""
+    rows: Rows = []
+    for name in dict.fromkeys(r["model"] for r in report["rows"]):
+        mine = [r for r in report["rows"] if r["model"] == name]
+        rows.append((name, len(mine), *(figure for key in ("whole_mm", "unseen_mm", "seen_predicted_mm") for figure in (
+            float(np.mean([r[key] for r in mine])), max(r[key] for r in mine))), max(r["largest_beta"] for r in mine),
+            float(np.mean([r["cpu_seconds"] for r in mine]))))
+    return table(("model", "men", "whole scan (mm)", "worst man", "half view, unseen (mm)", "worst man",
+                  "half view, seen (mm)", "worst man", "largest beta", "time (s CPU)"), rows)
