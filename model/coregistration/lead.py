@@ -32,7 +32,7 @@ from ..fitting.rounds import solve_jointly
 from ..fitting.scan import prepare_scan
 from ..fitting.scan_fit import STRANGE, ScanFit, scan_fit
 from ..fitting.settings import ScanFitConfig
-from ..fitting.starts import best_starts, first_starts
+from ..fitting.starts import best_starts, first_starts, from_nothing
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 # of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is another
@@ -70,7 +70,10 @@ class ModelLead:
         body = as_body(_loaded(self.name))
         fit = scan_fit(body, prepare_scan(scan), vertices, points, self.config)
         few = fit.few()
-        best, rival = with_limbs(fit, few, best_starts(few, first_starts(fit, few)))
+        starts = first_starts(fit, few)
+        if len(vertices) >= 3:               # few landmarks leave much open: also bodies that begin without
+            starts = np.concatenate([starts, from_nothing(few)])
+        best, rival = with_limbs(fit, few, best_starts(few, starts))
         return [self._led(fit, solve_jointly(fit, few, x, lambda done: None).x) for x in (best, rival)
                 if x is not None]
 
