@@ -11,15 +11,18 @@ import pytest
 from scan_folders import MARKS, QUICK, ball, contents, write_scans
 from scipy.spatial.transform import Rotation
 
+from model.coregistration.lead import ModelLead
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
 from scanprep.cleaning.clean_scan import CleanScanConfig
 from scanprep.correspondence.correspondences import Correspondences
+from scanprep.pipeline import prepare as preparing
 from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
+from scanprep.registration.lead import Led
 from scanprep.registration.limbs import Doubt
 
 
@@ -214,6 +217,25 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
     assert [f.init for f in done.figures] == ["22 correspondences", "5 landmarks"]
     found = done.registered.vertices(["body0"])[0]
     assert np.linalg.norm(found - turned.vertices, axis=1).max() < 0.05
+
+
+def test_a_model_leads_where_there_are_no_landmarks_or_few(scans, template, tmp_path, monkeypatch):
+    """It is laid on the template once; asked for by name it also leads scans with few landmarks."""
+    asked, lead = [], ModelLead("balls", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
+    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None: [Led(scan.vertices, 1.0)])
+    monkeypatch.setattr(preparing, "lead_of", lambda template, through, progress: asked.append(through) or lead)
+    turned = template.with_vertices(template.vertices @ Rotation.from_rotvec([2.0, 0, 0]).as_matrix().T)
+    write_mesh(scans / "body0.ply", turned)
+    (scans / "body0.landmarks.json").unlink()
+    for _ in range(2):
+        done = prepare(find_scans(scans)[:2], template, MARKS, tmp_path / "set", QUICK)
+    assert [f.init for f in done.figures] == ["model balls", "5 landmarks, model balls"] and asked == ["auto"]
+    assert np.linalg.norm(done.registered.vertices(["body0"])[0] - turned.vertices, axis=1).max() < 0.05
+    prepare(find_scans(scans)[1:2], template, MARKS, tmp_path / "all", QUICK)
+    assert asked == ["auto"]
+    named = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, through="people"))
+    done = prepare(find_scans(scans)[1:2], template, MARKS, tmp_path / "named", named)
+    assert [f.init for f in done.figures] == ["5 landmarks, model balls"] and asked == ["auto", "people"]
 
 
 def test_clutter_is_cleaned_off_when_asked(scans, template, tmp_path):
