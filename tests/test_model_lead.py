@@ -12,9 +12,9 @@ from scanprep.cli import group
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
-from scanprep.registration.lead import Led, lead_of
+from scanprep.registration.lead import lead_of
 from scanprep.registration.nonrigid import register
-from scanprep.registration.unmarked import doubted, register_led
+from scanprep.registration.unmarked import register_by_any, weigh_doubts
 from scanprep.synthetic.people import BodyShape, Person, named_pose
 
 
@@ -53,21 +53,21 @@ def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
     class TwoBodies:
         name, parts = "crabs", None
 
-        def __call__(self, scan, landmarks=None):
+        def __call__(self, scan, landmarks=None, model=None):
             asked.append(float(np.abs(scan.vertices).max()))
             middle = scan.vertices.mean(axis=0)
             right = near(scan)
-            return [Led((right - middle) @ exp(np.array([0, 0, np.pi])).T + middle, 0.7), Led(right, 0.99)]
+            return [(right - middle) @ exp(np.array([0, 0, np.pi])).T + middle, right]
 
-    fit, led_by = register_led(body, there, TwoBodies(), config=small())
+    fit, led_by = register_by_any(body, there, None, TwoBodies(), config=small())
     assert off(fit.mesh.vertices, there.vertices) < 0.008 and led_by == "model crabs"
-    assert doubted(body, None, fit) == 0 and max(asked) < 100
+    assert weigh_doubts(body, None, fit) == 0 and max(asked) < 100
 
 
-def test_without_a_lead_correspondences_lead(body):
+def test_without_a_lead_ends_of_limbs_are_needed(body):
     with pytest.raises(ValueError, match="limbs"):
-        register_led(body, crab(20, 10).with_vertices(0.01 * np.random.default_rng(0).normal(size=(
-            len(crab(20, 10).vertices), 3))), None)
+        register_by_any(body, crab(20, 10).with_vertices(0.01 * np.random.default_rng(0).normal(size=(
+            len(crab(20, 10).vertices), 3))))
 
 
 def test_no_model_where_none_is_wanted_or_known(body, tmp_path):

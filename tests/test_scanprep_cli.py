@@ -23,6 +23,7 @@ from scanprep.geometry.storage import StorageError
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import cli as registration_cli
+from scanprep.registration import unmarked
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -52,8 +53,11 @@ def place(tmp_path_factory, template):
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
     """A file of settings for a registration with few steps."""
-    monkeypatch.setattr(registration_cli, "register", lambda *given, **named: register(
-        *given, **named | {"config": QUICK.scan.registration}))
+    def few_steps(body, scan, landmarks=None, config=None, *rest, **named):
+        return register(body, scan, landmarks, QUICK.scan.registration, *rest, **named)
+
+    for place in (registration_cli, unmarked):
+        monkeypatch.setattr(place, "register", few_steps)
     path = tmp_path / "quick.toml"
     config = replace(QUICK, min_poses=5, scan=replace(QUICK.scan, pictures=True))
     path.write_text(config_files.write({"config": config}))

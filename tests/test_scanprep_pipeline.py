@@ -22,7 +22,6 @@ from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
-from scanprep.registration.lead import Led
 from scanprep.registration.limbs import Doubt
 
 
@@ -67,7 +66,7 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
         return dataclasses.replace(fit, rolled=parts is person)
 
     told = (Doubt(1.5, "the head is rolled by 90 degrees against the chest"),)
-    monkeypatch.setattr(one_scan, "repaired", repaired)
+    monkeypatch.setattr(unmarked, "repaired", repaired)
     small = Doubt(1.0, "the person is 1.20 m tall: a child, or the wrong scale?")
     monkeypatch.setattr(one_scan, "limb_doubts", lambda body, parts, vertices: told)
     monkeypatch.setattr(one_scan, "exchanged_sides", lambda body, parts, vertices: None)
@@ -222,7 +221,7 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
 def test_a_model_leads_where_there_are_no_landmarks_or_few(scans, template, tmp_path, monkeypatch):
     """It is laid on the template once; asked for by name it also leads scans with few landmarks."""
     asked, lead = [], ModelLead("balls", np.zeros((642, 3), dtype=np.int64), np.ones((642, 3)) / 3, np.zeros(642))
-    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None: [Led(scan.vertices, 1.0)])
+    monkeypatch.setattr(ModelLead, "__call__", lambda self, scan, landmarks=None, model=None: [scan.vertices])
     monkeypatch.setattr(preparing, "lead_of", lambda template, through, progress: asked.append(through) or lead)
     turned = template.with_vertices(template.vertices @ Rotation.from_rotvec([2.0, 0, 0]).as_matrix().T)
     write_mesh(scans / "body0.ply", turned)

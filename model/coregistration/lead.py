@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,10 +16,8 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.lead import Led
 from scanprep.registration.nonrigid import register, share_stretched
 from scanprep.registration.person import PersonParts
-from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
 from scanprep.threads import one_thread
@@ -30,15 +28,15 @@ from ..fitting.bodies import as_body
 from ..fitting.limbs import with_limbs
 from ..fitting.rounds import solve_jointly
 from ..fitting.scan import prepare_scan
-from ..fitting.scan_fit import STRANGE, ScanFit, scan_fit
+from ..fitting.scan_fit import scan_fit
 from ..fitting.settings import ScanFitConfig
 from ..fitting.starts import best_starts, first_starts, from_nothing
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 # of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is another
-# thing than the model; people have 0.004 and 0.001, a crab 0.005 and 0.088
+# thing than the model; a woman has 0.004 and 0.0002, a crab 0.005 and 0.088
 OTHER = 0.02, 0.05
-LEFT_OVER = 0.03                     # share of a scan with no body near, from which on a limb may be elsewhere
+NO_LANDMARKS = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,38 +52,36 @@ class ModelLead:
     weights: np.ndarray
     off: np.ndarray
     parts: PersonParts | None = None
-    config: ScanFitConfig = field(default_factory=ScanFitConfig)
 
     def carry(self, body: Mesh) -> np.ndarray:
         """Where the template's vertices (N, 3), metres, are on a body."""
-        ahead = np.einsum("nk,nkd->nd", self.weights, body.vertex_normals[self.corners])
-        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+        ahead = normals_at(body, self.corners, self.weights)
         return np.einsum("nk,nkd->nd", self.weights, body.vertices[self.corners]) + self.off[:, None] * ahead
 
-    @one_thread()
-    def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> list[Led]:
-        """The body on a scan, and another one that explains it nearly as well, where there is one."""
-        vertices, points = (np.zeros(0, dtype=np.int64), np.zeros((0, 3))) if landmarks is None else (
-            self.corners[landmarks[0], self.weights[landmarks[0]].argmax(axis=1)], landmarks[1])
-        body = as_body(_loaded(self.name))
-        fit = scan_fit(body, prepare_scan(scan), vertices, points, self.config)
-        few = fit.few()
-        starts = first_starts(fit, few)
-        if len(vertices) >= 3:               # few landmarks leave much open: also bodies that begin without
-            starts = np.concatenate([starts, from_nothing(few)])
-        best, rival = with_limbs(fit, few, best_starts(few, starts))
-        return [self._led(fit, solve_jointly(fit, few, x, lambda done: None).x) for x in (best, rival)
-                if x is not None]
+    def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None, model: Path | None = None
+                 ) -> list[np.ndarray]:
+        """The template's vertices (N, 3) on the body found, and on another that explains the scan nearly as well."""
+        mine = None
+        if landmarks is not None:              # of the model, the vertex that is nearest to each
+            mine = self.corners[landmarks[0], self.weights[landmarks[0]].argmax(axis=1)], landmarks[1]
+        return [self.carry(body) for body in find_bodies(model_at(self.name if model is None else model), scan, mine)]
 
-    def _led(self, fit: ScanFit, x: np.ndarray) -> Led:
-        """What the body of unknowns (P,) says of the template."""
-        explained = 1 - float(fit.unexplained(x, fit.thin).mean())
-        strange = fit.body.joints_from_known(fit.body.split(x)[0])
-        doubts = [f"the {joint_in_words(fit.body.skeleton.names[j])} is {np.degrees(strange[j]):.0f} degrees from any "
-                  "way that it is known to be held" for j in np.flatnonzero(strange > STRANGE)]
-        if 1 - explained > LEFT_OVER:
-            doubts.append(f"{100 * (1 - explained):.0f}% of the scan has no body near")
-        return Led(self.carry(fit.body.template.with_vertices(fit.body.vertices(x))), explained, tuple(doubts))
+
+@one_thread()
+def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> list[Mesh]:
+    """The body of a model on a scan, and another one that explains it nearly as well, where there is one.
+
+    Landmarks, few or none, are vertices (L,) of the model and points (L, 3), metres.
+    """
+    body, (vertices, points) = as_body(model), landmarks or NO_LANDMARKS
+    fit = scan_fit(body, prepare_scan(scan), vertices, points, ScanFitConfig())
+    few = fit.few()
+    starts = first_starts(fit, few)
+    if len(vertices) >= 3:                     # few landmarks leave much open: also bodies that begin without
+        starts = np.concatenate([starts, from_nothing(few)])
+    found = [x for x in with_limbs(fit, few, best_starts(few, starts)) if x is not None]
+    solved = [solve_jointly(fit, few, x, lambda done: None).x for x in found]
+    return [model.template.with_vertices(body.vertices(x)) for x in solved]
 
 
 def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> ModelLead | None:
@@ -106,28 +102,28 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
         A model that does not come to lie on the template. StorageError for a file that is no model.
     """
     name, tell = BUILT_IN if through == "auto" else through, progress or (lambda done, total: None)
-    model = _loaded(name)
-    body = as_body(model)
-    fit = scan_fit(body, prepare_scan(template), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), ScanFitConfig())
-    few = fit.few()
-    tell(1, 4)
-    x = with_limbs(fit, few, best_starts(few, first_starts(fit, few)))[0]
-    tell(2, 4)
-    found = model.template.with_vertices(body.vertices(solve_jointly(fit, few, x, lambda done: None).x))
-    tell(3, 4)
+    model = model_at(name)
+    # the body is found on the template as on any scan, and laid on it
+    found = find_bodies(model, template)[0]
+    tell(1, 2)
     laid = register(found, template, start=found.vertices)
-    tell(4, 4)
+    tell(2, 2)
     if laid.uncovered > OTHER[0] or share_stretched(found, laid.mesh) > OTHER[1]:
         if through == "auto":
             return None
         raise ValueError(f"--through {through}: the model does not come to lie on the template, "
                          f"{100 * laid.uncovered:.0f}% of which lies off it: a model of something else?")
+    # every vertex of the template gets a place on the body, and a distance from its skin
     place = Surface(laid.mesh).closest(template.vertices)
     corners = laid.mesh.faces[place.faces]
-    ahead = np.einsum("nk,nkd->nd", place.bary, laid.mesh.vertex_normals[corners])
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
-    off = np.einsum("nd,nd->n", template.vertices - place.points, ahead)
+    off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid.mesh, corners, place.bary))
     return ModelLead(name, corners, place.bary, off, _parts(model, laid.mesh, template))
+
+
+def normals_at(body: Mesh, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3) of a body at places among its vertices, `corners` (n, 3) with `weights` (n, 3)."""
+    ahead = np.einsum("nk,nkd->nd", weights, body.vertex_normals[corners])
+    return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
 
 
 def _parts(model: BodyModel, laid: Mesh, template: Mesh) -> PersonParts | None:
@@ -140,6 +136,12 @@ def _parts(model: BodyModel, laid: Mesh, template: Mesh) -> PersonParts | None:
                        model.skeleton.fit_rotations(model.template, laid.vertices))
 
 
+def model_at(name: str | Path) -> BodyModel:
+    """The model of a name or a file, kept for the next scan as long as the file is the same."""
+    path = Path(name)
+    return _read(str(name), path.stat().st_mtime_ns if path.is_file() else 0)
+
+
 @lru_cache(maxsize=2)
-def _loaded(name: str) -> BodyModel:
-    return load_model(name if name == BUILT_IN else Path(name))
+def _read(name: str, _changed: int) -> BodyModel:
+    return load_model(name)

@@ -22,7 +22,7 @@ from ..viewer.results import ResultsApp
 from .again import Call
 from .cli import carry_out
 from .page import PICTURES, judge_set
-from .scans import ScanTask, left_out
+from .scans import ScanTask, means_none
 
 WORK = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
 
@@ -42,7 +42,7 @@ class MendApp(ResultsApp):
 
     def __init__(self, folder: Path, ending: str = ".landmarks.json", names: tuple[str, ...] = ()) -> None:
         self.folder, self.call = folder, Call.read(folder)
-        if self.call.config.scan.through == "pose" or left_out(self.call.landmarks):
+        if self.call.config.scan.through == "pose" or means_none(self.call.landmarks):
             raise ValueError(f"{folder}: it was made with --through pose or --landmarks none, which use none: "
                              "there are no landmarks to mend")
         self.verdicts = self.read_results()

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from ..batch.opening import workspace
@@ -91,7 +91,9 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         # without what the template has worked out about itself: it is sent around
         bare = Mesh(template.vertices, template.faces, template.colors)
         parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
-        lead = _lead(space, bare, tasks, config.scan, person_progress)
+        model = Path(config.scan.through) if Path(config.scan.through).is_file() else None
+        tasks = [replace(task, model=model) for task in tasks]
+        lead = _lead(space, bare, tasks, config.scan.through, person_progress)
         work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan,
                             parts if lead is None else parts or lead.parts, lead)
         if not space.results(work):                   # the first call, or all is to be done anew
@@ -135,14 +137,13 @@ class RegisterScan:
         return found.figures
 
 
-def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], settings: ScanSettings,
-          progress: Progress | None) -> Lead | None:
+def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: str, progress: Progress | None
+          ) -> Lead | None:
     """What finds bodies on the scans, if they need it: a model laid on the template, once for the set."""
-    through = settings.through
     if through in ("none", "pose") or (through == "auto" and all(task.landmarks is not None for task in tasks)):
         return None
-    model = Path(through) if through != "auto" and Path(through).exists() else through
-    return space.step("lead", (template, model), lambda folder: lead_of(template, through, progress))
+    model = next((task.model for task in tasks), None)
+    return space.step("lead", (template, through, model), lambda folder: lead_of(template, through, progress))
 
 
 def mesh_file(name: str) -> str:

@@ -19,13 +19,12 @@ from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
 from ..registration.lead import Lead
 from ..registration.limbs import Doubt, exchanged_sides, limb_doubts
-from ..registration.nonrigid import Registration, register, registration_problem
+from ..registration.nonrigid import register, registration_problem
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
-from ..registration.unmarked import FEW, register_led
+from ..registration.unmarked import register_by_any
 from ..threads import one_thread
-from ..words import number_of
 from .scans import ScanTask
 
 Landmarks = tuple[np.ndarray, np.ndarray]
@@ -90,7 +89,16 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         if settings.clean is not None:
             cleaned = clean_scan(scan, settings.clean, None if landmarks is None else landmarks[1])
             scan, removed = cleaned.scan, 1 - float(cleaned.kept.mean())
-        fit, init = _registered(template, scan, landmarks, settings, parts, lead, progress)
+        if settings.through == "pose":
+            fit, init = register(template, scan, None, settings.registration, progress), "pose"
+            if not registration_problem(template, scan, fit, marked=False):
+                fit = repaired(template, scan, fit, parts, None, settings.registration)
+        else:
+            try:
+                fit, init = register_by_any(template, scan, landmarks, lead, parts, settings.registration,
+                                            settings.correspondences, progress, task.model)
+            except ValueError as error:
+                raise ValueError(f"{error} (a landmark file, or --through pose, needs no ends of limbs)") from None
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
@@ -123,19 +131,3 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
     found = read_landmarks(task.landmarks, scan, settings.unit)
     check_on_surface(task.landmarks, found, scan.vertices if isinstance(scan, Mesh) else scan)
     return shared_landmarks(task.landmarks, template_landmarks, found)
-
-
-def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings,
-                parts: PersonParts | None, lead: Lead | None, progress: Progress | None) -> tuple[Registration, str]:
-    """The template on the scan, and what led it there: landmarks, a model, correspondences, or its pose, in words."""
-    config = settings.registration
-    if settings.through == "pose" or (landmarks is not None and (lead is None or len(landmarks[0]) >= FEW)):
-        fit = register(template, scan, landmarks, config, progress)
-        if not registration_problem(template, scan, fit, landmarks is not None):
-            fit = repaired(template, scan, fit, parts, landmarks, config)
-        return fit, "pose" if landmarks is None else number_of(len(landmarks[0]), "landmark")
-    try:
-        fit, led_by = register_led(template, scan, lead, parts, landmarks, config, settings.correspondences, progress)
-    except ValueError as error:
-        raise ValueError(f"{error} (a landmark file, or --through pose, needs no ends of limbs)") from None
-    return fit, led_by if landmarks is None else f"{number_of(len(landmarks[0]), 'landmark')}, {led_by}"

@@ -23,6 +23,7 @@ class ScanTask:
     subject: str = field(default="", metadata=ABOUT)
     pose: str = field(default="", metadata=ABOUT)
     sex: str = field(default="", metadata=ABOUT)
+    model: Path | None = None         # the file of the model that leads the template, if not the built-in people
 
 
 def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:
@@ -52,9 +53,9 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     unknown = sorted(set(about) - set(paths))
     if unknown:
         raise ValueError(f"{folder / TABLE}: no scan is called {', '.join(unknown[:5])}")
-    if landmarks and not left_out(landmarks) and not Path(landmarks).is_dir():
+    if landmarks and not means_none(landmarks) and not Path(landmarks).is_dir():
         raise ValueError(f"landmarks: expected a folder, there is none at {landmarks}")
-    places = [folder / "landmarks", folder] if not landmarks else [] if left_out(landmarks) else [Path(landmarks)]
+    places = [folder / "landmarks", folder] if not landmarks else [] if means_none(landmarks) else [Path(landmarks)]
     tasks = []
     for name, path in sorted(paths.items()):
         row = about.get(name, {})
@@ -64,7 +65,7 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     return tasks
 
 
-def left_out(landmarks: str | Path | None) -> bool:
+def means_none(landmarks: str | Path | None) -> bool:
     """Whether a folder of landmarks is none, but the word."""
     return landmarks is not None and Path(landmarks).name == "none" and not Path(landmarks).exists()
 

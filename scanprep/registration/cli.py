@@ -36,7 +36,7 @@ from .nonrigid import Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
 from .repair import repaired
 from .schedule import RegistrationConfig
-from .unmarked import FEW, register_led
+from .unmarked import FEW, register_by_any
 
 
 def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
@@ -130,7 +130,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         template_landmarks: Landmarks of the template; else the file of its name beside it.
         through: What leads the template where landmarks are fewer than seven: a model file that finds the body on the
             scan; auto, the built-in people where the template is a person; a .json file of scape prep correspond;
-            or none: then without landmarks it must be near the template's pose.
+            none, correspondences; or pose: without landmarks it must be near the template's pose.
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
@@ -139,20 +139,20 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         template, body, scan, data, landmarks, template_landmarks, unit)
     with bar("finding the parts of a person") as progress:
         parts = person_parts(body, progress)
-    lead = None
-    if given is None and (pairs is None or len(pairs[0]) < FEW):
-        with bar("laying the model on the template") as progress:
-            lead = lead_of(body, through, progress)
-        parts = parts if lead is None else parts or lead.parts
-    if lead is None:
+    if given or through == "pose":
         hints = read_correspondences(given) if given else None
         with bar("registering") as progress:
             fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
         with bar("trying other rolls of limbs") as progress:
             fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
     else:
-        with bar("finding the body, and registering") as progress:
-            fit, way = register_led(body, data, lead, parts, pairs, config, progress=progress)
+        lead = None
+        if pairs is None or len(pairs[0]) < FEW:
+            with bar("laying the model on the template") as progress:
+                lead = lead_of(body, through, progress)
+            parts = parts if lead is None else parts or lead.parts
+        with bar("registering") as progress:
+            fit, way = register_by_any(body, data, pairs, lead, parts, config, progress=progress)
         led_by.append(Metric("led by", way))
     fit = with_soles(body, data, fit, parts)
     write_mesh(output, fit.mesh)

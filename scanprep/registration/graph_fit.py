@@ -68,14 +68,14 @@ def register_graph(inputs: Inputs, start: np.ndarray, config: RegistrationConfig
                    progress: Callable[[int, int], None]) -> GraphFit:
     """The template bent onto the scan by the stages of the schedule, from vertices by those near; see `Method`."""
     near = start.shape == inputs.template.vertices.shape
-    stages = config.near if near else [
+    stages = config.near_stages if near else [
         stage for stage in config.graph if stage.positions == 1 or inputs.descriptors is not None]
     nodes = stages[0].nodes if stages else 300
-    fit = posed_fit(inputs.template, start, nodes) if near else start_fit(inputs.template, start, nodes)
+    fit = fit_at_vertices(inputs.template, start, nodes) if near else start_fit(inputs.template, start, nodes)
     return fit_stages(inputs, fit, stages, progress)
 
 
-def posed_fit(template: Mesh, vertices: np.ndarray, nodes: int) -> GraphFit:
+def fit_at_vertices(template: Mesh, vertices: np.ndarray, nodes: int) -> GraphFit:
     """The template where nodes carry it nearest to vertices (N, 3), on a graph of so many nodes."""
     graph = build_graph(template, nodes)
     motion = motion_of(graph, vertices)

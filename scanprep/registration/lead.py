@@ -6,8 +6,8 @@ The package `model` does so by a model of people, or by one of your own; it make
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -18,27 +18,18 @@ from .person import PersonParts, has_limbs
 GROUP = "scapekit.leads"
 
 
-@dataclass(frozen=True, eq=False)
-class Led:
-    """A body that was found on a scan.
-
-    `vertices` (N, 3), metres: where those of the template are then; `explained`: share of the scan near the body;
-    `doubts`: what speaks against the body, in words.
-    """
-
-    vertices: np.ndarray
-    explained: float
-    doubts: tuple[str, ...] = ()
-
-
 class Lead(Protocol):
-    """Finds bodies on scans, the likeliest first; landmarks are vertices (L,) of the template and points (L, 3)."""
+    """Finds bodies on scans: where the template's vertices (N, 3), metres, are on each, the likeliest body first.
+
+    Landmarks are vertices (L,) of the template and points (L, 3), metres. `model` is where the file of the model lies
+    for whoever asks, if it is not where the lead was made.
+    """
 
     name: str
     parts: PersonParts | None        # of the template, where the model is of people
 
-    def __call__(self, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None
-                 ) -> Sequence[Led]: ...
+    def __call__(self, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+                 model: Path | None = None) -> Sequence[np.ndarray]: ...
 
 
 def lead_of(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> Lead | None:

@@ -52,7 +52,7 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     Registration
     """
     config = config or RegistrationConfig()
-    stages = config.near
+    stages = config.near_stages
     x = fit.mesh.vertices
     if parts is None or not config.rolls or not stages:
         return fit

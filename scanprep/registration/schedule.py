@@ -155,7 +155,7 @@ class RegistrationConfig(Settings):
     method: str = "graph"
 
     @property
-    def near(self) -> list[GraphStage]:
+    def near_stages(self) -> list[GraphStage]:
         """The stages that match by place alone, and need the template near the scan."""
         return [stage for stage in self.graph if stage.positions == 1 and not stage.paths and stage.reach]
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -17,57 +18,66 @@ from ..words import number_of
 from .lead import Lead
 from .limbs import exchanged_sides, limb_doubts
 from .matches import Landmarks
-from .nonrigid import Registration, near_origin, register
+from .nonrigid import Registration, near_origin, register, registration_problem
 from .person import PersonParts
 from .repair import gravity, repaired
 from .schedule import RegistrationConfig
 
 FEW = 7                              # landmarks from which on they lead a template alone
 CLEARLY = 0.8                        # of the doubts that the first leaves, below which another registration is better
+EXCHANGED = 10.0                     # doubts that exchanged sides count as: more than any limb
 UNCOVERED = 0.005                    # share of the scan off the template, from which on a limb may be lost
 
 
 @near_origin
-def register_led(template: Mesh, scan: Mesh | np.ndarray, lead: Lead | None, parts: PersonParts | None = None,
-                 landmarks: Landmarks | None = None, config: RegistrationConfig | None = None,
-                 search: CorrelatedConfig | None = None, progress: Callable[[int, int], None] | None = None
-                 ) -> tuple[Registration, str]:
-    """Bring a template onto a scan with few landmarks or none: as a `lead` finds a body on it, or by correspondences.
+def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
+                    lead: Lead | None = None, parts: PersonParts | None = None,
+                    config: RegistrationConfig | None = None, search: CorrelatedConfig | None = None,
+                    progress: Callable[[int, int], None] | None = None, model: Path | None = None
+                    ) -> tuple[Registration, str]:
+    """Bring a template onto a scan by what there is, limbs repaired: landmarks; few of them, or none, and a lead;
+    correspondences, where no lead finds a body that leaves nothing to doubt.
 
-    Returns the registration, its limbs repaired, and what led it, in words. The likeliest body is kept unless another
-    one, or correspondences, leave clearly less to doubt. ValueError as from `register_unmarked` where that is all
-    there is.
+    Returns the registration and what led it, in words. The likeliest body is kept unless another one, or
+    correspondences, leave clearly less to doubt. `model` is passed on to the lead. ValueError as from
+    `register_unmarked` where that is all there is.
     """
-    found = list[tuple[Registration, str]]()
-    if lead is not None:
-        for led in lead(scan, landmarks):
-            fit = register(template, scan, landmarks, config, progress, start=led.vertices)
+    clicked = [] if landmarks is None else [number_of(len(landmarks[0]), "landmark")]
+    if landmarks is not None and (lead is None or len(landmarks[0]) >= FEW):
+        fit = register(template, scan, landmarks, config, progress)
+        if not registration_problem(template, scan, fit, marked=True):
             fit = repaired(template, scan, fit, parts, landmarks, config)
-            found.append((fit, f"model {lead.name}"))
-    if landmarks is None and all(doubted(template, parts, fit) > 0 for fit, _ in found):
+        return fit, clicked[0]
+    # what was tried, each with how much is to be doubted, and what led it
+    found = list[tuple[float, Registration, str]]()
+    if lead is not None:
+        for vertices in lead(scan, landmarks, model):
+            fit = register(template, scan, landmarks, config, progress, start=vertices)
+            fit = repaired(template, scan, fit, parts, landmarks, config)
+            found.append((weigh_doubts(template, parts, fit), fit, ", ".join([*clicked, f"model {lead.name}"])))
+    if landmarks is None and all(doubt > 0 for doubt, _, _ in found):
         try:
             fit, pairs = register_unmarked(template, scan, config, search, progress)
         except ValueError:
             if not found:
                 raise
         else:
-            fit = repaired(template, scan, fit, parts, None, config, correspondences=pairs)
-            found.append((fit, number_of(len(pairs), "correspondence")))
-    best = min(found, key=lambda one: doubted(template, parts, one[0]))
-    clear = doubted(template, parts, best[0]) < CLEARLY * doubted(template, parts, found[0][0])
-    return best if clear else found[0]
+            if not registration_problem(template, scan, fit, marked=False):
+                fit = repaired(template, scan, fit, parts, None, config, correspondences=pairs)
+            found.append((weigh_doubts(template, parts, fit), fit, number_of(len(pairs), "correspondence")))
+    best = min(found, key=lambda one: one[0])
+    return (best if best[0] < CLEARLY * found[0][0] else found[0])[1:]
 
 
-def doubted(template: Mesh, parts: PersonParts | None, fit: Registration) -> float:
+def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -> float:
     """How much speaks against a registration: limbs, sides that are exchanged, and what of a scan is not covered.
 
     Each counts 1 where it begins to be doubted; 0 where nothing does.
     """
     lost = fit.uncovered / UNCOVERED
-    limbs = 0.0 if parts is None else gravity(limb_doubts(template, parts, fit.mesh.vertices)) + 10.0 * (
+    limbs = 0.0 if parts is None else gravity(limb_doubts(template, parts, fit.mesh.vertices)) + EXCHANGED * (
         exchanged_sides(template, parts, fit.mesh.vertices) is not None)
     return limbs + (lost if lost > 1 else 0.0)
-
 
 
 @near_origin

@@ -30,7 +30,7 @@ from scanprep.registration.nonrigid import METHODS, Registration, register, regi
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.repair import repaired
 from scanprep.registration.schedule import RegistrationConfig
-from scanprep.registration.unmarked import FEW, register_led, register_unmarked
+from scanprep.registration.unmarked import FEW, register_by_any, register_unmarked
 
 SETS = {"tuning": (TUNING_POSES, TUNING_MEN), "held": (HELD_POSES, HELD_MEN)}
 COLUMNS = ("all_mm", "before_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped",
@@ -43,7 +43,7 @@ def registered(data: RealData, parts: PersonParts, item: TestScan, marks: str, c
     led it."""
     landmarks, pairs = item.landmarks(data, marks), None
     if lead is not None:
-        found, led_by = register_led(data.template, item.scan, lead, parts, landmarks, config)
+        found, led_by = register_by_any(data.template, item.scan, landmarks, lead, parts, config)
         return found, found, led_by
     if landmarks is not None:
         found = register(data.template, item.scan, landmarks, config)
