@@ -129,8 +129,8 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
             the word none leaves it out.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
         through: What leads the template where landmarks are fewer than seven: a model file that finds the body on the
-            scan; auto, the built-in people where the template is a person; a .json file of scape prep correspond;
-            none, correspondences; or pose: without landmarks it must be near the template's pose.
+            scan; auto, the built-in people where the template is a person, else pose; a .json file of
+            scape prep correspond; none, correspondences; pose: without landmarks it must be near the template's pose.
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
@@ -139,18 +139,18 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         template, body, scan, data, landmarks, template_landmarks, unit)
     with bar("finding the parts of a person") as progress:
         parts = person_parts(body, progress)
-    if given or through == "pose":
+    lead = None
+    if given is None and through != "pose" and (pairs is None or len(pairs[0]) < FEW):
+        with bar("laying the model on the template") as progress:
+            lead = lead_of(body, through, progress)
+        parts = parts if lead is None else parts or lead.parts
+    if given or through == "pose" or (pairs is None and lead is None and through == "auto"):
         hints = read_correspondences(given) if given else None
         with bar("registering") as progress:
             fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
         with bar("trying other rolls of limbs") as progress:
             fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
     else:
-        lead = None
-        if pairs is None or len(pairs[0]) < FEW:
-            with bar("laying the model on the template") as progress:
-                lead = lead_of(body, through, progress)
-            parts = parts if lead is None else parts or lead.parts
         with bar("registering") as progress:
             fit, way = register_by_any(body, data, pairs, lead, parts, config, progress=progress)
         led_by.append(Metric("led by", way))
