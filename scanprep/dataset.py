@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -92,7 +92,7 @@ class RegisteredSet:
         if skeleton is not None and len(skeleton.part_of_face) != len(template.faces):
             raise storage.StorageError(f"{path}: expected {len(template.faces)} faces as template.ply has, "
                                        f"found {len(skeleton.part_of_face)}")
-        return RegisteredSet(folder, template, _read_rows(folder), skeleton, info)
+        return RegisteredSet(folder, template, read_entries(folder), skeleton, info)
 
     def add(self, name: str, mesh: Mesh | np.ndarray, subject: str = "", pose: str = "", sex: str = ""
             ) -> RegisteredSet:
@@ -119,7 +119,7 @@ class RegisteredSet:
         check_same_topology(Path(name), mesh, self.folder / "template.ply", self.template)
         entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
         write_mesh(self.folder / entry.file, mesh)
-        rows = {row.name: row for row in _read_rows(self.folder)}
+        rows = {row.name: row for row in read_entries(self.folder)}
         rows[name] = entry                               # in the place of the old one, if there was one
         _write_rows(self.folder, rows.values())
         return replace(self, entries=tuple(rows.values()))
@@ -196,13 +196,18 @@ def _read_header(folder: Path) -> dict[str, Any]:
     return info
 
 
-def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
+def read_entries(folder: Path, being_made: Collection[str] = ()) -> tuple[SetEntry, ...]:
+    """The rows of `set.csv`; files of names that are `being_made` may be gone.
+
+    StorageError, which names the line, for a file that is missing, outside the folder, or a name that comes twice.
+    """
     path = folder / "set.csv"
     entries: dict[str, SetEntry] = {}
     for line, row in tables.read_table(path, _COLUMNS, ("name", "file")):
         entry = SetEntry(**{column: row[column] for column in _COLUMNS})
         storage.path_inside(folder, entry.name, f"{path}: line {line}")       # files of other folders are called so
-        if not storage.path_inside(folder, entry.file, f"{path}: line {line}").is_file():
+        place = storage.path_inside(folder, entry.file, f"{path}: line {line}")
+        if not place.is_file() and entry.name not in being_made:
             raise storage.StorageError(f"{path}: line {line}: there is no file {entry.file}")
         if entry.name in entries:
             raise storage.StorageError(f"{path}: line {line}: the name {entry.name} comes twice")

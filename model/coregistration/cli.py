@@ -16,7 +16,7 @@ from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import read_landmarks, shared_landmarks, write_landmarks
 from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
-from scanprep.pipeline.prepare import mesh_file
+from scanprep.pipeline.scan import mesh_file
 from scanprep.pipeline.scans import ScanTask, find_scans
 
 from ..body import BodyModel

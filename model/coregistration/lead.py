@@ -2,12 +2,13 @@
 
 1. The model's body is fitted to the template, and laid on it: every vertex of the template gets a place in a triangle
    of the body, and a distance from its skin. That is done once.
-2. On a scan the body is found by the search of `complete`: typical poses turned every way, limbs tried elsewhere.
+2. On a scan the body is found by the search of `complete`: typical poses turned every way. Where that leaves something
+   to doubt, limbs are tried elsewhere, which takes as long again.
 3. The template's vertices go where their places on the body are, and the template is registered from there on.
 """
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.nonrigid import register, share_stretched
+from scanprep.registration.nonrigid import register, share_stretched, uncovered_share
 from scanprep.registration.person import PersonParts
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
@@ -28,14 +29,20 @@ from ..fitting.bodies import as_body
 from ..fitting.limbs import with_limbs
 from ..fitting.rounds import solve_jointly
 from ..fitting.scan import prepare_scan
-from ..fitting.scan_fit import scan_fit
+from ..fitting.scan_fit import ScanFit, scan_fit
 from ..fitting.settings import ScanFitConfig
 from ..fitting.starts import best_starts, first_starts, from_nothing
+from ..learning.config import LearnConfig
+from ..learning.scape import learn_scape
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 # of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is another
 # thing than the model; a woman has 0.004 and 0.0002, a crab 0.005 and 0.088
 OTHER = 0.02, 0.05
+ALIKE = 0.02       # metres: bodies no vertex of which is farther apart come to the same end
+FAR, LOST = 0.06, 0.005        # metres off a body, and share of the scan that is: a hand is 0.02 of a man
+# a first model of a set only has to find bodies: a tenth of the time of `scape learn`
+LEARNING = LearnConfig(prunings=(0.01,), ridges=(0.003, 0.03), refinements=1)
 NO_LANDMARKS = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
 
 
@@ -59,29 +66,62 @@ class ModelLead:
         return np.einsum("nk,nkd->nd", self.weights, body.vertices[self.corners]) + self.off[:, None] * ahead
 
     def __call__(self, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None, model: Path | None = None
-                 ) -> list[np.ndarray]:
-        """The template's vertices (N, 3) on the body found, and on another that explains the scan nearly as well."""
-        mine = None
+                 ) -> Iterator[np.ndarray]:
+        """The template's vertices (N, 3) on the bodies of `find_bodies`; each is sought when it is asked for."""
+        marked = None
         if landmarks is not None:              # of the model, the vertex that is nearest to each
-            mine = self.corners[landmarks[0], self.weights[landmarks[0]].argmax(axis=1)], landmarks[1]
-        return [self.carry(body) for body in find_bodies(model_at(self.name if model is None else model), scan, mine)]
+            marked = self.corners[landmarks[0], self.weights[landmarks[0]].argmax(axis=1)], landmarks[1]
+        body_model = model_at(self.name if model is None else model)
+        return map(self.carry, find_bodies(body_model, scan, marked))
+
+
+def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> Iterator[Mesh]:
+    """Yield bodies of a model on a scan, each sought when it is asked for.
+
+    First the likeliest of typical poses; then the best with limbs moved elsewhere, and another body that explains the
+    scan nearly as well, where there are such.
+
+    Parameters
+    ----------
+    model : BodyModel
+    scan : Mesh or (n, 3) float, metres
+    landmarks : (L,) int and (L, 3) float, metres, optional
+        Few vertices of the model and where they are on the scan.
+    """
+    fit, few, starts = _search(model, scan, landmarks or NO_LANDMARKS)
+    first = model.template.with_vertices(fit.body.vertices(_solve(fit, few, starts[0])))
+    # what is left uncovered so far off is a limb that is elsewhere; nobody needs to look at such a body
+    lost = uncovered_share(scan, first, FAR) > LOST
+    if not lost:
+        yield first
+    bodies = _solve_with_limbs(fit, few, starts)
+    for x in bodies:
+        body = model.template.with_vertices(fit.body.vertices(x))
+        if lost or np.linalg.norm(body.vertices - first.vertices, axis=1).max() > ALIKE:
+            yield body
 
 
 @one_thread()
-def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> list[Mesh]:
-    """The body of a model on a scan, and another one that explains it nearly as well, where there is one.
-
-    Landmarks, few or none, are vertices (L,) of the model and points (L, 3), metres.
-    """
-    body, (vertices, points) = as_body(model), landmarks or NO_LANDMARKS
-    fit = scan_fit(body, prepare_scan(scan), vertices, points, ScanFitConfig())
+def _search(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks) -> tuple[ScanFit, ScanFit, np.ndarray]:
+    """The fit of a scan, the same with few vertices, and the unknowns (n, P) of the likeliest bodies, best first."""
+    fit = scan_fit(as_body(model), prepare_scan(scan), *landmarks, ScanFitConfig())
     few = fit.few()
     starts = first_starts(fit, few)
-    if len(vertices) >= 3:                     # few landmarks leave much open: also bodies that begin without
+    if len(landmarks[0]) >= 3:                 # few landmarks leave much open: also bodies that begin without
         starts = np.concatenate([starts, from_nothing(few)])
-    found = [x for x in with_limbs(fit, few, best_starts(few, starts)) if x is not None]
-    solved = [solve_jointly(fit, few, x, lambda done: None).x for x in found]
-    return [model.template.with_vertices(body.vertices(x)) for x in solved]
+    return fit, few, best_starts(few, starts)
+
+
+@one_thread()
+def _solve_with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> list[np.ndarray]:
+    """Unknowns (P,) of the best start after its limbs were moved elsewhere, and of one that explains nearly as much."""
+    return [_solve(fit, few, x) for x in with_limbs(fit, few, starts) if x is not None]
+
+
+@one_thread()
+def _solve(fit: ScanFit, few: ScanFit, x: np.ndarray) -> np.ndarray:
+    """Unknowns (P,) of pose, place and shape together, from those of a start."""
+    return solve_jointly(fit, few, x, lambda done: None).x
 
 
 def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> ModelLead | None:
@@ -103,12 +143,21 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     """
     name, tell = BUILT_IN if through == "auto" else through, progress or (lambda done, total: None)
     model = model_at(name)
+    if np.array_equal(model.template.faces, template.faces) and np.allclose(model.template.vertices, template.vertices,
+                                                                            atol=1e-6):
+        tell(1, 1)                             # a model of this very template: every vertex is at its own
+        corners, weights = np.repeat(np.arange(len(template.vertices))[:, None], 3, axis=1), np.eye(3)[:1]
+        return ModelLead(name, corners, np.repeat(weights, len(corners), axis=0), np.zeros(len(corners)),
+                         _parts(model, template, template))
     # the body is found on the template as on any scan, and laid on it
-    found = find_bodies(model, template)[0]
-    tell(1, 2)
-    laid = register(found, template, start=found.vertices)
+    for body in find_bodies(model, template):
+        tell(1, 2)
+        laid = register(body, template, start=body.vertices)
+        other = laid.uncovered > OTHER[0] or share_stretched(body, laid.mesh) > OTHER[1]
+        if not other:
+            break
     tell(2, 2)
-    if laid.uncovered > OTHER[0] or share_stretched(found, laid.mesh) > OTHER[1]:
+    if other:
         if through == "auto":
             return None
         raise ValueError(f"--through {through}: the model does not come to lie on the template, "
@@ -118,6 +167,12 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     corners = laid.mesh.faces[place.faces]
     off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid.mesh, corners, place.bary))
     return ModelLead(name, corners, place.bary, off, _parts(model, laid.mesh, template))
+
+
+def learn_set_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None, path: Path
+                    ) -> None:
+    """Learn a model of registered meshes and write its file, see `scanprep.registration.lead.learn_model`."""
+    learn_scape(template, poses, shapes, skeleton, LEARNING).save(path)
 
 
 def normals_at(body: Mesh, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:

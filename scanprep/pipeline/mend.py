@@ -13,6 +13,7 @@ import numpy as np
 from ..batch.room import Progress
 from ..batch.workspace import Workspace
 from ..console import Outcome
+from ..dataset import RegisteredSet
 from ..judgement import Judgement
 from ..registration.figures import Verdict
 from ..viewer.app import Send
@@ -21,7 +22,7 @@ from ..viewer.messages import Message
 from ..viewer.results import ResultsApp
 from .again import Call
 from .cli import carry_out
-from .page import PICTURES, judge_set
+from .page import judge_set, pictures_place
 from .scans import ScanTask, means_none
 
 WORK = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
@@ -65,7 +66,9 @@ class MendApp(ResultsApp):
     def scene(self) -> Message:
         """Template, scan, and behind them, packed as the page of the set has it, the template on the scan."""
         plain = super().scene()
-        shown = self.folder / PICTURES / f"{self.scan_names[self.current]}.scene"
+        name = self.scan_names[self.current]
+        entries = {entry.name: entry for entry in RegisteredSet.load(self.folder).entries}
+        shown = self.folder / pictures_place(entries.get(name)) / f"{name}.scene"
         return Message("scene", {"first": len(plain.data)},
                        plain.data + (shown.read_bytes() if shown.is_file() else b""))
 

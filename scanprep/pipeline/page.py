@@ -63,18 +63,25 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page.markup(_index(verdicts, entries))
     page.section("Worst first", _explanation(limits, size))
     page.picture(color_bar(0, FAR * size, "distance to the scan; grey: no data there"))
-    scenes = worst_that_turn([folder / PICTURES / f"{verdict.name}.scene" for verdict in verdicts])
-    pictures = carried((folder / PICTURES / f"{verdict.name}.webp" for verdict in verdicts), MOST_CARRIED)
+    shots = [folder / pictures_place(entries.get(verdict.name)) / verdict.name for verdict in verdicts]
+    scenes = worst_that_turn([shot.with_name(f"{shot.name}.scene") for shot in shots])
+    pictures = carried((shot.with_name(f"{shot.name}.webp") for shot in shots), MOST_CARRIED)
     look = max(FEW, sum(verdict.suspect or verdict.failed for verdict in verdicts))
     for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
-        shown = _shown(page, folder, verdict.name, picture, scene if number < look else None)
-        page.markup(_card(verdict, entries.get(verdict.name), shown))
+        entry = entries.get(verdict.name)
+        shown = _shown(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
+        page.markup(_card(verdict, entry, shown))
     if whole.skeleton is not None:
         page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
         page.bodies([Pane([Solid(whole.template, part_colors(whole.skeleton.part_of_face))],
                           look_around(whole.template, turns=(TURN,))[0])], "parts")
     page.write((to or folder) / PAGE)
     return (to or folder) / PAGE
+
+
+def pictures_place(entry: SetEntry | None) -> Path:
+    """The folder of a scan's pictures inside the set: beside that of its mesh."""
+    return Path(PICTURES) if entry is None else Path(entry.file).parent.parent / PICTURES
 
 
 def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]:
@@ -168,13 +175,13 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
             f"<ul>{reasons}</ul>{shown}{table}</section>")
 
 
-def _shown(page: Page, folder: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
+def _shown(page: Page, folder: Path, place: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
     """A scan that turns, or its picture: the page carries that, or finds it in the folder when it is scrolled to."""
     if picture is not None and scene is not None:
         return page.turning(scene, picture, height=300)
-    if picture is None and not (folder / PICTURES / f"{name}.webp").exists():
+    if picture is None and not (folder / place / f"{name}.webp").exists():
         return ""
-    source = data_uri(picture) if picture is not None else f"{PICTURES}/{quote(name)}.webp"
+    source = data_uri(picture) if picture is not None else quote((place / f"{name}.webp").as_posix())
     labels = "".join(f"<span>{escape(label)}</span>" for label in PANELS)
     return (f'<div><img src="{source}" alt="{escape(name)}: {", ".join(PANELS)}" '
             f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'

@@ -11,22 +11,21 @@ from pathlib import Path
 
 from ..batch.opening import workspace
 from ..batch.pool import Workers
-from ..batch.room import Room
 from ..batch.workspace import Task, Workspace
-from ..dataset import RegisteredSet, SetEntry, write_set
-from ..geometry.files import write_mesh
+from ..dataset import RegisteredSet, SetEntry, read_entries, write_set
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
 from ..registration.figures import ScanFigures, write_doubts, write_failures, write_figures
 from ..registration.lead import Lead, lead_of
-from ..registration.person import PersonParts, person_parts
+from ..registration.person import person_parts
 from ..registration.schedule import RegistrationConfig
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
-from .page import PICTURES, write_set_page
-from .scan import ScanSettings, register_scan
+from .bootstrap import bootstrap_set, registered_again
+from .page import write_set_page
+from .scan import RegisterScan, ScanSettings, mesh_file
 from .scans import ScanTask
 
 Progress = Callable[[int, int], None]
@@ -99,12 +98,18 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         if not space.results(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
         failures: dict[str, str] = {}
-        fresh: tuple[str, ...] = ()
+        fresh: set[str] = set()
         _write_tables(space, work, tasks, failures)
         try:
             done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress,
                              scan_progress)
-            failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
+            failures = {name.removeprefix(SCANS): line for name, line in done.failures.items()}
+            fresh = {name.removeprefix(SCANS) for name in done.fresh}
+            if config.scan.through not in ("none", "pose"):
+                _write_tables(space, work, tasks, failures)
+                fresh |= bootstrap_set(space, work, tasks, _first_figures(space, work), config.min_poses,
+                                       config.skeleton, config.workers, progress)
+                failures = {name: line for name, line in failures.items() if name not in registered_again(space, work)}
             _write_tables(space, work, tasks, failures)
             _write_skeleton(space, config, skeleton_progress)
         finally:
@@ -113,28 +118,6 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
                 write_set_page(space.folder, to=staged.folder)
     return Prepared(RegisteredSet.load(space.folder), tuple(figures[name] for name in sorted(figures)),
                     tuple(failures[name] for name in sorted(failures)), len(fresh))
-
-
-@dataclass(frozen=True, eq=False)
-class RegisterScan:
-    """The work on each scan: the template brought onto it."""
-
-    template: Mesh
-    landmarks: Mapping[str, int]
-    settings: ScanSettings
-    parts: PersonParts | None = None         # of the template, where it is a person
-    # what finds bodies on scans, where some have few landmarks or none: it follows from template and settings
-    lead: Lead | None = field(default=None, metadata={"digest": False})
-
-    def __call__(self, task: ScanTask, room: Room) -> ScanFigures:
-        found = register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts,
-                              room.tell, self.lead)
-        write_mesh(room.folder / mesh_file(task.name), self.template.with_vertices(found.vertices))
-        if found.picture:
-            (room.folder / PICTURES).mkdir()
-            (room.folder / PICTURES / f"{task.name}.webp").write_bytes(found.picture)
-            (room.folder / PICTURES / f"{task.name}.scene").write_bytes(found.scene)
-        return found.figures
 
 
 def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: str, progress: Progress | None
@@ -146,24 +129,21 @@ def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: 
     return space.step("lead", (template, through, model), lambda folder: lead_of(template, through, progress))
 
 
-def mesh_file(name: str) -> str:
-    """Where the mesh of a scan stands in a set."""
-    return f"meshes/{name}.ply"
-
-
 def _write_tables(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str]
                   ) -> dict[str, ScanFigures]:
     """Everything in the set but meshes, pictures, skeleton and page, of the results that are there: their figures."""
-    figures = {name.removeprefix(SCANS): found for name, found in space.results(work).items()
-               if name.startswith(SCANS)}
+    better = registered_again(space, work)
+    figures = _first_figures(space, work) | {name: found for name, (found, _) in better.items()}
     # scans of earlier calls stay, if all were registered in the same way
-    entries = {entry.name: entry for entry in RegisteredSet.load(space.folder).entries} \
+    names = {task.name for task in tasks}
+    entries = {entry.name: entry for entry in read_entries(space.folder, names)} \
         if (space.folder / "set.json").exists() else {}
-    lost = [name for name in entries if name not in figures and name not in {task.name for task in tasks}]
+    lost = [name for name in entries if name not in figures and name not in names]
     if lost:
         raise ValueError(f"{space.folder}: holds {len(lost)} other scans that were registered with "
                          f"another template, settings or scapekit ({', '.join(lost[:5])}); name another folder")
     entries |= {t.name: SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name)) for t in tasks}
+    entries |= {name: replace(entries[name], file=file) for name, (_, file) in better.items() if name in entries}
     with space.staging("tables") as staged:
         write_set(staged.folder, work.template, [entries[name] for name in sorted(entries) if name in figures],
                   {"settings": asdict(work.settings)})
@@ -173,6 +153,11 @@ def _write_tables(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
             write_doubts(staged.folder, {name: each.doubts for name, each in figures.items()})
         write_failures(staged.folder, failures)
     return figures
+
+
+def _first_figures(space: Workspace, work: RegisterScan) -> dict[str, ScanFigures]:
+    """The figures of all scans as they were registered first."""
+    return {name.removeprefix(SCANS): found for name, found in space.results(work).items() if name.startswith(SCANS)}
 
 
 def _write_skeleton(space: Workspace, config: PrepareConfig, progress: Progress | None) -> None:

@@ -2,15 +2,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 
-from ..batch.room import Progress
+from ..batch.room import Progress, Room
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..correspondence.search import CorrelatedConfig
-from ..geometry.files import read_scan
+from ..geometry.files import read_scan, write_mesh
 from ..geometry.landmarks import check_on_surface, read_landmarks, shared_landmarks
 from ..geometry.mesh import Mesh
 from ..judgement import beyond_people, extent
@@ -115,6 +117,42 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     figures = replace(figures_of(task.name, init, template, fit), removed=removed, doubts=doubts,
                       seconds=time.perf_counter() - start)
     return RegisteredScan(fit.mesh.vertices, figures, picture, scene)
+
+
+@dataclass(frozen=True, eq=False)
+class RegisterScan:
+    """The work on each scan: the template brought onto it."""
+
+    template: Mesh
+    landmarks: Mapping[str, int]
+    settings: ScanSettings
+    parts: PersonParts | None = None         # of the template, where it is a person
+    # what finds bodies on scans, where some have few landmarks or none: it follows from template and settings
+    lead: Lead | None = field(default=None, metadata={"digest": False})
+
+    def __call__(self, task: ScanTask, room: Room) -> ScanFigures:
+        found = self.register(task, room)
+        self.write(room.folder, task.name, found)
+        return found.figures
+
+    def register(self, task: ScanTask, room: Room) -> RegisteredScan:
+        """Bring the template onto a scan."""
+        return register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts, room.tell, self.lead)
+
+    def write(self, folder: Path, name: str, found: RegisteredScan) -> None:
+        """Write the mesh and the pictures of a scan into a folder."""
+        from .page import PICTURES
+
+        write_mesh(folder / mesh_file(name), self.template.with_vertices(found.vertices))
+        if found.picture:
+            (folder / PICTURES).mkdir()
+            (folder / PICTURES / f"{name}.webp").write_bytes(found.picture)
+            (folder / PICTURES / f"{name}.scene").write_bytes(found.scene)
+
+
+def mesh_file(name: str) -> str:
+    """Where the mesh of a scan stands in a set."""
+    return f"meshes/{name}.ply"
 
 
 def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:

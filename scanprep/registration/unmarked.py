@@ -4,7 +4,7 @@ Both are tried where the first leaves something to doubt, and the one that leave
 """
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,8 +53,12 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
     if lead is not None:
         for vertices in lead(scan, landmarks, model):
             fit = register(template, scan, landmarks, config, progress, start=vertices)
-            fit = repaired(template, scan, fit, parts, landmarks, config)
             found.append((weigh_doubts(template, parts, fit), fit, ", ".join([*clicked, f"model {lead.name}"])))
+            if not found[-1][0]:
+                return fit, found[-1][2]       # nothing to doubt: no other body is sought
+        _, fit, way = choose_clearly(found)
+        fit = repaired(template, scan, fit, parts, landmarks, config)
+        found.insert(0, (weigh_doubts(template, parts, fit), fit, way))
     if landmarks is None and all(doubt > 0 for doubt, _, _ in found):
         try:
             fit, pairs = register_unmarked(template, scan, config, search, progress)
@@ -65,8 +69,13 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
             if not registration_problem(template, scan, fit, marked=False):
                 fit = repaired(template, scan, fit, parts, None, config, correspondences=pairs)
             found.append((weigh_doubts(template, parts, fit), fit, number_of(len(pairs), "correspondence")))
+    return choose_clearly(found)[1:]
+
+
+def choose_clearly(found: Sequence[tuple[float, Registration, str]]) -> tuple[float, Registration, str]:
+    """The first of some registrations, or the one of least doubt where that leaves clearly less."""
     best = min(found, key=lambda one: one[0])
-    return (best if best[0] < CLEARLY * found[0][0] else found[0])[1:]
+    return best if best[0] < CLEARLY * found[0][0] else found[0]
 
 
 def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -> float:

@@ -1,0 +1,107 @@
+"""A set teaches itself: doubted scans are registered through a model of the scans that are not doubted."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from crab_scans import FAR, crab_body, crab_skeleton  # noqa: F401
+from jointed_bodies import bent
+from scan_folders import contents
+
+from scanprep import read_mesh, write_mesh
+from scanprep.batch.pool import Workers
+from scanprep.dataset import RegisteredSet
+from scanprep.pipeline import bootstrap
+from scanprep.pipeline import prepare as preparing
+from scanprep.pipeline import scan as one_scan
+from scanprep.pipeline.bootstrap import MODEL
+from scanprep.pipeline.page import judge_set
+from scanprep.pipeline.prepare import PrepareConfig, prepare
+from scanprep.pipeline.scan import ScanSettings
+from scanprep.pipeline.scans import find_scans
+from scanprep.registration.nonrigid import register
+from scanprep.registration.schedule import RegistrationConfig
+from scanprep.registration.unmarked import register_by_any
+
+BAD = "scan6", "scan7"                  # which the first registrations do not find
+QUICK = RegistrationConfig(tuple(replace(stage, nodes=60, ends=0) for stage in RegistrationConfig().near_stages[:3]))
+CONFIG = PrepareConfig(ScanSettings(QUICK, pictures=False), min_poses=5, workers=Workers(1))
+
+
+@pytest.fixture
+def truth(body, tmp_path):
+    """The crab in eight poses, each written as a scan of its own."""
+    rng, bodies = np.random.default_rng(3), {}
+    for k in range(8):
+        arms = rng.normal(0, 0.5, (2, 3)) if f"scan{k}" not in BAD else rng.normal(0, 0.1, (2, 3)) + FAR
+        vertices = bent(body, *arms) + rng.normal(size=3)
+        bodies[f"scan{k}"] = vertices
+        write_mesh(tmp_path / "scans" / f"scan{k}.ply", body.with_vertices(vertices))
+    return bodies
+
+
+@pytest.fixture
+def calls(truth, skeleton, monkeypatch):
+    """Scans that were registered, each with what led it; without a model those of `BAD` are lost."""
+    made = []
+
+    def first_then_model(template, scan, landmarks, lead, *args):
+        name = min(truth, key=lambda n: np.abs(truth[n].mean(axis=0) - scan.vertices.mean(axis=0)).max())
+        made.append((name, lead and lead.name))
+        if lead is not None:
+            return register_by_any(template, scan, landmarks, lead, *args)
+        if name == BAD[1]:
+            raise ValueError("no ends of limbs were found")
+        start = truth[name] if name not in BAD else template.vertices + truth[name].mean(axis=0)
+        return register(template, scan, config=QUICK, start=start), "a start"
+
+    monkeypatch.setattr(one_scan, "register_by_any", first_then_model)
+    for module in (bootstrap, preparing):                      # half a minute of search for three parts
+        monkeypatch.setattr(module, "find_skeleton", lambda template, *args, **named: skeleton)
+    return made
+
+
+def run(tmp_path, body, subject="crab", config=CONFIG):
+    return prepare(find_scans(tmp_path / "scans", "none", subject), body, {}, tmp_path / "set", config)
+
+
+def apart_mm(tmp_path, truth):
+    entries = RegisteredSet.load(tmp_path / "set").entries
+    return {e.name: 1e3 * np.linalg.norm(read_mesh(tmp_path / "set" / e.file).vertices - truth[e.name], axis=1).mean()
+            for e in entries}
+
+
+def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(tmp_path, body, truth, calls):
+    done = run(tmp_path, body)
+    assert not done.failures and done.fresh == 8
+    apart = apart_mm(tmp_path, truth)
+    assert set(apart) == set(truth) and max(apart.values()) < 40
+    assert all(1e3 * np.linalg.norm(body.vertices + truth[name].mean(axis=0) - truth[name], axis=1).mean() > 100
+               for name in BAD), "where they were before"
+    led = {f.name: f.init for f in done.figures}
+    assert {name for name, way in led.items() if way == "model of this set"} == set(BAD)
+    assert not [verdict for verdict in judge_set(tmp_path / "set") if verdict.suspect]
+    assert (tmp_path / "set" / "again1" / MODEL).is_file()
+    assert not (tmp_path / "set" / "failures.csv").exists()
+    # once more nothing is to be done, and a first registration is where it was
+    before, made = contents(tmp_path / "set"), len(calls)
+    assert run(tmp_path, body).fresh == 0 and len(calls) == made and contents(tmp_path / "set") == before
+
+
+def test_a_scan_that_becomes_good_by_itself_leaves_nothing_behind(tmp_path, body, truth, calls):
+    run(tmp_path, body)
+    write_mesh(tmp_path / "scans" / "scan7.ply", body.with_vertices(truth["scan0"] + [3.0, 0, 0]))
+    truth["scan7"] = truth["scan0"] + [3.0, 0, 0]
+    truth["scan7b"] = truth.pop("scan7")             # under a name that the first registration finds
+    truth = {("scan7" if name == "scan7b" else name): vertices for name, vertices in truth.items()}
+    done = run(tmp_path, body)
+    assert {f.name: f.init for f in done.figures}["scan7"] == "a start"
+    entries = {e.name: e.file for e in RegisteredSet.load(tmp_path / "set").entries}
+    assert entries["scan7"] == "meshes/scan7.ply" and not (tmp_path / "set" / "again1" / "meshes/scan7.ply").exists()
+
+
+@pytest.mark.parametrize(("subject", "through"), [("", "auto"), ("crab", "none")])
+def test_nothing_is_learned_from_one_pose_of_each_or_where_no_model_is_wanted(tmp_path, body, truth, calls, subject,
+                                                                              through):
+    done = run(tmp_path, body, subject, replace(CONFIG, scan=replace(CONFIG.scan, through=through)))
+    assert len(done.failures) == len(BAD) and {lead for _, lead in calls} == {None}
+    assert not (tmp_path / "set" / "again1").exists()
