@@ -159,7 +159,7 @@ class Arguments:
                        if p.name != SPACE and p.name not in self.settings.values]
         self.output_name = next((a.name for a in self.listed if a.name in ("output", "out")), "")
         flags = self.settings.flags
-        if self.output_name:
+        if self.wants_space:                # all others keep nothing that they could take as done
             flags[FORCE] = Flag((), bool, False, "Do all anew, whatever is done already.")
         self.listed += [Argument(name, flag.annotation, flag.value, flag.sentence) for name, flag in flags.items()]
 
