@@ -27,6 +27,8 @@ MM = 1000.0
 COMMANDS = {
     "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.",
             "scanprep.pipeline.cli:run_all"),
+    "landmarks": ("Scans that nobody clicked -> named landmarks with expected errors.",
+                  "scanprep.pipeline.landmarks:landmark_scans"),
     "page": ("The page of a registered set: every scan with pictures and figures, worst first.",
              "scanprep.pipeline.cli:page"),
     "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.surfaces.cli:clean"),

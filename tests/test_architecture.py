@@ -32,7 +32,7 @@ ROOMS = {
         "registration": "alignment cleaning correspondence geometry skeleton synthetic",
         "surfaces": "adapters alignment cleaning decimation fusion geometry repair skeleton",
         "viewer": "alignment batch depth_camera geometry pictures registration",
-        "pipeline": "batch cleaning correspondence geometry pictures registration skeleton viewer"},
+        "pipeline": "batch cleaning correspondence geometry pictures registration skeleton synthetic viewer"},
     "model": {
         "fitting": "", "learning": "fitting", "measurement": "", "motion": "", "resolution": "",
         "coregistration": "fitting learning",

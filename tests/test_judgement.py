@@ -359,6 +359,7 @@ COMMANDS = ("prep clean good.ply -o clean.ply", "prep fill good.ply -o filled.pl
 # Commands that take minutes or other inputs, and the tests that run them; an outcome without a judgement ends there.
 ELSEWHERE = {
     "test_scanprep_cli": ("prep run", "prep page", "prep views", "prep merge", "prep skeleton", "prep edit-skeleton"),
+    "test_scanprep_landmarks_command": ("prep landmarks",),
     "test_model_importing": ("model import",), "test_model_evaluation": ("model evaluate",),
     "test_model_coregistration": ("model coregister",), "test_model_character": ("model character",),
     "test_completion_cli": ("complete",), "test_completion_measuring": ("measure",),

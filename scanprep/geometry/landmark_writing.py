@@ -5,6 +5,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Literal
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -12,6 +13,18 @@ import numpy as np
 from .format_common import UNITS
 
 Points = Mapping[str, np.ndarray]
+Format = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd", "txt"]
+
+
+def landmark_ending(format: Format) -> str:
+    """What the name of a landmark file ends with, so that `landmarks_beside` finds it; tables and text are many things.
+
+    Examples
+    --------
+    >>> landmark_ending("pp"), landmark_ending("json")
+    ('.pp', '.landmarks.json')
+    """
+    return (".landmarks." if format in ("json", "csv", "txt") else ".") + format
 
 
 def as_bytes(name: str, points: Points, unit: str | None) -> bytes | None:

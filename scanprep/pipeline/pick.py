@@ -3,11 +3,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from ..arguments import Place
 from ..cli import MeshArg, Unit
 from ..console import Metric, Outcome, bar
+from ..geometry.landmark_writing import Format, landmark_ending
 from ..ranges import Range
 from ..viewer.clicked import Clicked
 from ..viewer.landmark_names import read_names
@@ -16,10 +17,9 @@ from .scans import find_scans
 
 ScansArg = Annotated[tuple[Path, ...], Place("[SCAN ...]")]
 Port = Annotated[int, Range(0, 65535)]
-Ending = Literal["json", "pp", "mrk.json", "fcsv", "scalismo.json", "csv", "lnd", "txt"]
 
 
-def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Ending = "json",
+def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Format = "json",
                    unit: Unit | None = None, serve: Port | None = None) -> Outcome:
     """Click named points on a template and on scans, in the browser. Every click is saved at once.
 
@@ -39,7 +39,7 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
         serve: Port to be looked at from another machine, 0 for any that is free: no browser is opened here, and how
             to reach it is printed.
     """
-    ending = (".landmarks." if format in ("json", "csv", "txt") else ".") + format
+    ending = landmark_ending(format)
     if (mesh / "set.json").exists():
         return _mended(mesh, scans, ending, names, unit, serve)
     template = Clicked.found(mesh, ending, None if scans else unit)      # as scape prep run reads it

@@ -145,6 +145,12 @@ BENCHMARKS = (
               "What `scape pick` offers when hands and toes were clicked, without error, on a virtual scan. Where we "
               "lose: pose 7, where it means nothing, and men of another shape than the template.",
               quick="predicted_landmarks.py --poses 2,32,43,67 --men 2,52"),
+    Benchmark("found_landmarks", "Landmarks of scans that nobody clicked", "found_landmarks.py SCRATCH",
+              scans.found_landmarks,
+              "`scape prep landmarks` with the template mesh000 on held-out poses of its person, on other men, and on "
+              "poses seen from the front. Constants of expected errors were chosen on the tuning set. Where we lose: "
+              "elbows of other men, knees that bend, and the trunk.",
+              quick="found_landmarks.py SCRATCH --poses 2,17 --men 2 --fronts ''"),
     Benchmark("fronts", "The front of a body in pictures", "fronts.py", scans.fronts,
               "Against the level direction square to hips, shoulders and waist. The last column numbers the poses "
               "that are beyond 60 degrees."),

@@ -186,6 +186,19 @@ def predicted_landmarks(report: dict) -> str:
                   "time (s CPU)"), rows)
 
 
+def found_landmarks(report: dict) -> str:
+    """Groups of landmarks beside their expected errors, and every scan."""
+    names = ("count", "median_mm", "mean_mm", "nine_of_ten_mm", "expected_mm")
+    groups = table(("landmarks", "count", "median (mm)", "mean (mm)", "nine of ten within (mm)", "expected, mean (mm)",
+                    "within once", "within twice"),
+                   [(group, *(f[n] for n in names), f"{f['within_once']:.0%}", f"{f['within_twice']:.0%}")
+                    for group, f in report["summary"].items()])
+    names = ("scan", "verdict", "median_mm", "mean_mm", "worst_mm", "worst", "guessed", "cpu_s")
+    scans = table(("scan", "verdict", "median (mm)", "mean (mm)", "worst (mm)", "the worst", "without data",
+                   "time (s CPU)"), [tuple(row[n] for n in names) for row in report["rows"]])
+    return f"{groups}\n\n{scans}"
+
+
 def signatures(report: dict) -> str:
     """Means over the poses of the correlation at every scale."""
     names = {"reference": "published registration", "slid": "the same, slid 4 mm at random", "ours": "ours"}
