@@ -33,7 +33,7 @@ from ..registration.person import average_person, find_landmarks
 from ..synthetic.landmarks import landmarks as landmarks_of_people
 from .cli import ScansArg
 from .page import judge_set, judge_whole
-from .prepare import PrepareConfig, mesh_file, prepare
+from .prepare import PrepareConfig, prepare
 from .scan import ScanSettings
 from .scans import ScanTask, find_scans
 
@@ -146,9 +146,9 @@ def write_all(tasks: Sequence[ScanTask], template: Mesh, marks: Mapping[str, int
     # a scan that failed now may have a file of an earlier run
     for name in failed:
         space.drop(POINTS + name)
-    work = FindPoints(dict(marks))
+    work, meshes = FindPoints(dict(marks)), {entry.name: entry.file for entry in done.registered.entries}
     found = space.run(work, [Task(POINTS + task.name, ScanAndBody(
-        task.scan, place / mesh_file(task.name), task.name + landmark_ending(format), config.scan.unit))
+        task.scan, place / meshes[task.name], task.name + landmark_ending(format), config.scan.unit))
         for task in tasks if task.name not in failed], config.workers, writing)
 
     # the table has the scans of earlier calls too, as the set has
