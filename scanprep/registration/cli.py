@@ -137,13 +137,15 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     given = Path(through) if through.endswith(".json") else None
     pairs, led_by = (None, [Metric("landmarks", 0)]) if given and landmarks is None else _read_landmarks(
         template, body, scan, data, landmarks, template_landmarks, unit)
-    with bar("finding the parts of a person") as progress:
-        parts = person_parts(body, progress)
     lead = None
     if given is None and through != "pose" and (pairs is None or len(pairs[0]) < FEW):
         with bar("laying the model on the template") as progress:
             lead = lead_of(body, through, progress)
-        parts = parts if lead is None else parts or lead.parts
+    # a model of people brings their parts along
+    parts = None if lead is None else lead.parts
+    if parts is None:
+        with bar("finding the parts of a person") as progress:
+            parts = person_parts(body, progress)
     if given or through == "pose" or (pairs is None and lead is None and through == "auto"):
         hints = read_correspondences(given) if given else None
         with bar("registering") as progress:
