@@ -20,7 +20,6 @@ from ..batch.room import Room
 from ..batch.workspace import Task, Workspace
 from ..geometry.farthest_points import farthest_points
 from ..geometry.files import read_mesh
-from ..geometry.mesh import Mesh
 from ..judgement import size
 from ..registration.figures import UNSEEN, ScanFigures, Verdict, review
 from ..registration.lead import lead_of, learn_model
@@ -54,7 +53,7 @@ class RegisterAgain:
 
     def __call__(self, given: DoubtedScan, room: Room) -> ScanFigures | None:
         found = self.first.register(given.scan, room)
-        if not judge_alone(found.figures, self.first.template).badness < CLEARLY * given.badness:
+        if not judge_alone(found.figures, self.first).badness < CLEARLY * given.badness:
             return None
         self.first.write(room.folder / folder_of(self.number), given.scan.name, found)
         return found.figures
@@ -74,10 +73,10 @@ def folder_of(number: int) -> str:
     return f"again{number}"
 
 
-def judge_alone(figures: ScanFigures, template: Mesh) -> Verdict:
+def judge_alone(figures: ScanFigures, work: RegisterScan) -> Verdict:
     """The verdict on one scan, whatever is usual in its set."""
-    return review([figures], {}, size(template), len(template.faces), doubts={figures.name: figures.doubts},
-                  usual=UNSEEN)[0]
+    doubts = None if work.parts is None else {figures.name: figures.doubts}
+    return review([figures], {}, size(work.template), len(work.template.faces), doubts=doubts, usual=UNSEEN)[0]
 
 
 def registered_again(space: Workspace, work: RegisterScan) -> dict[str, tuple[ScanFigures, str]]:
@@ -117,7 +116,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
     names of the scans that were registered again now
     """
     fresh = set[str]()
-    best = {name: judge_alone(f, work.template) for name, f in first.items()}
+    best = {name: judge_alone(f, work) for name, f in first.items()}
     files = {name: mesh_file(name) for name in best}
     for number in range(1, ROUNDS + 1):
         kept = f"{folder_of(number)}/"
@@ -146,7 +145,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         before = sum(not verdict.suspect for verdict in best.values())
         for figures in done.values.values():
             if figures is not None:
-                best[figures.name] = judge_alone(figures, work.template)
+                best[figures.name] = judge_alone(figures, work)
                 files[figures.name] = f"{folder_of(number)}/{mesh_file(figures.name)}"
         if sum(not verdict.suspect for verdict in best.values()) == before:
             for later in range(number + 1, ROUNDS + 1):

@@ -180,7 +180,7 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
         exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
     doubts = limb_doubts(template, parts, fit.mesh.vertices) if parts else ()
     verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
-                     len(template.faces), doubts={name: doubts}, usual=UNSEEN)[0]
+                     len(template.faces), doubts={name: doubts} if parts else None, usual=UNSEEN)[0]
     if parts is None or problem is not None:
         return verdict.judgement
     # of a body that is too large or too small the size is the cause, limbs out of shape are what comes of it

@@ -19,6 +19,10 @@ from .nonrigid import Registration, share_stretched
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
+# Weights of the logarithms of evidence; `certain` is the log-odds of a registration that nothing speaks against. Chosen
+# by tests/benchmarks/reliability.py FOLDER --part train --fit.
+WEIGHTS = {"certain": 3.0, "missed": 1.0, "distance": 1.0, "unseen": 1.0, "stretch": 1.0, "inverted": 1.0, "limbs": 1.0}
+EVIDENCE = tuple(WEIGHTS)[1:]
 FIGURES, TIMES, FAILURES, LIMBS = "registration.csv", "times.csv", "failures.csv", "limbs.csv"
 
 
@@ -93,8 +97,10 @@ def write_failures(folder: Path, failures: Mapping[str, str]) -> None:
         (folder / FAILURES).unlink(missing_ok=True)
 
 
-def read_doubts(folder: Path) -> dict[str, list[Doubt]]:
-    """What in each scan no person can do, the gravest first."""
+def read_doubts(folder: Path) -> dict[str, list[Doubt]] | None:
+    """What in each scan no person can do, the gravest first; None for a template that is no person."""
+    if not (folder / LIMBS).exists():
+        return None
     found: dict[str, list[Doubt]] = {}
     for row in _read(folder / LIMBS):
         found.setdefault(row["name"], []).append(Doubt(float(row["excess"]), row["reason"]))
@@ -136,6 +142,8 @@ class Limits(Settings):
     limbs : float
         What no person can do: joints that roll or bend too far, limbs whose skin is out of shape or that grew or
         shrank against the body. One is where it begins; double of it is 30 degrees more.
+    right : float
+        Probability that all is right, below which a registration without another reason needs a look.
     not_converged : float
         What a registration that did not converge counts, as a multiple of a limit; below 1 it is not suspect for
         that alone.
@@ -152,6 +160,7 @@ class Limits(Settings):
     landmarks: float = 0.015
     limbs: float = 1.0
     not_converged: float = 0.5
+    right: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -162,6 +171,7 @@ class Verdict:
     badness: float                  # the largest multiple of a limit; from 1 on it needs a look; infinite: it failed
     reasons: tuple[str, ...]        # what is over its limit, worst first; for a scan that failed, why
     figures: ScanFigures | None = None
+    right: float = 0.0              # probability, see `probability_right`; NaN for a template that is no person
 
     @property
     def failed(self) -> bool:
@@ -192,27 +202,62 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
         usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
     known = {f.name: f for f in figures}
     verdicts = [Verdict(name, np.inf, (reason,), known.get(name)) for name, reason in sorted(failures.items())]
-    judged = [_judge(f, size, faces, usual, limits, (doubts or {}).get(f.name, ())) for f in figures
+    judged = [_judge(f, size, faces, usual, limits, None if doubts is None else doubts.get(f.name, ()))
+              for f in figures
               if f.name not in failures]
     return verdicts + sorted(judged, key=lambda verdict: (-verdict.badness, verdict.name))
 
 
-def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt]) -> Verdict:
+def evidence_of(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt]
+                ) -> dict[str, float]:
+    """The evidence against a registration: each figure as a multiple of its limit, by the names of the limits.
+
+    `size` of the template in metres, the number of its `faces`, and the share of vertices that is `usual` without data.
+    Doubts count together. What has no value is 0.
+    """
+    multiples = {"missed": f.missed / limits.missed, "distance": f.distance / (limits.distance * size),
+                 "unseen": (1 - f.seen - usual) / limits.unseen, "stretch": f.stretch / limits.stretch,
+                 "inverted": f.inverted / faces / limits.inverted, "landmarks": f.landmarks / (limits.landmarks * size),
+                 "not_converged": 0.0 if f.converged else limits.not_converged,
+                 "limbs": sum(doubt.excess for doubt in doubts) / limits.limbs}
+    return {name: max(value, 0.0) if np.isfinite(value) else 0.0 for name, value in multiples.items()}
+
+
+def probability_right(evidence: Mapping[str, float]) -> float:
+    """How likely a person's registration is within 20 mm on average, and no part beyond 50 mm.
+
+    A logistic model of the logarithms of one plus each multiple of `evidence_of`; no evidence can speak for it.
+
+    Examples
+    --------
+    >>> sure = probability_right({"missed": 0.1, "stretch": 0.1})
+    >>> sure > probability_right({"missed": 20.0, "stretch": 0.1})
+    True
+    """
+    against = sum(WEIGHTS.get(name, 0.0) * np.log1p(value) for name, value in evidence.items())
+    return float(1 / (1 + np.exp(against - WEIGHTS["certain"])))
+
+
+def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt] | None
+           ) -> Verdict:
+    found = evidence_of(f, size, faces, usual, limits, doubts or ())
+    right = np.nan if doubts is None else probability_right(found) if f.seen else 0.0
     # share of a scan off the template that may be a second person, who is half of it
     over = {
         f"{100 * f.missed:.1f}% of the scan lies off the template: "
-        + ("a second person, or clutter?" if f.missed > 0.3 else "an uncovered limb, or clutter"):
-            f.missed / limits.missed,
-        f"{1000 * f.distance:.1f} mm from the scan on average": f.distance / (limits.distance * size),
+        + ("a second person, or clutter?" if f.missed > 0.3 else "an uncovered limb, or clutter"): found["missed"],
+        f"{1000 * f.distance:.1f} mm from the scan on average": found["distance"],
         f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here: a part of the body, or one view?":
-            (1 - f.seen - usual) / limits.unseen,
-        f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half":
-            f.stretch / limits.stretch,
-        f"{number_of(f.inverted, 'triangle')} inverted": f.inverted / faces / limits.inverted,
-        f"landmarks {1000 * f.landmarks:.0f} mm off": f.landmarks / (limits.landmarks * size),
-        "not converged": 0.0 if f.converged else limits.not_converged,
+            found["unseen"],
+        f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half": found["stretch"],
+        f"{number_of(f.inverted, 'triangle')} inverted": found["inverted"],
+        f"landmarks {1000 * f.landmarks:.0f} mm off": found["landmarks"],
+        "not converged": found["not_converged"],
         "nowhere near the scan": 0.0 if f.seen else 100.0,
-        **{doubt.words: doubt.excess / limits.limbs for doubt in doubts}}
-    over = {reason: value for reason, value in over.items() if np.isfinite(value)}
+        **{doubt.words: doubt.excess / limits.limbs for doubt in doubts or ()}}
     reasons = sorted((reason for reason, value in over.items() if value >= 1), key=lambda reason: -over[reason])
-    return Verdict(f.name, max(over.values()), tuple(reasons), f)
+    badness = max(over.values())
+    # several figures near their limits may say together what none says alone
+    if not reasons and right < limits.right:
+        reasons, badness = [f"all figures together leave {100 * right:.0f}% that it is right within 20 mm"], 1.0
+    return Verdict(f.name, badness, tuple(reasons), f, right)
