@@ -167,7 +167,8 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
                 ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("inverted triangles", f"{f.inverted}"),
                 *([("limbs rolled otherwise", "yes")] if f.rolled else []),
                 ("landmarks off, RMS", "–" if np.isnan(f.landmarks) else f"{1000 * f.landmarks:.1f} mm"),
-                ("converged", "yes" if f.converged else "no"))
+                ("converged", "yes" if f.converged else "no"),
+                *([("right within 20 mm, probability", f"{100 * verdict.right:.0f}%")] if verdict.right >= 0 else []))
         table = "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'
                                     for name, value in rows) + "</table>"
     return (f'<section class="scan {_mark(verdict)}" id="{_anchor(verdict)}"><h3><span class="dot"></span>'
