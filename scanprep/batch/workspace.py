@@ -74,7 +74,8 @@ class Workspace:
         self.folder, self.home, self.force, self.output = folder, home, force, output
         self.digests = Digests(home / "files.json")
         self.is_new = False                 # this run made the folder
-        self.all_failed = False             # there were tasks, and none of them was done
+        self.all_failed = False             # there were tasks, and of all that were run none was done
+        self._some_done = False
         self._made: set[str] = set()
 
     @cached_property
@@ -118,7 +119,8 @@ class Workspace:
             for job in jobs:
                 shutil.rmtree(job.folder, ignore_errors=True)
         failures = {name: one.reason for name, one in outcomes.items() if isinstance(one, Failure)}
-        self.all_failed |= bool(tasks) and len(failures) == len(tasks)
+        self._some_done |= len(failures) < len(tasks)
+        self.all_failed = not self._some_done and (self.all_failed or bool(tasks))
         return Results({name: value for name, value in outcomes.items() if name not in failures}, failures,
                        tuple(job.name for job in jobs if job.name not in failures))
 

@@ -52,7 +52,10 @@ class RegisterAgain:
     number: int                     # of the round, from 1
 
     def __call__(self, given: DoubtedScan, room: Room) -> ScanFigures | None:
-        found = self.first.register(given.scan, room)
+        try:
+            found = self.first.register(given.scan, room)
+        except ValueError:              # the model does not find it either: the first registration stays, or its reason
+            return None
         if not judge_alone(found.figures, self.first).badness < CLEARLY * given.badness:
             return None
         self.first.write(room.folder / folder_of(self.number), given.scan.name, found)

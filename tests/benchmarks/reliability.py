@@ -64,17 +64,17 @@ def change(what: str, scan: Mesh, truth: np.ndarray, parts: PersonParts, body: M
 
 
 def chosen(part: str, count: int) -> list[tuple[str, int, str]]:
-    """Kind, number and change of so many scans: half of them poses, every second man as he is."""
+    """Kind, number and change of so many scans: half of them poses, most as they are."""
     rng, held = random.Random(2), part == "held"
     poses = [k for k in range(1, 71) if (k % 5 == 2) == held]
     men = [k for k in range(227) if (k % 5 == 2) == held]
     rng.shuffle(poses)
     rng.shuffle(men)
-    changes = ("plain", "turned", "clutter", "waist", "down")
+    changes = ("plain", "turned", "plain", "waist", "plain", "down", "plain", "clutter")
     out = []
     for k in range(count // 2):
-        out.append(("pose", poses[k % len(poses)], changes[(k + k // len(poses)) % 5]))
-        out.append(("man", men[k % len(men)], "plain" if k % 2 else changes[(k // 2) % 5]))
+        out.append(("pose", poses[k % len(poses)], changes[(k + k // len(poses)) % 8]))
+        out.append(("man", men[k % len(men)], changes[(k + 4) % 8]))
     return out
 
 
