@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from crab_scans import FAR, crab_body, crab_skeleton  # noqa: F401
-from jointed_bodies import bent
+from crab_scans import FAR
+from jointed_bodies import bent, crab
 from scan_folders import contents
 
 from scanprep import read_mesh, write_mesh
@@ -21,6 +21,7 @@ from scanprep.pipeline.scans import find_scans
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.registration.unmarked import register_by_any
+from scanprep.skeleton.tree import Skeleton
 
 BAD = "scan6", "scan7"                  # which the first registrations do not find
 QUICK = RegistrationConfig(tuple(replace(stage, nodes=60, ends=0) for stage in RegistrationConfig().near_stages[:3]))
@@ -28,14 +29,38 @@ CONFIG = PrepareConfig(ScanSettings(QUICK, pictures=False), min_poses=5, workers
 
 
 @pytest.fixture
-def truth(body, tmp_path):
+def scale():
+    return 1.0
+
+
+@pytest.fixture(scope="module")
+def at_rest():
+    return crab()
+
+
+@pytest.fixture
+def body(at_rest, scale):
+    return at_rest.with_vertices(scale * at_rest.vertices)
+
+
+@pytest.fixture
+def skeleton(at_rest, scale):
+    """A trunk and two arms."""
+    across = at_rest.corners.mean(axis=1)[:, 0]
+    part, joints = np.select([across < -0.2, across > 0.2], [1, 2], 0), np.array([[0, 0, 0], [-0.2, 0, 0], [0.2, 0, 0]])
+    joints[0] = at_rest.vertices[Skeleton(part, [-1, 0, 0], joints).part_of_vertex(at_rest) == 0].mean(axis=0)
+    return Skeleton(part, [-1, 0, 0], scale * joints)
+
+
+@pytest.fixture
+def truth(at_rest, scale, tmp_path):
     """The crab in eight poses, each written as a scan of its own."""
     rng, bodies = np.random.default_rng(3), {}
     for k in range(8):
         arms = rng.normal(0, 0.5, (2, 3)) if f"scan{k}" not in BAD else rng.normal(0, 0.1, (2, 3)) + FAR
-        vertices = bent(body, *arms) + rng.normal(size=3)
+        vertices = scale * (bent(at_rest, *arms) + rng.normal(size=3))
         bodies[f"scan{k}"] = vertices
-        write_mesh(tmp_path / "scans" / f"scan{k}.ply", body.with_vertices(vertices))
+        write_mesh(tmp_path / "scans" / f"scan{k}.ply", at_rest.with_vertices(vertices))
     return bodies
 
 
@@ -70,12 +95,14 @@ def apart_mm(tmp_path, truth):
             for e in entries}
 
 
-def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(tmp_path, body, truth, calls):
+@pytest.mark.parametrize("scale", [1.0, 0.2])
+def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(tmp_path, body, truth, calls, scale):
+    """Of whatever size: a crab of two metres, or of a hand and a half."""
     done = run(tmp_path, body)
     assert not done.failures and done.fresh == 8
     apart = apart_mm(tmp_path, truth)
-    assert set(apart) == set(truth) and max(apart.values()) < 40
-    assert all(1e3 * np.linalg.norm(body.vertices + truth[name].mean(axis=0) - truth[name], axis=1).mean() > 100
+    assert set(apart) == set(truth) and max(apart.values()) < 40 * scale
+    assert all(1e3 * np.linalg.norm(body.vertices + truth[name].mean(axis=0) - truth[name], axis=1).mean() > 100 * scale
                for name in BAD), "where they were before"
     led = {f.name: f.init for f in done.figures}
     assert {name for name, way in led.items() if way == "model of this set"} == set(BAD)

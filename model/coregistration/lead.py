@@ -25,11 +25,10 @@ from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..files import BUILT_IN, load_model
-from ..fitting.bodies import as_body
+from ..fitting.bodies import FixedBody, as_body
 from ..fitting.limbs import with_limbs
 from ..fitting.rounds import solve_jointly
-from ..fitting.scan import prepare_scan
-from ..fitting.scan_fit import ScanFit, scan_fit
+from ..fitting.scan_fit import ScanFit, sized_scan_fit
 from ..fitting.settings import ScanFitConfig
 from ..fitting.starts import best_starts, first_starts, from_nothing
 from ..learning.config import LearnConfig
@@ -39,8 +38,9 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 # of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is another
 # thing than the model; a woman has 0.004 and 0.0002, a crab 0.005 and 0.088
 OTHER = 0.02, 0.05
-ALIKE = 0.02       # metres: bodies no vertex of which is farther apart come to the same end
-FAR, LOST = 0.06, 0.005        # metres off a body, and share of the scan that is: a hand is 0.02 of a man
+# Of the body's size: bodies no vertex of which is farther apart come to the same end; so far off a body is what a limb
+# that is elsewhere leaves uncovered; and the share of a scan that is then lost, where a hand is 0.02 of a man.
+ALIKE, FAR, LOST = 0.015, 0.045, 0.005
 # a first model of a set only has to find bodies: a tenth of the time of `scape learn`
 LEARNING = LearnConfig(prunings=(0.01,), ridges=(0.003, 0.03), refinements=1)
 NO_LANDMARKS = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
@@ -88,23 +88,28 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
     landmarks : (L,) int and (L, 3) float, metres, optional
         Few vertices of the model and where they are on the scan.
     """
-    fit, few, starts = _search(model, scan, landmarks or NO_LANDMARKS)
-    first = model.template.with_vertices(fit.body.vertices(_solve(fit, few, starts[0])))
+    body, size = as_body(model), float(np.sqrt(model.template.face_areas.sum()))
+    fit, few, starts = _search(body, scan, landmarks or NO_LANDMARKS)
+
+    def mesh_of(x: np.ndarray) -> Mesh:
+        """The body of unknowns (P,) at its own size."""
+        return model.template.with_vertices(body.vertices(fit.body.in_metres(x)[0]))
+
+    first = mesh_of(_solve(fit, few, starts[0]))
     # what is left uncovered so far off is a limb that is elsewhere; nobody needs to look at such a body
-    lost = uncovered_share(scan, first, FAR) > LOST
+    lost = uncovered_share(scan, first, FAR * size) > LOST
     if not lost:
         yield first
-    bodies = _solve_with_limbs(fit, few, starts)
-    for x in bodies:
-        body = model.template.with_vertices(fit.body.vertices(x))
-        if lost or np.linalg.norm(body.vertices - first.vertices, axis=1).max() > ALIKE:
-            yield body
+    for x in _solve_with_limbs(fit, few, starts):
+        other = mesh_of(x)
+        if lost or np.linalg.norm(other.vertices - first.vertices, axis=1).max() > ALIKE * size:
+            yield other
 
 
 @one_thread()
-def _search(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks) -> tuple[ScanFit, ScanFit, np.ndarray]:
+def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks) -> tuple[ScanFit, ScanFit, np.ndarray]:
     """The fit of a scan, the same with few vertices, and the unknowns (n, P) of the likeliest bodies, best first."""
-    fit = scan_fit(as_body(model), prepare_scan(scan), *landmarks, ScanFitConfig())
+    fit, _ = sized_scan_fit(body, scan, *landmarks, ScanFitConfig())
     few = fit.few()
     starts = first_starts(fit, few)
     if len(landmarks[0]) >= 3:                 # few landmarks leave much open: also bodies that begin without

@@ -15,17 +15,15 @@ from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..features import twists
-from ..fitting.bodies import FixedBody, ResizedBody, as_body
+from ..fitting.bodies import FixedBody, as_body
 from ..fitting.limbs import limbs_amiss, reinitialise_limbs, with_limbs
 from ..fitting.rounds import meet_vertices, solve_jointly
-from ..fitting.scan import prepare_scan
-from ..fitting.scan_fit import ScanFit, scan_fit
+from ..fitting.scan_fit import ScanFit, sized_scan_fit
 from ..fitting.starts import best_starts, first_starts
 from ..linear import Subject
 from .config import CoregistrationConfig
 
 Landmarks = tuple[np.ndarray, np.ndarray]
-PERSON = 1.36                        # metres: root of the surface area of a person
 EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
 ENOUGH = 0.98                        # share of a scan that a start must explain for no other to be sought
 # of the misfit of a start that explains its scan, below which another is better: of a crab, a body that lay the other
@@ -115,12 +113,8 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     given: Landmarks = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
     vertices, points = checked_pairs(body.template, *given, "landmarks", 0)
     target = target_of(scan)
-    # lengths of the search are those of a person: bodies of another size are searched for as large as one
-    size = float(np.sqrt(body.template.face_areas.sum()))
-    factor = 1.0 if 0.5 < size / PERSON < 2 else PERSON / size
-    person = as_body(body)
-    fit = scan_fit(person if factor == 1 else ResizedBody(person, factor), prepare_scan(scan, metres=factor), vertices,
-                   factor * points, config.fit)
+    size, person = float(np.sqrt(body.template.face_areas.sum())), as_body(body)
+    fit, factor = sized_scan_fit(person, scan, vertices, points, config.fit)
     # 1. pose, place and betas by matches alone
     x, tried = _pose_and_shape(fit, None if start is None else _given(fit, start, factor))
     tell(1, 2)

@@ -14,16 +14,17 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..priors import LEAST_POSES, GaussianPrior, JointLimits, gaussian_prior
 from . import energy
-from .bodies import FixedBody
+from .bodies import FixedBody, ResizedBody
 from .free_space import Clothing, Contact, Outside, Violation, find_cameras, free_space_violation
 from .pull import Pull
-from .scan import ScanPoints, spread
+from .scan import ScanPoints, prepare_scan, spread
 from .settings import ScanFitConfig
 from .upright import TILT, Upright
 
 Terms = dict[str, Residual]
 
 LIKELY = 0.04                        # metres: matches closer than this are mostly right
+PERSON = 1.36                        # metres: root of the surface area of a person
 REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches, first and last
 DAMPING = 1e-3, 1e-1                 # of the first step for a matching, and of another one where that lowers nothing
 FEW = 3000                           # vertices that a search takes
@@ -353,6 +354,19 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
     upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
     return ScanFit(sample, ScanData(cloud, config), vertices, points, prior, limits, upright,
                    config.scan_points, config, np.random.default_rng(config.seed))
+
+
+def sized_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndarray, points: np.ndarray,
+                   config: ScanFitConfig) -> tuple[ScanFit, float]:
+    """A body of any size and a scan, ready to be fitted, and the factor by which both were made larger for it.
+
+    Lengths of the search are those of a person: a hand or a horse is searched for as large as one. `vertices` (L,) int
+    and `points` (L, 3), metres, are landmarks, none or more.
+    """
+    size = float(np.sqrt(body.template.face_areas.sum()))
+    factor = 1.0 if 0.5 < size / PERSON < 2 else PERSON / size
+    sized = body if factor == 1 else ResizedBody(body, factor)
+    return scan_fit(sized, prepare_scan(scan, metres=factor), vertices, factor * points, config), factor
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,10 +173,10 @@ def choose_lessons(folder: Path, tasks: Sequence[ScanTask], best: Mapping[str, V
 
 def _teach(place: Path, work: RegisterScan, config: SkeletonConfig, lessons: Lessons, folder: Path) -> None:
     """Write a model of meshes that are good, with the parts of a person, or those that the poses show."""
-    poses = np.stack([read_mesh(file).vertices for file in lessons.poses])
+    poses = np.stack([read_mesh(file, unit="m").vertices for file in lessons.poses])
     if len(poses) > MOST:           # those that differ most from one another
         poses = poses[farthest_points((poses - poses.mean(axis=1, keepdims=True)).reshape(len(poses), -1), MOST)]
-    shapes = np.stack([read_mesh(file).vertices for file in lessons.shapes]) if lessons.shapes else None
+    shapes = np.stack([read_mesh(file, unit="m").vertices for file in lessons.shapes]) if lessons.shapes else None
     skeleton = find_skeleton(work.template, poses, config) if work.parts is None else work.parts.skeleton
     (folder / place).parent.mkdir(parents=True, exist_ok=True)
     learn_model(work.template, skeleton, poses, shapes, folder / place)
