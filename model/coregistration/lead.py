@@ -28,7 +28,7 @@ from ..files import BUILT_IN, load_model
 from ..fitting.bodies import FixedBody, as_body
 from ..fitting.limbs import with_limbs
 from ..fitting.rounds import solve_jointly
-from ..fitting.scan_fit import ScanFit, sized_scan_fit
+from ..fitting.scan_fit import ScanFit, prepare_scan_fit
 from ..fitting.settings import ScanFitConfig
 from ..fitting.starts import best_starts, first_starts, from_nothing
 from ..learning.config import LearnConfig
@@ -109,7 +109,7 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
 @one_thread()
 def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks) -> tuple[ScanFit, ScanFit, np.ndarray]:
     """The fit of a scan, the same with few vertices, and the unknowns (n, P) of the likeliest bodies, best first."""
-    fit, _ = sized_scan_fit(body, scan, *landmarks, ScanFitConfig())
+    fit, _ = prepare_scan_fit(body, scan, *landmarks, ScanFitConfig())
     few = fit.few()
     starts = first_starts(fit, few)
     if len(landmarks[0]) >= 3:                 # few landmarks leave much open: also bodies that begin without

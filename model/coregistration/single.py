@@ -18,7 +18,7 @@ from ..features import twists
 from ..fitting.bodies import FixedBody, as_body
 from ..fitting.limbs import limbs_amiss, reinitialise_limbs, with_limbs
 from ..fitting.rounds import meet_vertices, solve_jointly
-from ..fitting.scan_fit import ScanFit, sized_scan_fit
+from ..fitting.scan_fit import ScanFit, prepare_scan_fit
 from ..fitting.starts import best_starts, first_starts
 from ..linear import Subject
 from .config import CoregistrationConfig
@@ -114,7 +114,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     vertices, points = checked_pairs(body.template, *given, "landmarks", 0)
     target = target_of(scan)
     size, person = float(np.sqrt(body.template.face_areas.sum())), as_body(body)
-    fit, factor = sized_scan_fit(person, scan, vertices, points, config.fit)
+    fit, factor = prepare_scan_fit(person, scan, vertices, points, config.fit)
     # 1. pose, place and betas by matches alone
     x, tried = _pose_and_shape(fit, None if start is None else _given(fit, start, factor))
     tell(1, 2)

@@ -356,7 +356,7 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
                    config.scan_points, config, np.random.default_rng(config.seed))
 
 
-def sized_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndarray, points: np.ndarray,
+def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndarray, points: np.ndarray,
                    config: ScanFitConfig) -> tuple[ScanFit, float]:
     """A body of any size and a scan, ready to be fitted, and the factor by which both were made larger for it.
 

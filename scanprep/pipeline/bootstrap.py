@@ -82,7 +82,7 @@ def judge_alone(figures: ScanFigures, work: RegisterScan) -> Verdict:
     return review([figures], {}, size(work.template), len(work.template.faces), doubts=doubts, usual=UNSEEN)[0]
 
 
-def registered_again(space: Workspace, work: RegisterScan) -> dict[str, tuple[ScanFigures, str]]:
+def find_better_scans(space: Workspace, work: RegisterScan) -> dict[str, tuple[ScanFigures, str]]:
     """Scans whose later registration was better: their figures, and where the mesh is inside the set."""
     found = {}
     for number in range(1, ROUNDS + 1):

@@ -132,7 +132,8 @@ def _explanation(limits: Limits, size: float) -> str:
         f"{100 * limits.inverted:.3g}% of the triangles inverted, landmarks {1000 * limits.landmarks * size:.0f} mm "
         f"off. A registration that did not converge counts {limits.not_converged:.3g}. On a template that is a person, "
         "joints that roll or bend as no person's do and limbs whose skin is out of shape count too: a rolled limb lies "
-        "on the scan as well as the right one.\n\n"
+        "on the scan as well as the right one. All figures together make a probability that it is right within 20 mm; "
+        f"below {100 * limits.right:.0f}% a scan needs a look.\n\n"
         "To mend a scan, correct its landmarks or click more of them where it went wrong and run the same command "
         "again: only scans whose files have changed are registered anew. `scape pick` with the folder of this set "
         "does both in the browser.")

@@ -23,7 +23,7 @@ from ..registration.schedule import RegistrationConfig
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
-from .bootstrap import bootstrap_set, registered_again
+from .bootstrap import bootstrap_set, find_better_scans
 from .page import write_set_page
 from .scan import RegisterScan, ScanSettings, mesh_file
 from .scans import ScanTask
@@ -109,7 +109,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
                 _write_tables(space, work, tasks, failures)
                 fresh |= bootstrap_set(space, work, tasks, _first_figures(space, work), config.min_poses,
                                        config.skeleton, config.workers, progress)
-                failures = {name: line for name, line in failures.items() if name not in registered_again(space, work)}
+                failures = {name: line for name, line in failures.items() if name not in find_better_scans(space, work)}
             _write_tables(space, work, tasks, failures)
             _write_skeleton(space, config, skeleton_progress)
         finally:
@@ -132,7 +132,7 @@ def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: 
 def _write_tables(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str]
                   ) -> dict[str, ScanFigures]:
     """Everything in the set but meshes, pictures, skeleton and page, of the results that are there: their figures."""
-    better = registered_again(space, work)
+    better = find_better_scans(space, work)
     figures = _first_figures(space, work) | {name: found for name, (found, _) in better.items()}
     # scans of earlier calls stay, if all were registered in the same way
     names = {task.name for task in tasks}
