@@ -1,20 +1,23 @@
 """Registration through a model: a body that is found on a scan takes the template along."""
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from jointed_bodies import bent, crab
+from scan_folders import QUICK, ball
 from test_scanprep_registration_start import BEND, small
 
 from model.coregistration.lead import model_lead
-from scanprep import read_mesh, write_mesh
+from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.cli import group
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
+from scanprep.registration.cli import judge_registration
 from scanprep.registration.lead import lead_of
 from scanprep.registration.nonrigid import register
-from scanprep.registration.unmarked import register_by_any, weigh_doubts
+from scanprep.registration.unmarked import find_rival, register_by_any, weigh_doubts
 from scanprep.synthetic.people import BodyShape, Person, named_pose
 
 
@@ -59,9 +62,47 @@ def test_what_leaves_less_to_doubt_is_kept(body, scan, far):
             right = near(scan)
             return [(right - middle) @ exp(np.array([0, 0, np.pi])).T + middle, right]
 
-    fit, led_by = register_by_any(body, there, None, TwoBodies(), config=small())
-    assert off(fit.mesh.vertices, there.vertices) < 0.008 and led_by == "model crabs"
-    assert weigh_doubts(body, None, fit) == 0 and max(asked) < 100
+    led = register_by_any(body, there, None, TwoBodies(), config=small())
+    assert off(led.fit.mesh.vertices, there.vertices) < 0.008 and led.way == "model crabs" and led.rival is None
+    assert weigh_doubts(body, None, led.fit) == 0 and max(asked) < 100
+
+
+@pytest.mark.parametrize("far", [0.0, 4e6])
+def test_two_bodies_that_explain_a_scan_alike_are_both_kept(far):
+    """An egg looks the same when it is turned round; something beside it leaves as much to doubt of both."""
+    egg, clutter = ball(), np.array([1.0, 0, 0]) + 0.01 * np.arange(6)[:, None]
+    back = egg.vertices * [-1, -1, 1]
+    scan = Mesh(np.vstack([egg.vertices, clutter]) + far, egg.faces)
+
+    class Eggs:
+        name, parts = "eggs", None
+
+        def __init__(self, *bodies):
+            self.bodies = bodies
+
+        def __call__(self, scan, landmarks=None, model=None):
+            middle = scan.vertices[:len(egg.vertices)].mean(axis=0)
+            return [body + middle for body in self.bodies]
+
+    def lead_by(*bodies):
+        return register_by_any(egg, scan, None, Eggs(*bodies), config=QUICK.scan.registration)
+
+    led = lead_by(egg.vertices, back)
+    assert off(led.fit.mesh.vertices, egg.vertices + far) < 0.008 > off(led.rival.fit.mesh.vertices, back + far)
+    assert led.rival.way == "model eggs" and led.rival.rival is None
+    assert lead_by(egg.vertices, egg.vertices + 0.01).rival is None             # the same body
+    # a limb that the scan does not show makes no other body; the same limb, seen, does
+    moved = replace(led.fit, mesh=egg.with_vertices(led.fit.mesh.vertices + (egg.vertices[:, 2:] > 0.6) * [0.5, 0, 0]))
+    for seen in (True, False):
+        hidden = [replace(fit, seen=(egg.vertices[:, 2] < 0.6) | seen) for fit in (led.fit, moved)]
+        best, other = ((0.0, fit, "") for fit in hidden)
+        assert find_rival(egg, best, [best, other]) == (other if seen else None)
+        assert find_rival(egg, best, [best, (0.1, *other[1:])]) is None         # one that leaves more to doubt
+    assert lead_by(egg.vertices, back + [0.5, 0, 0]).rival is None              # one that explains less
+    fit = register(egg, egg, start=egg.vertices, config=QUICK.scan.registration)
+    assert judge_registration("egg", egg, egg, fit, None, None).verdict == "good"
+    told = judge_registration("egg", egg, egg, fit, None, None, has_rival=True)
+    assert told.verdict == "check" and told.reasons[0].startswith("another body explains the scan as well")
 
 
 def test_without_a_lead_ends_of_limbs_are_needed(body):

@@ -18,7 +18,7 @@ from scanprep.pipeline.bootstrap import MODEL
 from scanprep.pipeline.prepare import PrepareConfig, prepare
 from scanprep.pipeline.scan import ScanSettings
 from scanprep.pipeline.scans import find_scans
-from scanprep.registration.nonrigid import register
+from scanprep.registration.nonrigid import LedRegistration, register
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.registration.unmarked import register_by_any
 from scanprep.skeleton.tree import Skeleton
@@ -77,7 +77,7 @@ def calls(truth, skeleton, monkeypatch):
         if name == BAD[1]:
             raise ValueError("no ends of limbs were found")
         start = truth[name] if name not in BAD else template.vertices + truth[name].mean(axis=0)
-        return register(template, scan, config=QUICK, start=start), "a start"
+        return LedRegistration(register(template, scan, config=QUICK, start=start), "a start")
 
     monkeypatch.setattr(one_scan, "register_by_any", first_then_model)
     for module in (bootstrap, preparing):                      # half a minute of search for three parts

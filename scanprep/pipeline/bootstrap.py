@@ -3,7 +3,7 @@
     scans --register--> good: learn a model of them --> doubted: register through it --better?--> good, and once more
 
 The model knows this body and how it moves, where the built-in people know people in general; and it is there for
-animals and hands too. Scans with landmarks are left as they are.
+animals and hands too. Scans with landmarks are left as they are, and those for which somebody chose between two bodies.
 """
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from ..registration.figures import UNSEEN, ScanFigures, Verdict, review
 from ..registration.lead import lead_of, learn_model
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
+from .rivals import is_chosen
 from .scan import RegisterScan, mesh_file
 from .scans import ScanTask
 
@@ -92,6 +93,12 @@ def find_better_scans(space: Workspace, work: RegisterScan) -> dict[str, tuple[S
     return found
 
 
+def drop_rounds(space: Workspace, name: str) -> None:
+    """Remove the later registrations of a scan."""
+    for number in range(1, ROUNDS + 1):
+        space.drop(f"{folder_of(number)}/{name}")
+
+
 def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], first: Mapping[str, ScanFigures],
                   min_poses: int, skeleton: SkeletonConfig, workers: Workers, progress: Progress | None = None
                   ) -> set[str]:
@@ -121,10 +128,11 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
     fresh = set[str]()
     best = {name: judge_alone(f, work) for name, f in first.items()}
     files = {name: mesh_file(name) for name in best}
+    chosen = {name for name in best if is_chosen(space.folder, name)}
     for number in range(1, ROUNDS + 1):
         kept = f"{folder_of(number)}/"
-        doubted = [task for task in tasks
-                   if task.landmarks is None and (task.name not in best or best[task.name].suspect)]
+        doubted = [task for task in tasks if task.landmarks is None and task.name not in chosen
+                   and (task.name not in best or best[task.name].suspect)]
         lessons = choose_lessons(space.folder, tasks, best, files, min_poses)
         if lessons is not None and not lessons.shapes:          # it knows the body of one subject alone
             doubted = [task for task in doubted if task.subject == lessons.subject]

@@ -20,7 +20,7 @@ from ..geometry.mesh import Mesh
 from ..registration.figures import Limits, Verdict
 from .again import LISTED, Call
 from .page import PAGE, judge_set, judge_whole, write_set_page
-from .prepare import PrepareConfig, Progress, prepare
+from .prepare import PrepareConfig, Prepared, Progress, prepare
 from .scans import ScanTask
 
 ScansArg = Annotated[Path, Place("SCANS")]
@@ -67,10 +67,15 @@ def carry_out(call: Call, given: tuple[list[ScanTask], Mesh, dict[str, int]], sp
     done = prepare(tasks, body, marks, space.folder, call.config, *tell)
     with space.staging("run") as staged:
         call.write(staged.folder)
+    return summarize(call, len(tasks), done, space)
+
+
+def summarize(call: Call, count: int, done: Prepared, space: Workspace) -> Outcome:
+    """What became of a number of scans in a set that is open."""
     verdicts, tree = judge_set(space.folder), done.registered.skeleton
     seconds = [f.seconds for f in done.figures if np.isfinite(f.seconds)]
     ways = Counter(f.init.lstrip("0123456789 ") for f in done.figures)        # without the number of landmarks
-    rows = [Metric("scans registered", f"{len(tasks) - len(done.failures)} of {len(tasks)}"),
+    rows = [Metric("scans registered", f"{count - len(done.failures)} of {count}"),
             Metric("of them in this run", done.fresh),
             *(Metric(f"led by {way}", count) for way, count in sorted(ways.items())),
             Metric("time a scan, mean", float(np.mean(seconds)) if seconds else "", "s"),

@@ -21,8 +21,11 @@ from ..viewer.clicked import Clicked
 from ..viewer.messages import Message
 from ..viewer.results import ResultsApp
 from .again import Call
-from .cli import carry_out
+from .cli import carry_out, summarize
 from .page import judge_set, pictures_place
+from .prepare import take_rival
+from .rivals import has_rival
+from .scan import mesh_file
 from .scans import ScanTask, means_none
 
 WORK = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
@@ -46,7 +49,7 @@ class MendApp(ResultsApp):
         if self.call.config.scan.through == "pose" or means_none(self.call.landmarks):
             raise ValueError(f"{folder}: it was made with --through pose or --landmarks none, which use none: "
                              "there are no landmarks to mend")
-        self.verdicts = self.read_results()
+        self.show_results(self.read_results())
         tasks = {task.name: task for task in self.call.tasks()}
         worst = [name for name in self.verdicts if name in tasks]
         self.scan_names = [*worst, *(name for name in tasks if name not in self.verdicts)]
@@ -80,9 +83,10 @@ class MendApp(ResultsApp):
                 reason.removeprefix(f"{one.path}: ") for reason in verdict.judgement.reasons))
 
     def more(self) -> dict[str, Any]:
-        """Which scans have been changed, besides."""
+        """Which scans have been changed, besides, and which have another body to choose."""
         return {**super().more(), "changed": [self.scan_names[i] for i in sorted(self.changed) if i >= 0],
-                "template_changed": -1 in self.changed, "set": str(self.folder)}
+                "template_changed": -1 in self.changed, "set": str(self.folder),
+                "rivals": [name in self.rivals for name in self.scan_names]}
 
     # what the page sends
 
@@ -111,6 +115,19 @@ class MendApp(ResultsApp):
         self.do_again(WORK[0], f"scape pick {self.folder}", do, send, "nothing was registered",
                       lambda: self.changed.update(before))
 
+    def on_take_rival(self, send: Send) -> None:
+        """Take the other body that explains the scan that is shown; once more takes it back."""
+        if self.working is not None:
+            return
+        name = self.scan_names[self.current]
+
+        def do(space: Workspace, _: Progress) -> tuple[Outcome, str]:
+            tasks, template, landmarks = self.call.inputs(lambda line: None)
+            done = take_rival(tasks, template, landmarks, space.folder, self.call.config, name)
+            return summarize(self.call, len(tasks), done, space), "this is the other body; the button takes it back"
+
+        self.do_again("taking the other body", f"scape pick {self.folder}", do, send, "the body stays as it was")
+
     def read_results(self) -> dict[str, Verdict]:
         """The verdicts on the scans of the set, worst first."""
         return {verdict.name: verdict for verdict in judge_set(self.folder)}
@@ -118,3 +135,7 @@ class MendApp(ResultsApp):
     def show_results(self, results: dict[str, Verdict]) -> None:
         """The scans keep their order."""
         self.verdicts = results
+        # beside the mesh in the folder of a later round, too; only a scan that had been registered first can be kept so
+        self.rivals = {entry.name for entry in RegisteredSet.load(self.folder).entries
+                       if has_rival((self.folder / entry.file).parents[1], entry.name)
+                       and (self.folder / mesh_file(entry.name)).is_file()}

@@ -34,6 +34,7 @@ from ..registration.nonrigid import Registration
 from ..skeleton.names import skeleton_doubts
 from ..skeleton.tree import Skeleton
 from ..words import number_of
+from .rivals import RIVALS, doubt_rival
 
 PICTURES, PAGE = "pictures", "report.html"
 WIDTH, HEIGHT = 150, 216
@@ -70,7 +71,8 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
         entry = entries.get(verdict.name)
         shown = _shown(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
-        page.markup(_card(verdict, entry, shown))
+        rival = _shown(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None, None)
+        page.markup(_card(verdict, entry, shown, rival))
     if whole.skeleton is not None:
         page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
         page.bodies([Pane([Solid(whole.template, part_colors(whole.skeleton.part_of_face))],
@@ -89,8 +91,12 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
     folder = Path(folder)
     whole = RegisteredSet.load(folder)
     figures = [f for f in read_figures(folder) if f.name in whole.names]
-    return review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits,
-                  read_doubts(folder))
+    verdicts = review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits,
+                      read_doubts(folder))
+    # of two bodies that explain a scan as well somebody is to choose
+    places = {entry.name: (folder / entry.file).parents[1] for entry in whole.entries}
+    verdicts = [doubt_rival(verdict, places.get(verdict.name, folder)) for verdict in verdicts]
+    return sorted(verdicts, key=lambda verdict: (-verdict.badness, verdict.name))
 
 
 def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: Limits | None = None) -> Judgement:
@@ -154,7 +160,7 @@ def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
     return f'<div class="index">{"".join(parts)}</div>'
 
 
-def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
+def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> str:
     f, table = verdict.figures, ""
     about = " · ".join(filter(None, [entry.subject if entry and entry.subject != verdict.name else "",
                                      entry.pose if entry else "", f.init if f else ""]))
@@ -174,7 +180,8 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str) -> str:
                                     for name, value in rows) + "</table>"
     return (f'<section class="scan {_mark(verdict)}" id="{_anchor(verdict)}"><h3><span class="dot"></span>'
             f"{escape(verdict.name)} <small>{badness}</small><small>{escape(about)}</small></h3>"
-            f"<ul>{reasons}</ul>{shown}{table}</section>")
+            f"<ul>{reasons}</ul>{shown}{table}"
+            + (f"<div><h4>the other body that explains the scan</h4>{rival}</div>" if rival else "") + "</section>")
 
 
 def _shown(page: Page, folder: Path, place: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:

@@ -5,9 +5,12 @@
 """
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+
+import numpy as np
 
 from ..batch.opening import workspace
 from ..batch.pool import Workers
@@ -16,15 +19,16 @@ from ..dataset import RegisteredSet, SetEntry, read_entries, write_set
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
-from ..registration.figures import ScanFigures, write_doubts, write_failures, write_figures
+from ..registration.figures import ScanFigures, read_failures, write_doubts, write_failures, write_figures
 from ..registration.lead import Lead, lead_of
 from ..registration.person import person_parts
 from ..registration.schedule import RegistrationConfig
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
-from .bootstrap import bootstrap_set, find_better_scans
-from .page import write_set_page
+from .bootstrap import bootstrap_set, drop_rounds, find_better_scans
+from .page import PICTURES, write_set_page
+from .rivals import RIVALS, TWO_BODIES, has_rival, load_figures, rival_file, save_figures
 from .scan import RegisterScan, ScanSettings, mesh_file
 from .scans import ScanTask
 
@@ -87,14 +91,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
     config = config or PrepareConfig()
     check_template(template)
     with workspace(folder) as space, one_thread():
-        # without what the template has worked out about itself: it is sent around
-        bare = Mesh(template.vertices, template.faces, template.colors)
-        parts = space.step("person", bare, lambda folder: person_parts(bare, person_progress))
-        model = Path(config.scan.through) if Path(config.scan.through).is_file() else None
-        tasks = [replace(task, model=model) for task in tasks]
-        lead = _lead(space, bare, tasks, config.scan.through, person_progress)
-        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan,
-                            parts if lead is None else parts or lead.parts, lead)
+        work, tasks = _set_up(space, tasks, template, template_landmarks, config, person_progress)
         if not space.results(work):                   # the first call, or all is to be done anew
             space.drop("skeleton")
         failures: dict[str, str] = {}
@@ -113,11 +110,66 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             _write_tables(space, work, tasks, failures)
             _write_skeleton(space, config, skeleton_progress)
         finally:
-            figures = _write_tables(space, work, tasks, failures)
-            with space.staging("page") as staged:
-                write_set_page(space.folder, to=staged.folder)
+            prepared = _write_all(space, work, tasks, failures, len(fresh))
+    return prepared
+
+
+def take_rival(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,
+               config: PrepareConfig, name: str) -> Prepared:
+    """Exchange the two bodies that explain a scan: the rival is its registration now, and `prepare` leaves it so.
+
+    Tasks, template and settings as the set was prepared with. ValueError for a scan without a rival, or one that was
+    not registered from its files as they are now.
+    """
+    with workspace(folder) as space, one_thread():
+        work, tasks = _set_up(space, tasks, template, template_landmarks, config, None)
+        task = next((Task(SCANS + task.name, task) for task in tasks if task.name == name), None)
+        # where both bodies lie: in the folder of a later round, if that was better
+        former, file = find_better_scans(space, work).get(name, (None, mesh_file(name)))
+        place = (space.folder / file).parent.parent
+        if task is None or not has_rival(place, name):
+            raise ValueError(f"{name}: there is no other body that explains this scan")
+        if not space.is_done(work, task):
+            raise ValueError(f"{name}: its files, or scapekit, have changed since; register it again first")
+        former = former or space.value(task.name)
+        rival = load_figures(place, name)
+        with space.instead(work, task) as staged:
+            pairs = [(mesh_file(name), rival_file(name))]
+            pairs += [(f"{PICTURES}/{name}.{ending}", f"{RIVALS}/{name}.{ending}") for ending in ("webp", "scene")]
+            for one, other in pairs:
+                for source, target in ((one, other), (other, one)):
+                    if (place / source).is_file():                       # there may be no pictures
+                        (staged.folder / target).parent.mkdir(exist_ok=True)
+                        shutil.copyfile(place / source, staged.folder / target)
+            # somebody chose, so that there are two is no doubt of either; the time is that of finding both
+            doubts = tuple(doubt for doubt in former.doubts if doubt != TWO_BODIES)
+            save_figures(staged.folder, replace(former, doubts=doubts, seconds=np.nan), chosen=True)
+            staged.value = replace(rival, seconds=former.seconds)
+        drop_rounds(space, name)                                         # the choice counts, and no later round
+        return _write_all(space, work, tasks, read_failures(space.folder), 0)
+
+
+def _set_up(space: Workspace, tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int],
+            config: PrepareConfig, progress: Progress | None) -> tuple[RegisterScan, list[ScanTask]]:
+    """The work on each scan of a set, and the scans with the model that leads the template to them."""
+    # without what the template has worked out about itself: it is sent around
+    bare = Mesh(template.vertices, template.faces, template.colors)
+    parts = space.step("person", bare, lambda folder: person_parts(bare, progress))
+    model = Path(config.scan.through) if Path(config.scan.through).is_file() else None
+    tasks = [replace(task, model=model) for task in tasks]
+    lead = _lead(space, bare, tasks, config.scan.through, progress)
+    return RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan,
+                        parts if lead is None else parts or lead.parts, lead), tasks
+
+
+def _write_all(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], failures: Mapping[str, str],
+               fresh: int) -> Prepared:
+    """Write the tables and the page of a set; returns what is in it."""
+    figures = _write_tables(space, work, tasks, failures)
+    with space.staging("page") as staged:
+        write_set_page(space.folder, to=staged.folder)
     return Prepared(RegisteredSet.load(space.folder), tuple(figures[name] for name in sorted(figures)),
-                    tuple(failures[name] for name in sorted(failures)), len(fresh))
+                    tuple(failures[name] for name in sorted(failures)), fresh)
 
 
 def _lead(space: Workspace, template: Mesh, tasks: Sequence[ScanTask], through: str, progress: Progress | None

@@ -21,12 +21,13 @@ from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
 from ..registration.lead import Lead
 from ..registration.limbs import Doubt, exchanged_sides, limb_doubts
-from ..registration.nonrigid import register, registration_problem
+from ..registration.nonrigid import LedRegistration, register, registration_problem
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
 from ..registration.unmarked import register_by_any
 from ..threads import one_thread
+from .rivals import RIVALS, TWO_BODIES, rival_file, save_figures
 from .scans import ScanTask
 
 Landmarks = tuple[np.ndarray, np.ndarray]
@@ -69,6 +70,7 @@ class RegisteredScan:
     figures: ScanFigures
     picture: bytes = b""            # a strip of small pictures as a WebP file; empty where none were asked for
     scene: bytes = b""              # the same for the browser
+    rival: RegisteredScan | None = None     # another body that explains the scan as well
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], settings: ScanSettings,
@@ -92,31 +94,40 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             cleaned = clean_scan(scan, settings.clean, None if landmarks is None else landmarks[1])
             scan, removed = cleaned.scan, 1 - float(cleaned.kept.mean())
         if settings.through == "pose":
-            fit, init = register(template, scan, None, settings.registration, progress), "pose"
+            fit = register(template, scan, None, settings.registration, progress)
             if not registration_problem(template, scan, fit, marked=False):
                 fit = repaired(template, scan, fit, parts, None, settings.registration)
+            led = LedRegistration(fit, "pose")
         else:
             try:
-                fit, init = register_by_any(template, scan, landmarks, lead, parts, settings.registration,
-                                            settings.correspondences, progress, task.model)
+                led = register_by_any(template, scan, landmarks, lead, parts, settings.registration,
+                                      settings.correspondences, progress, task.model)
             except ValueError as error:
                 raise ValueError(f"{error} (a landmark file, or --through pose, needs no ends of limbs)") from None
-        problem = registration_problem(template, scan, fit, landmarks is not None)
+        problem = registration_problem(template, scan, led.fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        if parts is not None and (problem := exchanged_sides(template, parts, fit.mesh.vertices)):
+        if parts is not None and (problem := exchanged_sides(template, parts, led.fit.mesh.vertices)):
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        fit = with_soles(template, scan, fit, parts)
-        picture = scene = b""
-        if settings.pictures:
-            from .page import pictures_of
+        done = finish_scan(task.name, template, scan, led, parts, removed, settings.pictures)
+        doubts = done.figures.doubts if done.rival is None else (*done.figures.doubts, TWO_BODIES)
+    return replace(done, figures=replace(done.figures, doubts=doubts, seconds=time.perf_counter() - start))
 
-            picture, scene = pictures_of(template, scan, fit)
-        doubts = () if parts is None else (*limb_doubts(template, parts, fit.mesh.vertices),
-                                           *size_doubts(template, parts, fit.mesh.vertices))
-    figures = replace(figures_of(task.name, init, template, fit), removed=removed, doubts=doubts,
-                      seconds=time.perf_counter() - start)
-    return RegisteredScan(fit.mesh.vertices, figures, picture, scene)
+
+def finish_scan(name: str, template: Mesh, scan: Mesh | np.ndarray, led: LedRegistration, parts: PersonParts | None,
+                removed: float, pictures: bool) -> RegisteredScan:
+    """Bring the soles of a registration to the floor, measure it and take its picture; the same with its rival."""
+    fit = with_soles(template, scan, led.fit, parts)
+    picture = scene = b""
+    if pictures:
+        from .page import pictures_of
+
+        picture, scene = pictures_of(template, scan, fit)
+    doubts = () if parts is None else (*limb_doubts(template, parts, fit.mesh.vertices),
+                                       *size_doubts(template, parts, fit.mesh.vertices))
+    figures = replace(figures_of(name, led.way, template, fit), removed=removed, doubts=doubts)
+    rival = None if led.rival is None else finish_scan(name, template, scan, led.rival, parts, removed, pictures)
+    return RegisteredScan(fit.mesh.vertices, figures, picture, scene, rival)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +151,23 @@ class RegisterScan:
         return register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts, room.tell, self.lead)
 
     def write(self, folder: Path, name: str, found: RegisteredScan) -> None:
-        """Write the mesh and the pictures of a scan into a folder."""
+        """Write the mesh and the pictures of a scan into a folder, and those of its rival with its figures."""
         from .page import PICTURES
 
         write_mesh(folder / mesh_file(name), self.template.with_vertices(found.vertices))
-        if found.picture:
-            (folder / PICTURES).mkdir()
-            (folder / PICTURES / f"{name}.webp").write_bytes(found.picture)
-            (folder / PICTURES / f"{name}.scene").write_bytes(found.scene)
+        write_pictures(folder / PICTURES, name, found)
+        if found.rival is not None:
+            write_mesh(folder / rival_file(name), self.template.with_vertices(found.rival.vertices))
+            write_pictures(folder / RIVALS, name, found.rival)
+            save_figures(folder, found.rival.figures, chosen=False)
+
+
+def write_pictures(folder: Path, name: str, found: RegisteredScan) -> None:
+    """Write the pictures of a scan into a folder, where they were taken."""
+    if found.picture:
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.webp").write_bytes(found.picture)
+        (folder / f"{name}.scene").write_bytes(found.scene)
 
 
 def mesh_file(name: str) -> str:

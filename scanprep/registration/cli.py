@@ -32,11 +32,11 @@ from .figures import UNSEEN, figures_of, review
 from .ground import soles_row, with_soles
 from .lead import lead_of
 from .limbs import exchanged_sides, limb_doubts
-from .nonrigid import Registration, register, registration_problem
+from .nonrigid import LedRegistration, Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
 from .repair import repaired
 from .schedule import RegistrationConfig
-from .unmarked import FEW, register_by_any
+from .unmarked import FEW, RIVAL, register_by_any
 
 
 def align(source: MeshArg, target: Annotated[Path, Place("TARGET")], output: Output, landmarks: Path | None = None,
@@ -146,6 +146,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     if parts is None:
         with bar("finding the parts of a person") as progress:
             parts = person_parts(body, progress)
+    rival: LedRegistration | None = None
     if given or through == "pose" or (pairs is None and lead is None and through == "auto"):
         hints = read_correspondences(given) if given else None
         with bar("registering") as progress:
@@ -154,8 +155,9 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
             fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
     else:
         with bar("registering") as progress:
-            fit, way = register_by_any(body, data, pairs, lead, parts, config, progress=progress)
-        led_by.append(Metric("led by", way))
+            led = register_by_any(body, data, pairs, lead, parts, config, progress=progress)
+        fit, rival = led.fit, led.rival
+        led_by.append(Metric("led by", led.way))
     fit = with_soles(body, data, fit, parts)
     write_mesh(output, fit.mesh)
     return Outcome(output, [
@@ -167,21 +169,25 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("inverted triangles", fit.inverted), Metric("limbs rolled otherwise", str(fit.rolled)),
         *soles_row(fit.soles),
         Metric("converged", str(fit.converged))], {"register": config},
-        judgement=judge_registration(scan.name, body, data, fit, pairs, parts))
+        judgement=judge_registration(scan.name, body, data, fit, pairs, parts, rival is not None))
 
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
 def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, pairs: Landmarks | None,
-                       parts: PersonParts | None) -> Judgement:
-    """What the registration of one scan is worth: by the limits of a set of scans, and whether it is of a person."""
+                       parts: PersonParts | None, has_rival: bool = False) -> Judgement:
+    """What the registration of one scan is worth: by the limits of a set of scans, and whether it is of a person.
+
+    `has_rival` is whether another body explains the scan as well.
+    """
     problem = registration_problem(template, scan, fit, pairs is not None) or (
         exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
     doubts = limb_doubts(template, parts, fit.mesh.vertices) if parts else ()
     verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
                      len(template.faces), doubts={name: doubts} if parts else None, usual=UNSEEN)[0]
+    rival = Judgement.of(check=[f"{RIVAL}: click some landmarks, left and right, to decide"] if has_rival else [])
     if parts is None or problem is not None:
-        return verdict.judgement
+        return verdict.judgement.joined(rival)
     # of a body that is too large or too small the size is the cause, limbs out of shape are what comes of it
-    return beyond_people(stature(template, parts, fit.mesh.vertices)).joined(verdict.judgement)
+    return beyond_people(stature(template, parts, fit.mesh.vertices)).joined(verdict.judgement, rival)

@@ -53,6 +53,15 @@ class Registration:
     soles: tuple[float, float] | None = None    # metres beyond the floor where the scan ends: see `with_soles`
 
 
+@dataclass(frozen=True, eq=False)
+class LedRegistration:
+    """A registration without landmarks, or with few, and what led it: see `register_by_any`."""
+
+    fit: Registration
+    way: str                                    # what led it, in words: "model people", "160 correspondences"
+    rival: LedRegistration | None = None        # another body on the scan that leaves hardly more to doubt
+
+
 class Method(Protocol):
     """A way to bring a template near a scan, of which `METHODS` holds those that can be chosen by name.
 
@@ -77,6 +86,8 @@ def translate(what: Any, by: np.ndarray) -> Any:
         return what.with_vertices(what.vertices + by)
     if isinstance(what, Registration):
         return replace(what, mesh=translate(what.mesh, by))
+    if isinstance(what, LedRegistration):
+        return replace(what, fit=translate(what.fit, by), rival=translate(what.rival, by))
     if isinstance(what, Correspondences):
         return replace(what, scan_points=what.scan_points + by)
     if isinstance(what, tuple):

@@ -1,6 +1,7 @@
 """Registration without landmarks, or with few: through a model that finds a body on the scan; by correspondences.
 
-The second is tried where the first leaves much to doubt, and the one that leaves less is kept.
+The second is tried where the first leaves much to doubt, and the one that leaves less is kept. Bodies lie on a scan
+nearly as well turned round or mirrored: where a second one leaves hardly more to doubt, it is told too.
 """
 from __future__ import annotations
 
@@ -14,11 +15,12 @@ from ..correspondence.correlated import find_correspondences, find_seeds
 from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.mesh import Mesh
+from ..judgement import HAND, size
 from ..words import number_of
 from .lead import Lead
 from .limbs import exchanged_sides, limb_doubts
 from .matches import Landmarks
-from .nonrigid import Registration, near_origin, register, registration_problem
+from .nonrigid import LedRegistration, Registration, near_origin, register, registration_problem
 from .person import PersonParts
 from .repair import gravity, repaired
 from .schedule import RegistrationConfig
@@ -30,6 +32,10 @@ EXCHANGED = 10.0                     # doubts that exchanged sides count as: mor
 # they led to the same within a millimetre, or 3 mm farther off, and took a minute.
 GRAVE = 3.0
 UNCOVERED = 0.005                    # share of the scan off the template, from which on a limb may be lost
+WORST = 0.1                          # share of the vertices that tells two bodies apart: about that of an arm
+RIVAL = "another body explains the scan as well"
+
+Candidate = tuple[float, Registration, str]        # how much is to be doubted, the registration, what led it
 
 
 @near_origin
@@ -37,12 +43,12 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
                     lead: Lead | None = None, parts: PersonParts | None = None,
                     config: RegistrationConfig | None = None, search: CorrelatedConfig | None = None,
                     progress: Callable[[int, int], None] | None = None, model: Path | None = None
-                    ) -> tuple[Registration, str]:
+                    ) -> LedRegistration:
     """Bring a template onto a scan by what there is, limbs repaired: landmarks; few of them, or none, and a lead;
     correspondences, where all bodies that a lead finds leave much to doubt.
 
-    Returns the registration and what led it, in words. The likeliest body is kept unless another one, or
-    correspondences, leave clearly less to doubt. `model` is passed on to the lead. ValueError as from
+    The likeliest body is kept unless another one, or correspondences, leave clearly less to doubt. Another body that
+    leaves hardly more is the rival of the one that is kept. `model` is passed on to the lead. ValueError as from
     `register_unmarked` where that is all there is.
     """
     clicked = [] if landmarks is None else [number_of(len(landmarks[0]), "landmark")]
@@ -50,18 +56,23 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
         fit = register(template, scan, landmarks, config, progress)
         if not registration_problem(template, scan, fit, marked=True):
             fit = repaired(template, scan, fit, parts, landmarks, config)
-        return fit, clicked[0]
-    # what was tried, each with how much is to be doubted, and what led it
-    found = list[tuple[float, Registration, str]]()
+        return LedRegistration(fit, clicked[0])
+    found = list[Candidate]()
     if lead is not None:
         for vertices in lead(scan, landmarks, model):
             fit = register(template, scan, landmarks, config, progress, start=vertices)
             found.append((weigh_doubts(template, parts, fit), fit, ", ".join([*clicked, f"model {lead.name}"])))
             if not found[-1][0]:
-                return fit, found[-1][2]       # nothing to doubt: no other body is sought
-        _, fit, way = choose_clearly(found)
-        fit = repaired(template, scan, fit, parts, landmarks, config)
-        found.insert(0, (weigh_doubts(template, parts, fit), fit, way))
+                return LedRegistration(fit, found[-1][2])      # nothing to doubt: no other body is sought
+        # the best body and its rival, both repaired, stand for what they were
+        first = choose_clearly(found)
+        chosen = [one for one in (first, find_rival(template, first, found)) if one is not None]
+        others = [one for one in found if one not in chosen]
+        found.clear()
+        for _, fit, way in chosen:
+            fit = repaired(template, scan, fit, parts, landmarks, config)
+            found.append((weigh_doubts(template, parts, fit), fit, way))
+        found += others
     if landmarks is None and all(doubt > GRAVE for doubt, _, _ in found):
         try:
             fit, pairs = register_unmarked(template, scan, config, search, progress)
@@ -72,13 +83,31 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
             if not registration_problem(template, scan, fit, marked=False):
                 fit = repaired(template, scan, fit, parts, None, config, correspondences=pairs)
             found.append((weigh_doubts(template, parts, fit), fit, number_of(len(pairs), "correspondence")))
-    return choose_clearly(found)[1:]
+    best = choose_clearly(found)
+    rival = find_rival(template, best, [one for one in found if not registration_problem(
+        template, scan, one[1], landmarks is not None)])
+    return LedRegistration(*best[1:], None if rival is None else LedRegistration(*rival[1:]))
 
 
-def choose_clearly(found: Sequence[tuple[float, Registration, str]]) -> tuple[float, Registration, str]:
+def choose_clearly(found: Sequence[Candidate]) -> Candidate:
     """The first of some registrations, or the one of least doubt where that leaves clearly less."""
     best = min(found, key=lambda one: one[0])
     return best if best[0] < CLEARLY * found[0][0] else found[0]
+
+
+def find_rival(template: Mesh, best: Candidate, found: Sequence[Candidate]) -> Candidate | None:
+    """Of other bodies than the best the one of least doubt, where that is not clearly more; else None.
+
+    Another body is one whose worst tenth is more than a hand's width off: a twisted limb makes none, and neither does
+    a limb of which the scan shows nothing in either.
+    """
+    def apart(fit: Registration) -> float:
+        shown = fit.seen | best[1].seen
+        far = np.sort(np.linalg.norm(fit.mesh.vertices - best[1].mesh.vertices, axis=1)[shown])
+        return float(far[-max(1, int(WORST * len(far))):].mean()) if len(far) else 0.0
+
+    others = [one for one in found if CLEARLY * one[0] <= best[0] and apart(one[1]) > HAND * size(template)]
+    return min(others, key=lambda one: one[0], default=None)
 
 
 def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -> float:

@@ -43,8 +43,8 @@ def registered(data: RealData, parts: PersonParts, item: TestScan, marks: str, c
     led it."""
     landmarks, pairs = item.landmarks(data, marks), None
     if lead is not None:
-        found, led_by = register_by_any(data.template, item.scan, landmarks, lead, parts, config)
-        return found, found, led_by
+        led = register_by_any(data.template, item.scan, landmarks, lead, parts, config)
+        return led.fit, led.fit, led.way
     if landmarks is not None:
         found = register(data.template, item.scan, landmarks, config)
     else:

@@ -1,4 +1,5 @@
-// `scape pick SET`: scans worst first, their landmarks mended as in `scape pick`, and a button that registers them again.
+// `scape pick SET`: scans worst first, their landmarks mended as in `scape pick`, and a button that registers them again;
+// of two bodies that explain a scan as well another button takes the other.
 import { make } from "./figure.js";
 import { button, Pick, WORDS } from "./pick.js";
 import { unpackScene } from "./unpack.js";
@@ -9,7 +10,8 @@ export class Mend extends Pick {
     this.verdict = make("div", { class: "sk-verdict" });
     this.go = button("register again", "what scape prep run does, for scans that have changed", () => this.send("register"));
     this.go.classList.add("sk-main-button");
-    this.scans.after(this.verdict, make("div", { class: "sk-buttons" }, this.go));
+    this.other = button("take the other body", "it explains the scan as well; once more takes it back", () => this.send("take_rival"));
+    this.scans.after(this.verdict, make("div", { class: "sk-buttons" }, this.go, this.other));
   }
 
   // The template on the scan, from the page of the set, has columns of its own.
@@ -24,13 +26,14 @@ export class Mend extends Pick {
 
   update(state) {
     super.update(state);
-    const { scans, scan, verdicts, changed, template_changed: all, working } = state;
+    const { scans, scan, verdicts, changed, template_changed: all, working, rivals } = state;
     const { verdict, reasons } = verdicts[scan];
     this.verdict.dataset.verdict = verdict;
     const mended = all || changed.includes(scans[scan].name.split(".")[0]);
     this.verdict.replaceChildren(make("strong", {}, mended ? `${WORDS[verdict]}; its landmarks changed since` : WORDS[verdict]),
       make("ul", {}, ...reasons.map((reason) => make("li", {}, reason))));
-    this.go.disabled = Boolean(working);
+    this.go.disabled = this.other.disabled = Boolean(working);
+    this.other.hidden = !rivals[scan];
     this.go.textContent = all ? "register all scans again" : changed.length > 1 ? `register ${changed.length} scans again` : "register again";
   }
 }
