@@ -85,9 +85,10 @@ def measure(data: RealData, parts: PersonParts, lead: Lead, kind: str, index: in
     row: dict[str, object] = {"scan": item.name, "kind": kind, "change": what}
     cpu = time.process_time()
     try:
-        fit, way = register_by_any(data.template, scan, None, lead, parts)
+        led = register_by_any(data.template, scan, None, lead, parts)
     except ValueError as error:
         return {**row, "verdict": "failed", "why": str(error), "right": False}
+    fit, way = led.fit, led.way
     x = fit.mesh.vertices
     limb = worst_limb(x, replace(item, truth=item.truth.with_vertices(truth)), parts)
     mean = 1e3 * float(np.linalg.norm(x - truth, axis=1).mean())
