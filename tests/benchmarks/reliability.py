@@ -38,7 +38,8 @@ from scanprep.registration.unmarked import register_by_any
 
 MEAN, PART = 20.0, 50.0               # millimetres within which a registration is right
 LEGS = "thigh", "shin", "foot"
-PENALTY = 0.05                        # of squared weights, so that evidence that is never seen keeps none
+# Evidence that is hardly seen keeps this weight: as much as tells in favour; and the penalty of squared distances to it
+PRIOR, PENALTY = 0.5, 0.5
 
 
 def change(what: str, scan: Mesh, truth: np.ndarray, parts: PersonParts, body: Mesh, rng: np.random.Generator
@@ -114,7 +115,7 @@ def fit_weights(rows: list[dict]) -> dict[str, float]:
 
     def cost(w: np.ndarray) -> float:
         z = w[0] - X @ w[1:]
-        return float(np.logaddexp(0, z).sum() - y @ z + PENALTY * (w[1:]**2).sum())
+        return float(np.logaddexp(0, z).sum() - y @ z + PENALTY * ((w[1:] - PRIOR)**2).sum())
 
     found = minimize(cost, np.r_[2.0, np.ones(X.shape[1])], bounds=[(None, None), *[(0, None)] * X.shape[1]]).x
     return dict(zip(("certain", *EVIDENCE), found.round(2).tolist(), strict=True))
