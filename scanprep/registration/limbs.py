@@ -24,12 +24,12 @@ from .person import PersonParts, average_person
 
 ROLL, BEND, SIDE = range(3)
 MOVED = ("rolled", "bent", "bent sideways")
-# Degrees by which joints of real people go beyond those of the built-in ones (roll, bend, side), of 99 in 100 of the
-# true bodies of 56 scans of one man, none of them held out: hands are held in more ways, and skin lags behind the bones
-# of knees and elbows more.
-SLACK = {"pelvis": (0, 0, 0), "abdomen": (20, 40, 20), "chest": (20, 20, 20), "head": (25, 40, 25),
-         "upper_arm": (20, 20, 20), "forearm": (35, 20, 52), "hand": (55, 55, 52), "thigh": (20, 20, 20),
-         "shin": (35, 20, 75), "foot": (20, 30, 60)}
+# Degrees by which joints of real people go beyond those of the built-in ones (roll, bend, side), found on the true
+# bodies of 56 scans of one man, none of them held out. Rolls hold for 99 in 100, so that limbs that are rolled are told;
+# bends are five degrees beyond the largest, as registered hands bend a little more than they should.
+SLACK = {"pelvis": (0, 0, 0), "abdomen": (20, 42, 20), "chest": (20, 24, 20), "head": (25, 40, 25),
+         "upper_arm": (20, 20, 20), "forearm": (35, 21, 63), "hand": (55, 66, 64), "thigh": (20, 20, 20),
+         "shin": (35, 22, 75), "foot": (20, 30, 66)}
 # Of a body's size: what muscles and build add to the bending of a part. True bodies have up to 0.0025 more; registered
 # ones are smoother, and with more a head rolled by 45 degrees is not told.
 SHAPE = {"pelvis": 0.01, "abdomen": 0.01, "chest": 0.01, "head": 0.006, "upper_arm": 0.008, "forearm": 0.008,
