@@ -25,8 +25,8 @@ from .person import PersonParts, average_person
 ROLL, BEND, SIDE = range(3)
 MOVED = ("rolled", "bent", "bent sideways")
 # Degrees by which joints of real people go beyond those of the built-in ones (roll, bend, side), found on the true
-# bodies of 56 scans of one man, none of them held out. Rolls hold for 99 in 100, so that limbs that are rolled are told;
-# bends are five degrees beyond the largest, as registered hands bend a little more than they should.
+# bodies of 56 scans of one man, none of them held out. Rolls hold for 99 in 100, so that rolled limbs are told; bends
+# are five degrees beyond the largest, as registered hands bend a little more than they should.
 SLACK = {"pelvis": (0, 0, 0), "abdomen": (20, 42, 20), "chest": (20, 24, 20), "head": (25, 40, 25),
          "upper_arm": (20, 20, 20), "forearm": (35, 21, 63), "hand": (55, 66, 64), "thigh": (20, 20, 20),
          "shin": (35, 22, 75), "foot": (20, 30, 66)}

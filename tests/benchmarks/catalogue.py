@@ -145,16 +145,6 @@ BENCHMARKS = (
               "What `scape pick` offers when hands and toes were clicked, without error, on a virtual scan. Where we "
               "lose: pose 7, where it means nothing, and men of another shape than the template.",
               quick="predicted_landmarks.py --poses 2,32,43,67 --men 2,52"),
-    Benchmark("set_alone", "A set without landmarks that teaches itself", "set_alone.py SCRATCH --of animal",
-              scans.set_alone,
-              "An animal made for the tests, of which no built-in model knows anything: doubted scans are registered "
-              "again through a model of those that are good. `--of poses` does it with SCAPE poses.",
-              quick=""),
-    Benchmark("reliability", "How well verdicts tell which registrations are right",
-              "reliability.py SCRATCH --part held --count 40", scans.reliability,
-              "Without landmarks; scans turned, upside down, with a chair and cut at the waist among them. Right is "
-              "within 20 mm on average and no part beyond 50 mm. The weights were fitted on few scans.",
-              quick="reliability.py SCRATCH --part held --count 2"),
     Benchmark("found_landmarks", "Landmarks of scans that nobody clicked", "found_landmarks.py SCRATCH",
               scans.found_landmarks,
               "`scape prep landmarks` with the template mesh000 on held-out poses of its person, on other men, and on "

@@ -199,32 +199,6 @@ def found_landmarks(report: dict) -> str:
     return f"{groups}\n\n{scans}"
 
 
-def set_alone(report: dict) -> str:
-    """What became of a set in all, and of every scan that was registered again or is not good."""
-    f = report["summary"]
-    summary = table(("scans", "failed at first", "registered again and better", "good at last", "good, beyond 30 mm",
-                     "median (mm)", "worst (mm)", "time of registrations (s)"),
-                    [(f["scans"], f["first_failed"], f["again"], f["good"], f["good_beyond_30mm"], f["median_mm"],
-                      f["worst_mm"], f["wall_of_scans_s"])])
-    scans = table(("scan", "first (mm)", "at last (mm)", "verdict"),
-                  [(row["scan"], "failed" if row["first_mm"] is None else row["first_mm"],
-                    "failed" if row["mean_mm"] is None else row["mean_mm"], row["verdict"].split(":")[0])
-                   for row in report["rows"] if row["again"] or row["verdict"] != "good"])
-    return f"{summary}\n\n{scans}"
-
-
-def reliability(report: dict) -> str:
-    """Verdicts against the truth, and what probabilities said beside what was."""
-    f = report["summary"]
-    verdicts = table(("registrations", "right", "wrong, called good", "right, called check", "right, called failed",
-                      "Brier score", "that of the share"),
-                     [tuple(f[n] for n in ("registrations", "right", "wrong_called_good", "right_called_check",
-                                           "right_called_failed", "brier", "brier_of_the_mean"))])
-    diagram = table(("probability from", "registrations", "said, mean", "right"),
-                    [(row["from"], row["count"], f"{row['said']:.0%}", f"{row['were']:.0%}") for row in f["diagram"]])
-    return f"{verdicts}\n\n{diagram}"
-
-
 def signatures(report: dict) -> str:
     """Means over the poses of the correlation at every scale."""
     names = {"reference": "published registration", "slid": "the same, slid 4 mm at random", "ours": "ours"}
