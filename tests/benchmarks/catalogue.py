@@ -145,6 +145,11 @@ BENCHMARKS = (
               "What `scape pick` offers when hands and toes were clicked, without error, on a virtual scan. Where we "
               "lose: pose 7, where it means nothing, and men of another shape than the template.",
               quick="predicted_landmarks.py --poses 2,32,43,67 --men 2,52"),
+    Benchmark("set_alone", "A set without landmarks that teaches itself", "set_alone.py SCRATCH --of animal",
+              scans.set_alone,
+              "An animal made for the tests, of which no built-in model knows anything: doubted scans are registered "
+              "again through a model of those that are good. `--of poses` does it with SCAPE poses.",
+              quick=""),
     Benchmark("found_landmarks", "Landmarks of scans that nobody clicked", "found_landmarks.py SCRATCH",
               scans.found_landmarks,
               "`scape prep landmarks` with the template mesh000 on held-out poses of its person, on other men, and on "

@@ -199,6 +199,20 @@ def found_landmarks(report: dict) -> str:
     return f"{groups}\n\n{scans}"
 
 
+def set_alone(report: dict) -> str:
+    """What became of a set in all, and of every scan that was registered again or is not good."""
+    f = report["summary"]
+    summary = table(("scans", "failed at first", "registered again and better", "good at last", "good, beyond 30 mm",
+                     "median (mm)", "worst (mm)", "time of registrations (s)"),
+                    [(f["scans"], f["first_failed"], f["again"], f["good"], f["good_beyond_30mm"], f["median_mm"],
+                      f["worst_mm"], f["wall_of_scans_s"])])
+    scans = table(("scan", "first (mm)", "at last (mm)", "verdict"),
+                  [(row["scan"], "failed" if row["first_mm"] is None else row["first_mm"],
+                    "failed" if row["mean_mm"] is None else row["mean_mm"], row["verdict"].split(":")[0])
+                   for row in report["rows"] if row["again"] or row["verdict"] != "good"])
+    return f"{summary}\n\n{scans}"
+
+
 def signatures(report: dict) -> str:
     """Means over the poses of the correlation at every scale."""
     names = {"reference": "published registration", "slid": "the same, slid 4 mm at random", "ours": "ours"}
