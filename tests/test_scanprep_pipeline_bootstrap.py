@@ -114,16 +114,30 @@ def test_doubted_and_failed_scans_are_registered_through_what_the_others_teach(t
     assert calls[made:] == [(name, None) for name in BAD]
 
 
-def test_a_scan_that_becomes_good_by_itself_leaves_nothing_behind(tmp_path, body, truth, calls):
+def test_scans_that_become_good_by_themselves_leave_nothing_behind(tmp_path, body, truth, calls):
     run(tmp_path, body)
-    write_mesh(tmp_path / "scans" / "scan7.ply", body.with_vertices(truth["scan0"] + [3.0, 0, 0]))
-    truth["scan7"] = truth["scan0"] + [3.0, 0, 0]
-    truth["scan7b"] = truth.pop("scan7")             # under a name that the first registration finds
-    truth = {("scan7" if name == "scan7b" else name): vertices for name, vertices in truth.items()}
-    done = run(tmp_path, body)
-    assert {f.name: f.init for f in done.figures}["scan7"] == "a start"
+    for number, name in enumerate(reversed(BAD)):
+        assert (tmp_path / "set" / "again1" / MODEL).is_file()
+        # another scan in its place, which the first registration finds, as it is of another name in `truth`
+        found = truth.pop(name) * 0 + truth["scan0"] + [3.0 + number, 0, 0]
+        truth[f"{name}, found"] = found
+        write_mesh(tmp_path / "scans" / f"{name}.ply", body.with_vertices(found))
+        done = run(tmp_path, body)
+        assert {f.name: f.init for f in done.figures}[name] == "a start"
+        entries = {e.name: e.file for e in RegisteredSet.load(tmp_path / "set").entries}
+        assert entries[name] == f"meshes/{name}.ply"
+        assert not (tmp_path / "set" / "again1" / "meshes" / f"{name}.ply").exists()
+    assert not (tmp_path / "set" / "again1").exists(), "the model goes with the last of them"
+
+
+def test_scans_of_other_calls_keep_what_later_rounds_found(tmp_path, body, truth, calls):
+    run(tmp_path, body)
+    truth["other"] = truth["scan0"] + [5.0, 0, 0]
+    write_mesh(tmp_path / "more" / "other.ply", body.with_vertices(truth["other"]))
+    prepare(find_scans(tmp_path / "more", "none", "crab"), body, {}, tmp_path / "set", CONFIG)
     entries = {e.name: e.file for e in RegisteredSet.load(tmp_path / "set").entries}
-    assert entries["scan7"] == "meshes/scan7.ply" and not (tmp_path / "set" / "again1" / "meshes/scan7.ply").exists()
+    assert set(entries) == set(truth) and {entries[name] for name in BAD} == {f"again1/meshes/{n}.ply" for n in BAD}
+    assert max(apart_mm(tmp_path, truth).values()) < 40
 
 
 def test_scans_that_no_model_finds_keep_their_reasons_and_the_others_their_place(tmp_path, body, truth, calls,

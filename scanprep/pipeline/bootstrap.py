@@ -8,7 +8,7 @@ animals and hands too. Scans with landmarks are left as they are, and those for 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -99,6 +99,18 @@ def drop_rounds(space: Workspace, name: str) -> None:
         space.drop(f"{folder_of(number)}/{name}")
 
 
+def drop_round(space: Workspace, number: int, names: Collection[str]) -> None:
+    """Remove the registrations of some scans in a round, and its model when nothing else was made with it.
+
+    Scans of earlier calls, which are not among the names, keep theirs.
+    """
+    kept = f"{folder_of(number)}/"
+    for name in names:
+        space.drop(kept + name)
+    if not space.kept(kept):
+        space.drop(f"model {number}")
+
+
 def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask], first: Mapping[str, ScanFigures],
                   min_poses: int, skeleton: SkeletonConfig, workers: Workers, progress: Progress | None = None
                   ) -> set[str]:
@@ -137,7 +149,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         if lessons is not None and not lessons.shapes:          # it knows the body of one subject alone
             doubted = [task for task in doubted if task.subject == lessons.subject]
         if lessons is None or not doubted:
-            space.drop_others(kept)
+            drop_round(space, number, {task.name for task in tasks})
             continue
         # a model of what is good; its file is in the folder of the round
         place = Path(folder_of(number)) / MODEL
@@ -150,7 +162,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         given = [DoubtedScan(replace(task, model=model), best[task.name].badness if task.name in best else np.inf)
                  for task in doubted]
         done = space.run(again, [Task(kept + one.scan.name, one) for one in given], workers, progress)
-        space.drop_others(kept, [kept + task.name for task in doubted])
+        drop_round(space, number, {task.name for task in tasks} - {task.name for task in doubted})
         fresh |= {name.removeprefix(kept) for name in done.fresh}
         # what became better counts from now on
         before = sum(not verdict.suspect for verdict in best.values())
@@ -160,7 +172,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
                 files[figures.name] = f"{folder_of(number)}/{mesh_file(figures.name)}"
         if sum(not verdict.suspect for verdict in best.values()) == before:
             for later in range(number + 1, ROUNDS + 1):
-                space.drop_others(f"{folder_of(later)}/")
+                drop_round(space, later, {task.name for task in tasks})
             break
     return fresh
 

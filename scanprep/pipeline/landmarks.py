@@ -132,7 +132,8 @@ def write_all(tasks: Sequence[ScanTask], template: Mesh, marks: Mapping[str, int
     What is done already is not done again. `tell` is the progress of scans, of parts of a person, and of files.
     """
     registering, naming, writing = tell or (None, None, None)
-    # landmarks that somebody clicked are left out, and no skeleton is sought: nobody has so many poses
+    # landmarks that somebody clicked are left out; nobody has so many poses, so that no skeleton is sought and no
+    # model of the set learned: landmarks of one scan do not depend on the others
     tasks = [replace(task, landmarks=None) for task in tasks]
     config = replace(config, min_poses=10_000_000)
     place = space.folder / SET

@@ -19,9 +19,10 @@ from .nonrigid import Registration, share_stretched
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
-# Weights of the logarithms of evidence; `certain` is the log-odds of a registration that nothing speaks against. Chosen
-# by tests/benchmarks/reliability.py FOLDER --part train --fit, on 27 scans only: evidence that these hardly show keeps
-# one half. What lies off the template was clutter as often as a limb, which its limit tells.
+# Weights of the logarithms of evidence; `certain` is the log-odds of a registration that nothing speaks against. Found
+# by `fit_weights` of tests/benchmarks/reliability.py on 27 scans that lay at hand, none held out; its own choice of
+# scans was not gone through. Evidence that these hardly show keeps one half. What lies off the template was clutter as
+# often as a limb, which its limit tells.
 WEIGHTS = {"certain": 2.56, "missed": 0.0, "distance": 0.51, "unseen": 0.5, "stretch": 0.33, "inverted": 0.5,
            "limbs": 1.25}
 EVIDENCE = tuple(WEIGHTS)[1:]
