@@ -44,6 +44,19 @@ class PoseSpace:
             Q[..., faces, :, :] = value.reshape(*delta.shape[:-1], len(faces), 3, 3)
         return Q
 
+    def add(self, other: PoseSpace) -> PoseSpace:
+        """The pose space whose Q is the sum of two on the same skeleton, with the features of both."""
+        one, two = self.features, other.features
+        if one.lift.kind != two.lift.kind:
+            raise ValueError(f"pose spaces: expected features of one kind, got {one.lift.kind} and {two.lift.kind}")
+        part, mixes, coefficients = [], [], []
+        for p, (a, b) in enumerate(zip(self.coefficients, other.coefficients, strict=True)):
+            part += [p] * (len(a) + len(b) - 1)                # of the two constants one is left
+            mixes += [one.mix[..., one.of_part(p)], two.mix[..., two.of_part(p)][..., 1:]]
+            coefficients.append(np.concatenate([a[:1] + b[:1], a[1:], b[1:]]))
+        features = PoseFeatures(self.skeleton, one.lift, np.array(part), np.concatenate(mixes, axis=-1))
+        return PoseSpace(features, tuple(coefficients))
+
     @staticmethod
     def identity(skeleton: Skeleton) -> PoseSpace:
         """The pose space without deformation: rigid parts, Q = I."""

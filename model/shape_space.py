@@ -94,16 +94,62 @@ def learn_shape_space(S: np.ndarray, components: int, volumes: np.ndarray | None
 
     [SCAPE] Eq. 7
     """
-    P = len(S)
-    mean = S.mean(axis=0, dtype=np.float64)
-    centred = (S - mean).reshape(P, -1)
-    gram = np.asarray(centred @ centred.T, dtype=np.float64) / P
+    P, mean = len(S), S.mean(axis=0, dtype=np.float64)
+    more = None if volumes is None else volumes - volumes.mean()
+    return principal_shapes(mean, S - mean, P, min(components, P - 1), more)
+
+
+def principal_shapes(mean: np.ndarray, off: np.ndarray, count: float, components: int,
+                     volumes: np.ndarray | None = None) -> ShapeSpace:
+    """Principal components of deviations (R, F, 3, 3) from a mean, whose products sum to `count` covariances.
+
+    `volumes` (R,), how much the volume deviates, choose the signs as in `learn_shape_space`.
+
+    [SCAPE] Eq. 7
+    """
+    rows = off.reshape(len(off), -1)
+    gram = np.asarray(rows @ rows.T, dtype=np.float64) / count
     variances, modes = np.linalg.eigh(gram)
     variances, modes = np.maximum(variances[::-1], 0), modes[:, ::-1]
-    count = min(components, int((variances > 1e-9 * max(variances[0], 1e-30)).sum()), P - 1)
-    # unit variance of betas: component k is one standard deviation, Σ_p modes[p, k] centred[p] / √P
-    directions = modes[:, :count].T.astype(centred.dtype) @ centred / np.sqrt(P)
+    K = min(components, int((variances > 1e-9 * max(variances[0], 1e-30)).sum()))
+    # unit variance of betas: component k is one standard deviation, Σ_p modes[p, k] off[p] / √count
+    directions = modes[:, :K].T.astype(rows.dtype) @ rows / np.sqrt(count)
     if volumes is not None:
-        directions *= np.where((volumes - volumes.mean()) @ modes[:, :count] < 0, -1, 1)[:, None]
-    return ShapeSpace(mean.astype(np.float32), directions.reshape(count, *S.shape[1:]).astype(np.float32),
-                      variances[:count], float(variances.sum()))
+        directions *= np.where(volumes @ modes[:, :K] < 0, -1, 1)[:, None]
+    return ShapeSpace(mean.astype(np.float32), directions.reshape(K, *mean.shape).astype(np.float32),
+                      variances[:K], float(variances.sum()))
+
+
+def add_people(S: np.ndarray, volumes: np.ndarray, prior: np.ndarray, prior_volumes: np.ndarray, worth: float,
+               components: int) -> ShapeSpace:
+    """Principal components of people and of what is known of others, which counts as `worth` people.
+
+    Mean and covariance are those that a normal-inverse-Wishart prior and the people give together.
+
+    Parameters
+    ----------
+    S : (P, F, 3, 3) float
+        Shape deformations of the people, of whom there may be none.
+    volumes : (P,) float, cubic metres
+    prior : (1 + K, F, 3, 3) float
+        Of the mean person known before, and of one standard deviation along each known component.
+    prior_volumes : (1 + K,) float, cubic metres
+    worth : float
+    components : int
+        To keep at most.
+
+    Returns
+    -------
+    ShapeSpace
+
+    [SCAPE] Eq. 7
+    """
+    P, known = len(S), prior[0].astype(np.float64)
+    own = S.mean(axis=0, dtype=np.float64) if P else known
+    mean = (P * own + worth * known) / (P + worth)
+    apart, volume = np.sqrt(P * worth / (P + worth)), float(volumes.mean()) if P else float(prior_volumes[0])
+    # deviations whose products sum to the scatter: of the people, of the known components, of one mean from the other
+    off = np.concatenate([S - own, np.sqrt(worth) * (prior[1:] - known), apart * (own - known)[None]])
+    of_volume = np.r_[volumes - volume, np.sqrt(worth) * (prior_volumes[1:] - prior_volumes[0]),
+                      apart * (volume - prior_volumes[0])]
+    return principal_shapes(mean, off.astype(np.float32), P + worth, components, of_volume)

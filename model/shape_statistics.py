@@ -11,6 +11,7 @@ from scanprep.synthetic.anatomy import Sex
 from .body import BodyModel
 
 SEXES: tuple[Sex, Sex] = ("female", "male")
+PLANE = "sex_plane"                  # the plane between women and men, in a model's info
 WORDS = {"female": "women", "male": "men"}
 
 

@@ -8,7 +8,6 @@ from posing_bodies import skinned, symmetric_worm
 
 from model import load_model
 from model.cli import group
-from model.learning.sexes import PLANE
 from model.posing.character import (
     CharacterConfig,
     CharacterMeshConfig,
@@ -18,6 +17,7 @@ from model.posing.character import (
     register_character,
 )
 from model.scape import BlendScapeModel
+from model.shape_statistics import PLANE
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
 from scanprep.registration.schedule import RegistrationConfig

@@ -7,7 +7,8 @@ from model_bodies import random_poses, worm_model
 from model import LearnConfig, learn_scape
 from model.files import load_model
 from model.fitting.vertices import fit_shape
-from model.learning.sexes import PLANE, guess_sex, learn_by_sex, learn_sex_plane
+from model.learning.sexes import guess_sex, learn_by_sex, learn_sex_plane
+from model.shape_statistics import PLANE
 
 CONFIG = LearnConfig(prunings=(0.01,), ridges=(0.001,), refinements=0)
 SEXES = ["female", "male", "", "female", "male", "male", "female", "male", "female", ""]

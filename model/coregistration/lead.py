@@ -1,9 +1,8 @@
 """Registration through a model: a body is found on a scan, and a template of any triangles goes along.
 
-1. The model's body is fitted to the template, and laid on it: every vertex of the template gets a place in a triangle
-   of the body, and a distance from its skin. That is done once.
-2. On a scan the body is found by the search of `complete`: typical poses turned every way. Where that leaves something
-   to doubt, limbs are tried elsewhere, which takes as long again.
+1. The model's body is fitted to the template, and laid on it (`fitting/search.py`): every vertex of the template gets a
+   place in a triangle of the body, and a distance from its skin. That is done once.
+2. On a scan the body is found by the same search.
 3. The template's vertices go where their places on the body are, and the template is registered from there on.
 """
 from __future__ import annotations
@@ -17,33 +16,18 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.nonrigid import register, share_stretched, uncovered_share
 from scanprep.registration.person import PersonParts
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
-from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..files import BUILT_IN, load_model
-from ..fitting.bodies import FixedBody, as_body
-from ..fitting.limbs import with_limbs
-from ..fitting.rounds import solve_jointly
-from ..fitting.scan_fit import ScanFit, prepare_scan_fit
-from ..fitting.settings import ScanFitConfig
-from ..fitting.starts import best_starts, first_starts, from_nothing
+from ..fitting.search import Landmarks, ModelMismatchError, find_bodies, lay_model
 from ..learning.config import LearnConfig
 from ..learning.scape import learn_scape
 
-Landmarks = tuple[np.ndarray, np.ndarray]
-# of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is another
-# thing than the model; a woman has 0.004 and 0.0002, a crab 0.005 and 0.088
-OTHER = 0.02, 0.05
-# Of the body's size: bodies no vertex of which is farther apart come to the same end; so far off a body is what a limb
-# that is elsewhere leaves uncovered; and the share of a scan that is then lost, where a hand is 0.02 of a man.
-ALIKE, FAR, LOST = 0.015, 0.045, 0.005
 # a first model of a set only has to find bodies: a tenth of the time of `scape learn`
 LEARNING = LearnConfig(prunings=(0.01,), ridges=(0.003, 0.03), refinements=1)
-NO_LANDMARKS = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,60 +59,6 @@ class ModelLead:
         return map(self.carry, find_bodies(body_model, scan, marked))
 
 
-def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None) -> Iterator[Mesh]:
-    """Yield bodies of a model on a scan, each sought when it is asked for.
-
-    First the likeliest of typical poses; then the best with limbs moved elsewhere, and another body that explains the
-    scan nearly as well, where there are such.
-
-    Parameters
-    ----------
-    model : BodyModel
-    scan : Mesh or (n, 3) float, metres
-    landmarks : (L,) int and (L, 3) float, metres, optional
-        Few vertices of the model and where they are on the scan.
-    """
-    body, size = as_body(model), float(np.sqrt(model.template.face_areas.sum()))
-    fit, few, starts = _search(body, scan, landmarks or NO_LANDMARKS)
-
-    def mesh_of(x: np.ndarray) -> Mesh:
-        """The body of unknowns (P,) at its own size."""
-        return model.template.with_vertices(body.vertices(fit.body.in_metres(x)[0]))
-
-    first = mesh_of(_solve(fit, few, starts[0]))
-    # what is left uncovered so far off is a limb that is elsewhere; nobody needs to look at such a body
-    lost = uncovered_share(scan, first, FAR * size) > LOST
-    if not lost:
-        yield first
-    for x in _solve_with_limbs(fit, few, starts):
-        other = mesh_of(x)
-        if lost or np.linalg.norm(other.vertices - first.vertices, axis=1).max() > ALIKE * size:
-            yield other
-
-
-@one_thread()
-def _search(body: FixedBody, scan: Mesh | np.ndarray, landmarks: Landmarks) -> tuple[ScanFit, ScanFit, np.ndarray]:
-    """The fit of a scan, the same with few vertices, and the unknowns (n, P) of the likeliest bodies, best first."""
-    fit, _ = prepare_scan_fit(body, scan, *landmarks, ScanFitConfig())
-    few = fit.few()
-    starts = first_starts(fit, few)
-    if len(landmarks[0]) >= 3:                 # few landmarks leave much open: also bodies that begin without
-        starts = np.concatenate([starts, from_nothing(few)])
-    return fit, few, best_starts(few, starts)
-
-
-@one_thread()
-def _solve_with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> list[np.ndarray]:
-    """Unknowns (P,) of the best start after its limbs were moved elsewhere, and of one that explains nearly as much."""
-    return [_solve(fit, few, x) for x in with_limbs(fit, few, starts) if x is not None]
-
-
-@one_thread()
-def _solve(fit: ScanFit, few: ScanFit, x: np.ndarray) -> np.ndarray:
-    """Unknowns (P,) of pose, place and shape together, from those of a start."""
-    return solve_jointly(fit, few, x, lambda done: None).x
-
-
 def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None] | None = None) -> ModelLead | None:
     """A model that leads a template to scans, see `scanprep.registration.lead.lead_of`.
 
@@ -155,23 +85,17 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
         return ModelLead(name, corners, np.repeat(weights, len(corners), axis=0), np.zeros(len(corners)),
                          _parts(model, template, template))
     # the body is found on the template as on any scan, and laid on it
-    for body in find_bodies(model, template):
-        tell(1, 2)
-        laid = register(body, template, start=body.vertices)
-        other = laid.uncovered > OTHER[0] or share_stretched(body, laid.mesh) > OTHER[1]
-        if not other:
-            break
-    tell(2, 2)
-    if other:
+    try:
+        laid = lay_model(model, template, tell)
+    except ModelMismatchError as error:
         if through == "auto":
             return None
-        raise ValueError(f"--through {through}: the model does not come to lie on the template, "
-                         f"{100 * laid.uncovered:.0f}% of which lies off it: a model of something else?")
+        raise ValueError(f"--through {through}: {error}") from error
     # every vertex of the template gets a place on the body, and a distance from its skin
-    place = Surface(laid.mesh).closest(template.vertices)
-    corners = laid.mesh.faces[place.faces]
-    off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid.mesh, corners, place.bary))
-    return ModelLead(name, corners, place.bary, off, _parts(model, laid.mesh, template))
+    place = Surface(laid).closest(template.vertices)
+    corners = laid.faces[place.faces]
+    off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid, corners, place.bary))
+    return ModelLead(name, corners, place.bary, off, _parts(model, laid, template))
 
 
 def learn_set_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None, path: Path

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,32 +21,39 @@ from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
 from scanprep.ranges import Count
+from scanprep.registration.person import has_limbs
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
+from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
 from ..cli import about, read_bodies
+from ..files import BUILT_IN, load_model
+from ..fitting.search import ModelMismatchError
 from .config import LearnConfig
 from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
+from .prior import TemplatePrior, bring_prior
 from .scape import Progress, judge_model, learn_blendscape, learn_scape
 from .sexes import learn_by_sex
 from .skinning import SkinConfig, learn_skinning
 
 SEXES = "sexes.csv"                  # in a plain folder of shapes
 Kind = Literal["scape", "blendscape", "skinning", "mixed"]
+WITH_PRIOR = "scape", "blendscape"
 
 
 def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
           skeleton: Path | None = None, landmarks: Path | None = None, subject: Annotated[str | None, Person] = None,
           unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", by_sex: bool = False,
-          scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX,
-          *, space: FileWorkspace) -> Outcome:
+          prior: str = "auto", scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(),
+          mixed: LearnConfig = MIX, *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
 
-    Killed and started again it goes on where it was; what does not depend on a change is not learned again. A picture
-    of the parts and one of the shape components lie beside the model.
+    From few scans it is a known model, adapted: what they do not show, how joints bend and how people differ, is as
+    there. One registered scan is enough. Killed and started again it goes on where it was; what does not depend on a
+    change is not learned again. A picture of the parts and one of the shape components lie beside the model.
 
     Example: scape learn --poses set --shapes set -o model.npz
 
@@ -54,14 +62,16 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         output: Model file to write.
         shapes: Folder of meshes of many people, or a registered set; without it the model has no shape of its own.
         template: The mesh that the others are deformations of; else the first of the poses, or the set's own.
-        skeleton: JSON of `scape prep skeleton`; else the set's own, else found from the poses, with as many parts as
-            predict left-out poses best.
+        skeleton: JSON of `scape prep skeleton`; else the set's own, where there is no prior. Else it is found from the
+            poses and those of the prior, with as many parts as predict left-out poses best.
         landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
         subject: Of a registered set, whose meshes are the poses; else of the one with the most.
         unit: Unit of the meshes.
         parts: Find a skeleton with so many parts, whatever skeleton there is.
         kind: SCAPE, BlendSCAPE, linear blend skinning with pose-corrective shapes, or SCAPE from a mix: the poses are
             then those of many people, a registered set that says whose mesh each is.
+        prior: Where scans say little, as in this model: a file, "people", "none", or "auto", the built-in people for a
+            template that is a person. For SCAPE and BlendSCAPE; with --by-sex for the movement alone.
         by_sex: Also a model of the women and one of the men, beside the neutral one, where the set says the sex; of a
             plain folder of shapes, sexes.csv in it with the columns name,sex.
         scape: Settings of SCAPE and BlendSCAPE.
@@ -74,6 +84,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         raise UsageError("--by-sex: it needs --shapes and the kind scape")
     if kind not in ("scape", "blendscape") and scape == LearnConfig.published():
         raise UsageError(f"--kind {kind}: the paper of --preset published has SCAPE alone")
+    if prior not in ("auto", "none") and kind not in WITH_PRIOR:
+        raise UsageError(f"--prior {prior}: expected the kind {' or '.join(WITH_PRIOR)}, got {kind}")
     # what is learned from, and what the model is to know besides
     if kind == "mixed":
         if not (poses / "set.json").exists():
@@ -84,24 +96,29 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         (body, posed), who = read_poses(poses, template, subject, unit), []
     people = None if shapes is None else read_bodies(shapes, body, unit)[0]
     sexes = None if not by_sex or shapes is None else _read_sexes(shapes)
-    tree = None if parts is not None else _read_skeleton(skeleton, poses, body)
     marks = landmarks or poses / "landmarks.json"
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
     # the parts, where none are given, and the model
     step = KeptSteps(space)
+    known = _bring_prior(body, prior if kind in WITH_PRIOR else "none", step)
+    # the poses of a prior show joints that no scan bends: with them even 57 poses gave a better skeleton than alone
+    found = parts is not None or (known is not None and skeleton is None)
+    tree = None if found else _read_skeleton(skeleton, poses, body)
     if tree is None:
         if kind == "mixed":
             raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
         with bar("finding the skeleton") as progress:
-            tree = step("skeleton", (body, posed, parts), lambda: _find_skeleton(body, posed, parts, step, progress))
+            more = None if known is None else known.poses[1:]
+            tree = step("skeleton", (body, posed, parts, more),
+                        lambda: _find_skeleton(body, posed, parts, more, step, progress))
     with bar("learning the model") as progress:
-        more = progress, step
+        how = progress, step
         models: Mapping[str, BodyModel] = (
-            {"neutral": learn_scape_mix(body, posed, who, tree, mixed, *more)} if kind == "mixed" else
-            learn_by_sex(body, posed, people, sexes, tree, scape, *more) if people is not None and sexes else
-            {"neutral": learn_blendscape(body, posed, people, tree, scape, *more)} if kind == "blendscape" else
-            {"neutral": learn_skinning(body, posed, people, tree, skinning, *more)} if kind == "skinning" else
-            {"neutral": learn_scape(body, posed, people, tree, scape, *more)})
+            {"neutral": learn_scape_mix(body, posed, who, tree, mixed, *how)} if kind == "mixed" else
+            learn_by_sex(body, posed, people, sexes, tree, scape, *how, known) if people is not None and sexes else
+            {"neutral": learn_blendscape(body, posed, people, tree, scape, *how, known)} if kind == "blendscape" else
+            {"neutral": learn_skinning(body, posed, people, tree, skinning, *how)} if kind == "skinning" else
+            {"neutral": learn_scape(body, posed, people, tree, scape, *how, known)})
     for name, model in models.items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
         kept = dataclasses.replace(model, info={**model.info, "landmarks": named})     # type: ignore[type-var]
@@ -115,17 +132,51 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     return Outcome(output, [
         *about(models["neutral"]), Metric("poses", len(posed)),
         Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
+        *_about_prior(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
         *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)), *times])],
         {"scape": scape, "skinning": skinning, "mixed": mixed}, judgement=judge_model(models["neutral"], people),
         following=f"look at it: scape view {output}")
 
 
-def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: Step, progress: Progress) -> Skeleton:
+def _bring_prior(body: Mesh, prior: str, step: Step) -> TemplatePrior | None:
+    """The prior of a name in the template's triangles; None for "none", and for "auto" on what is no person."""
+    if prior == "none" or (prior == "auto" and not has_limbs(body)):
+        return None
+    name = BUILT_IN if prior == "auto" else prior
+    model = load_model(name)
+    try:
+        with bar(f"bringing the model {name} to the template") as progress:
+            return step("prior", (body, name, model.template, model.pose_examples),
+                        lambda: bring_prior(model, body, progress))
+    except ModelMismatchError as error:
+        if prior == "auto":
+            warnings.warn(f"learned without the built-in people: {error}", stacklevel=2)
+            return None
+        raise ValueError(f"--prior {prior}: {error}") from error
+
+
+def _about_prior(model: BodyModel) -> list[Metric]:
+    """What of a model is its prior's; no rows where it has none."""
+    if "prior" not in model.info:
+        return []
+    count, evidence = model.info["prior_people"], model.info["joint_evidence"]
+    own = [f"{joint_in_words(name)} {100 * share:.0f}%" for name, share in
+           list(zip(model.skeleton.names, evidence, strict=True))[1:]]
+    return [Metric("prior", model.info["prior"]),
+            Metric("joints as in the prior, as no scan bends them", model.info["joints_of_prior"] or "none"),
+            Metric("people of the prior count as", count, "people"),
+            *details([Metric("share of each joint's movement that is of your scans", ", ".join(own))])]
+
+
+def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, known: np.ndarray | None, step: Step,
+                   progress: Progress) -> Skeleton:
+    """The skeleton of posed bodies (M, N, 3), and of those of a prior (K, N, 3), with so many parts or the best."""
     within = inside(step, "skeleton")
     if parts is None:
-        return choose_skeleton(body, posed, progress=progress, step=within).skeleton
-    return find_skeleton(body, posed, SkeletonConfig(parts=parts), progress, within)
+        return choose_skeleton(body, posed, progress, within, known).skeleton
+    shown = posed if known is None else np.concatenate([posed, known])
+    return find_skeleton(body, shown, SkeletonConfig(parts=parts), progress, within)
 
 
 def _read_sexes(folder: Path) -> list[str]:

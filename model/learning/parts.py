@@ -32,8 +32,8 @@ class ChosenSkeleton:
 
 
 @one_thread()
-def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None = None, step: Step = once
-                    ) -> ChosenSkeleton:
+def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None = None, step: Step = once,
+                    known: np.ndarray | None = None) -> ChosenSkeleton:
     """A skeleton with as many parts as help to predict poses that were left out.
 
     The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
@@ -50,6 +50,14 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
         Called with the skeletons done and their largest number.
     step : callable, optional
         Keeps every restart, skeleton and error, as `scanprep.batch.room.Step`.
+    known : (K, N, 3) float, metres, optional
+        The same person as a prior moves them. They show joints that no pose bends; how many parts there are is chosen
+        by the left-out poses alone, which are predicted with the prior as `learn_scape` does. Of a single pose none can
+        be left out: then the prior's are.
+
+    Returns
+    -------
+    ChosenSkeleton
 
     Raises
     ------
@@ -60,13 +68,15 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     poses = np.asarray(poses, dtype=np.float64)
     settings = SkeletonConfig()
     whole = 1 + settings.restarts + TRIES
-    finder = SkeletonFinder(template, poses, settings, lambda done, total: tell(done, whole), step)
+    shown = poses if known is None else np.concatenate([poses, known])
+    finder = SkeletonFinder(template, shown, settings, lambda done, total: tell(done, whole), step)
     vertices, coarse = coarse_copy(template, VERTICES)
 
     def tried(parts: int | None) -> tuple[Skeleton, float] | None:
         name = "best parts" if parts is None else f"{parts} parts"
-        return step(name, (template, poses, settings, parts, QUICK, VERTICES),
-                    lambda: _tried(finder, parts, coarse, poses[:, vertices]))
+        return step(name, (template, poses, settings, parts, QUICK, VERTICES, known),
+                    lambda: _tried(finder, parts, coarse, poses[:, vertices],
+                                   None if known is None else known[:, vertices]))
 
     first = tried(None)
     assert first is not None, "what goes wrong without a count of parts is raised"
@@ -87,14 +97,15 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     return ChosenSkeleton(best, errors)
 
 
-def _tried(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray
+def _tried(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray, known: np.ndarray | None
            ) -> tuple[Skeleton, float] | None:
-    """A skeleton and its error on coarse bodies (M, n, 3); None where there is no tree of so many parts, or parts are
-    too small to compare.
+    """A skeleton and its error on coarse bodies (M, n, 3), with those of a prior (K, n, 3).
+
+    None where there is no tree of so many parts, or parts are too small to compare.
     """
     try:
         found = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
-        return found, _left_out_error(poses, coarse_skeleton(found, finder.template, coarse), coarse)
+        return found, _left_out_error(poses, coarse_skeleton(found, finder.template, coarse), coarse, known)
     except ValueError:
         if parts is None:
             raise
@@ -125,7 +136,11 @@ def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleto
     return Skeleton(part, skeleton.parents, joints)
 
 
-def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh) -> float:
+def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, known: np.ndarray | None) -> float:
     """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
-    parts = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton))
-    return learn_pose(parts, poses, QUICK, Work(None)).design.left_out_error
+    parts, prior = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton)), None
+    if known is not None:
+        prior = learn_pose(parts, np.concatenate([coarse.vertices[None], known]), QUICK, Work(None))
+        if len(poses) == 1:
+            return prior.design.left_out_error
+    return learn_pose(parts, poses, QUICK, Work(None), prior=prior).design.left_out_error

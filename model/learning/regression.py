@@ -21,7 +21,7 @@ class Design:
 
     The features are those before they are made few: every part has all the numbers of all its joints. A group is a
     part, its features (n,), and the triangles (f,) that regress on the same two joints. Of the errors of left-out
-    poses, metres.
+    poses, metres. With a `prior` the penalty draws Q towards what that says, instead of towards a constant.
     """
 
     template: Mesh
@@ -31,6 +31,7 @@ class Design:
     pruning: float
     ridge: float
     left_out_error: float = float("nan")
+    prior: PoseSpace | None = None
 
     def fit(self, poses: np.ndarray, Q: np.ndarray) -> PoseSpace:
         """Q (M, F, 3, 3), seen at poses (M, J, 3), as a function of the features. [SCAPE] Eq. 4"""
@@ -95,6 +96,8 @@ class SeenPoses:
     def fit(self, sums: np.ndarray) -> PoseSpace:
         """Q as a function of the features, from its sums (r, F, 3, 3). [SCAPE] Eq. 4"""
         design, M = self.design, len(self.poses)
+        if design.prior is not None:            # what the prior leaves is regressed, and added to what it says
+            sums = sums - self.of_space(design.prior)
         v_hat = design.template.corners[:, 1:] - design.template.corners[:, :1]
 
         def solve(used: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -108,24 +111,25 @@ class SeenPoses:
                 slope = ridge_operator(X, M * design.ridge) @ flat
             return np.concatenate([(mean - centre @ slope)[None], slope])
 
-        return design.space(solve)
+        space = design.space(solve)
+        return space if design.prior is None else design.prior.add(space)
 
 
 Judge = Callable[[Design], float]
 
 
 def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: LearnConfig, judge: Judge,
-                  start: Design | None = None) -> Design:
+                  start: Design | None = None, prior: PoseSpace | None = None) -> Design:
     """The features, pruning and penalty that predict left-out poses of (M, J, 3) best, one sought after the other. The
     judge gives the error of a design in metres. The choices begin with those of `start`, or with the middle of what
-    there is. [SCAPE] Eq. 4
+    there is. All designs have the `prior`. [SCAPE] Eq. 4
     """
     choices = {"pruning": config.prunings, "ridge": config.ridges}
     at = {name: values[len(values) // 2] for name, values in choices.items()}
     if start is not None:
         at = {name: getattr(start, name) for name in choices}
     def tried(**chosen: float) -> Design:
-        design = make_design(template, skeleton, poses, config, **{**at, **chosen})
+        design = replace(make_design(template, skeleton, poses, config, **{**at, **chosen}), prior=prior)
         return replace(design, left_out_error=judge(design))
 
     best = tried()
@@ -179,15 +183,19 @@ def _left_out_operator(design: Design, delta: np.ndarray, used: np.ndarray) -> n
 def left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """Q (M, F, 3, 3) of every pose as ridge regression on the other poses predicts it."""
     delta, out = design.features.evaluate(poses), np.empty_like(Q)
+    known = 0.0 if design.prior is None else design.prior.gradients(poses)
+    Q = Q - known
     for _, used, faces in design.groups:
         target = Q[:, faces].reshape(len(Q), -1)
         predicted = target - _left_out_operator(design, delta, used) @ target
         out[:, faces] = predicted.reshape(len(Q), len(faces), 3, 3)
-    return out
+    return out + known
 
 
 def by_edges(template: Mesh, poses: np.ndarray, Q: np.ndarray) -> Judge:
     """The root mean square error of the edges of left-out poses, metres, of poses (M, J, 3) and Q (M, F, 3, 3).
+
+    For designs with a prior Q is what the prior leaves of it.
 
     Off by L T, the edges T (M, 6f) of a group of triangles count as trace(L T Tᵀ Lᵀ): their products are summed once.
     """

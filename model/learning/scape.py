@@ -5,6 +5,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,18 +25,23 @@ from ..body import BodyModel, Progress
 from ..digests import body_digest, body_digests, checked_bodies, digest
 from ..features import twists
 from ..fitting.vertices import FitConfig, PoseFitter
-from ..gradients import GradientSystem, pose_gradients, shape_gradients
+from ..gradients import GradientSystem, ShapeSolver, pose_gradients, shape_gradients
 from ..human_poses import mixed, with_human_poses
 from ..linear import Subject
 from ..pose_space import PoseSpace
 from ..priors import CRUDE, STIFF, stiff_joints
 from ..scape import BlendScapeModel, ScapeModel
-from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
+from ..shape_space import ShapeSpace, add_people, body_volumes, learn_shape_space
 from .config import LearnConfig
+from .prior import TemplatePrior
 from .regression import Design, by_edges, choose_design, compress, left_out
 
 T = TypeVar("T")
 POSES = 2 / 3                        # of the time of learning, where there are people as well
+# The pose space of a prior's own bodies: refined once it was 0.3 mm better on held-out poses, for three times the time.
+PRIOR = LearnConfig(prunings=(0.01,), ridges=(1e-3,), refinements=0)
+WORTH = 10.0                         # people that the people of a prior count as
+ONE_POSE = 0.016                     # metres by which the built-in people's movement misses SCAPE poses of one scan
 
 
 class Work:
@@ -64,40 +70,50 @@ class Work:
 
 @one_thread()
 def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once
-                ) -> ScapeModel:
+                config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once,
+                prior: TemplatePrior | None = None) -> ScapeModel:
     """Learn a body model from one person in many poses and many people in about one pose.
+
+    With a `prior` the model is the known one, adapted: what the scans do not show is as there.
 
     Parameters
     ----------
     template : Mesh
         One of the poses.
     poses : (M, N, 3) float, metres
-        The template's person in M poses.
+        The template's person in M poses, at least two; with a prior one is enough.
     shapes : (S, N, 3) float, metres, or None
-        Other people; None for a model of the template's own body alone.
+        Other people; with None the model is of the template's own body alone, or of the people of the prior.
     skeleton : Skeleton
+        For few poses that of the prior.
     config : LearnConfig, optional
     progress : callable, optional
         Called with the work done and the whole.
     step : callable, optional
         Keeps what was worked out on the way, as `scanprep.batch.room.Step`.
+    prior : TemplatePrior, optional
+        Of `bring_prior`.
+
+    Returns
+    -------
+    ScapeModel
+        `info["prior"]` says how much of every joint and of the people is the prior's.
 
     Raises
     ------
     ValueError
-        Fewer than two poses, vertices of another count or not finite, a skeleton of another template.
+        Too few poses, vertices of another count or not finite, a skeleton of another template.
 
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
-    return ScapeModel(template, skeleton, **_learned(parts, poses, shapes, config, Work(progress, step)))
+    return ScapeModel(template, skeleton, **_learned(parts, poses, shapes, config, Work(progress, step), prior))
 
 
 @one_thread()
 def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                     config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once
-                     ) -> BlendScapeModel:
+                     config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once,
+                     prior: TemplatePrior | None = None) -> BlendScapeModel:
     """Learn a body model whose rotations blend across the borders of parts.
 
     All is as in `learn_scape`, with `R` a mixture of rotations for triangles near a border. A mixture is no rotation;
@@ -105,7 +121,7 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     Parameters
     ----------
-    template, poses, shapes, skeleton, config, progress, step
+    template, poses, shapes, skeleton, config, progress, step, prior
         As for `learn_scape`.
 
     Raises
@@ -115,23 +131,34 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     [BlendSCAPE]
     """
-    checked_training(template, skeleton, poses, shapes)
+    checked_training(template, skeleton, poses, shapes, prior)
     # a share of the template's diagonal: so far a rotation blends over the border of its part
     blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
-    return BlendScapeModel(template, skeleton, **_learned(parts, poses, shapes, config, Work(progress, step)),
-                           blend=blend)
+    learned = _learned(parts, poses, shapes, config, Work(progress, step), prior)
+    return BlendScapeModel(template, skeleton, **learned, blend=blend)
 
 
 def _learned(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig | None,
-             work: Work) -> dict[str, Any]:
+             work: Work, prior: TemplatePrior | None) -> dict[str, Any]:
     """Pose space, shape space, pose prior and info of a SCAPE model of either kind."""
     config = config or LearnConfig()
-    poses, shapes = checked_training(parts.template, parts.skeleton, poses, shapes)
-    learned = learn_pose(parts, poses, config, work)                                       # [SCAPE] Eq. 3, Eq. 4, Eq. 5
-    people = learn_people(parts, learned.space, shapes, config, work)                      # [SCAPE] Eq. 7, Eq. 8
+    poses, shapes = checked_training(parts.template, parts.skeleton, poses, shapes, prior)
+    learned = learn_pose_with(prior, parts, poses, config, work)                           # [SCAPE] Eq. 3, Eq. 4, Eq. 5
+    people = learn_people(parts, learned.space, shapes, config, work, prior)               # [SCAPE] Eq. 7, Eq. 8
     return {"pose_space": learned.space, "shape_space": people,
-            **seen_in_training(parts.template, parts.skeleton, learned, poses, shapes, config)}
+            **seen_in_training(parts.template, parts.skeleton, learned, poses, shapes, config, prior)}
+
+
+def learn_pose_with(prior: TemplatePrior | None, parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig,
+                    work: Work) -> LearnedPose:
+    """The pose space of bodies (M, N, 3), which leans on a prior where there is one; two thirds of the work."""
+    if prior is None:
+        return learn_pose(parts, bodies, config, work, POSES)
+    # the prior's own bodies are learned from in the same way, on this skeleton
+    known = learn_pose(parts, prior.poses, replace(PRIOR, features=config.features, smoothness=config.smoothness),
+                       work, POSES / 3)
+    return learn_pose(parts, bodies, config, work, 2 * POSES / 3, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,16 +170,26 @@ class LearnedPose:
     design: Design
 
 
-def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: Work) -> LearnedPose:
-    """The pose space, first as in the paper, then refined on the stitched surface. [SCAPE] Eq. 3, Eq. 4, Eq. 5"""
-    template, skeleton, inputs = parts.template, parts.skeleton, (parts, bodies, replace(config, components=0))
+def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: Work, share: float = 1.0,
+               prior: LearnedPose | None = None) -> LearnedPose:
+    """The pose space, first as in the paper, then refined on the stitched surface; a share of the work.
+
+    A prior is taken where left-out poses are predicted better with it, which are none of a single one.
+    [SCAPE] Eq. 3, Eq. 4, Eq. 5
+    """
+    template, skeleton = parts.template, parts.skeleton
+    inputs = (parts, bodies, replace(config, components=0), prior and (prior.space, prior.poses))
     system = GradientSystem(template, config.smoothness, skeleton.part_of_face)
 
     def first(_: Work) -> LearnedPose:
         """Q of every body from the rotations of Procrustes, regressed on the joint twists."""
         poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))                      # R, then Δr
         Q = pose_gradients(system, parts.local_edges(bodies, poses))                            # [SCAPE] Eq. 5
-        design = choose_design(template, skeleton, poses, config, by_edges(template, poses, Q))
+        designs = [choose_design(template, skeleton, poses, config, by_edges(template, poses, Q))]
+        if prior is not None:
+            judge = by_edges(template, poses, Q - prior.space.gradients(poses))
+            designs.insert(0, choose_design(template, skeleton, poses, config, judge, prior=prior.space))
+        design = min(designs, key=attrgetter("left_out_error"))         # of equals, as of one pose, that with the prior
         return LearnedPose(design.fit(poses, Q), poses, design)                                 # [SCAPE] Eq. 4
 
     def learn(inner: Work) -> LearnedPose:
@@ -161,12 +198,13 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
         for k in range(config.refinements):
             learned = inner.step(f"refinement {k}", inputs, share,
                                  partial(_refined, parts, system, bodies, config, learned, k == 0))
-        # features are joined to the few mixtures that matter
+        # features are joined to the few mixtures that matter, in the poses seen and in those of the prior
         tolerance = config.detail * template.mean_edge
+        seen = learned.poses if prior is None else np.concatenate([learned.poses, prior.poses])
         return learned if not tolerance else replace(
-            learned, space=compress(learned.space, learned.poses, template, tolerance))
+            learned, space=compress(learned.space, seen, template, tolerance))
 
-    return work.step("pose space", inputs, POSES, learn)
+    return work.step("pose space" if prior is None else "pose space with the prior", inputs, share, learn)
 
 
 def _refined(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig,
@@ -193,7 +231,7 @@ def _refined(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray,
                                 zip(bodies, poses, left_out(tried, poses, Q), strict=True)])
                 return float(np.linalg.norm(off - off.mean(axis=1, keepdims=True), axis=2).mean())
 
-            design = choose_design(parts.template, parts.skeleton, poses, config, by_vertices, design)
+            design = choose_design(parts.template, parts.skeleton, poses, config, by_vertices, design, design.prior)
         seen = design.seen(poses)
         space = seen.fit(seen.of_space(space) + _correction(parts, system, seen.sums(left)))    # [SCAPE] Eq. 4
     return LearnedPose(space, poses, design)
@@ -215,17 +253,34 @@ def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Wor
     return np.stack(fitted)
 
 
-def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig, work: Work
-                 ) -> ShapeSpace:
-    """The space of body shapes of people (P, N, 3), without components where there are none. [SCAPE] Eq. 7, Eq. 8"""
-    if shapes is None:
+def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig, work: Work,
+                 prior: TemplatePrior | None = None) -> ShapeSpace:
+    """The space of body shapes of people (P, N, 3), who may be none, and of the prior's. [SCAPE] Eq. 7, Eq. 8"""
+    if shapes is None and prior is None:
         work.tick(1 - POSES)
         return ShapeSpace.empty(len(parts.template.faces))
+    people = np.zeros((0, *parts.template.vertices.shape)) if shapes is None else shapes
 
-    return work.step(
-        "shape components", (parts, space, shapes, config.smoothness, config.components), 1 - POSES,
-        lambda inner: learn_shape_space(shape_deformations(parts, space, shapes, config, inner), config.components,
-                                        body_volumes(parts.template, shapes)))
+    def learn(inner: Work) -> ShapeSpace:
+        S, volumes = shape_deformations(parts, space, people, config, inner), body_volumes(parts.template, people)
+        if prior is None:
+            return learn_shape_space(S, config.components, volumes)
+        return add_people(S, volumes, prior_deformations(parts, space, prior.people, config),
+                          body_volumes(parts.template, prior.people), WORTH, config.components)
+
+    return work.step("shape components", (parts, space, people, config.smoothness, config.components,
+                                          prior and prior.people), 1 - POSES, learn)
+
+
+def prior_deformations(parts: BlendedTemplate, space: PoseSpace, people: np.ndarray, config: LearnConfig
+                       ) -> np.ndarray:
+    """S (1 + K, F, 3, 3), in float32, of the people of a prior, who all stand in the pose of the first.
+
+    [SCAPE] Eq. 8
+    """
+    pose = parts.skeleton.pose_of(parts.skeleton.fit_rotations(parts.template, people[0]))
+    solve = ShapeSolver(GradientSystem(parts.template, config.smoothness), parts.posed(space.gradients(pose)))
+    return np.stack([solve(parts.local_edges(person, pose)).astype(np.float32) for person in people])
 
 
 def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig, work: Work
@@ -254,15 +309,44 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
 
 
 def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, poses: np.ndarray,
-                     shapes: np.ndarray | None, config: LearnConfig) -> dict[str, Any]:
+                     shapes: np.ndarray | None, config: LearnConfig, prior: TemplatePrior | None = None
+                     ) -> dict[str, Any]:
     """What a model keeps of its making: the pose prior, its examples, and settings, choices, sizes and digests."""
     design, examples = learned.design, pose_examples(template, skeleton, learned.poses, shapes)
     mean, covariance = pose_prior(template, skeleton, examples, len(poses))
+    if prior is not None:                   # what joints do that no scan bends
+        examples = np.concatenate([examples, pose_examples(
+            template, skeleton, skeleton.pose_of(skeleton.fit_rotations(template, prior.poses)))])
+    of_prior = {} if prior is None else describe_prior(prior, skeleton, learned, 0 if shapes is None else len(shapes))
     return {"pose_mean": mean, "pose_covariance": covariance, "pose_examples": examples, "info": {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
-        "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes),
-        "digests": body_digests(poses, shapes)}}
+        "left_out_error": design.left_out_error if len(poses) > 1 else ONE_POSE,     # of a single pose none is left out
+        "digest": digest(template, poses, shapes), "digests": body_digests(poses, shapes), **of_prior}}
+
+
+def describe_prior(prior: TemplatePrior, skeleton: Skeleton, learned: LearnedPose, people: int) -> dict[str, Any]:
+    """What of a model is the prior's: its name, the joints, and how many of so many people its own count as."""
+    return {"prior": prior.name, "prior_people": WORTH, "joint_evidence": joint_evidence(learned),
+            "joints_of_prior": ", ".join(joint_in_words(skeleton.names[j]) for j, share in
+                                         enumerate(joint_evidence(learned)) if j and share < 0.5)}
+
+
+def joint_evidence(learned: LearnedPose) -> list[float]:
+    """How much of the deformation by each joint (J,) the scans say, from 0, all is the prior's, to 1.
+
+    A ridge regression takes from data the share v / (v + penalty) along a twist direction of variance v. The direction
+    in which a joint moved most counts; one that was pruned says nothing. The root, which deforms nothing, has 1.
+
+    [SCAPE] Eq. 4
+    """
+    design, twist = learned.design, twists(learned.poses)
+    if design.prior is None:
+        return [1.0] * twist.shape[1]
+    centred = twist - twist.mean(axis=0)
+    moved = np.linalg.eigvalsh(np.einsum("mji,mjk->jik", centred, centred) / len(centred))[:, -1]
+    share = np.where(moved >= design.pruning, moved / (moved + design.ridge), 0.0)
+    return [1.0, *share[1:].tolist()]
 
 
 def pose_prior(template: Mesh, skeleton: Skeleton, examples: np.ndarray, count: int
@@ -297,12 +381,15 @@ def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes:
     return out
 
 
-def checked_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None
-                     ) -> tuple[np.ndarray, np.ndarray | None]:
+def checked_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None,
+                     prior: TemplatePrior | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """Poses (M, N, 3) and people (P, N, 3) that a model can be learned from, or ValueError."""
+    if prior is not None and prior.poses.shape[1:] != template.vertices.shape:
+        raise ValueError(f"prior: it was brought to a template of {prior.poses.shape[1]} vertices, not to this one of "
+                         f"{len(template.vertices)}")
     check_template(template)
     check_skeleton(template, skeleton)
-    return (checked_bodies(template, poses, "poses", 2),
+    return (checked_bodies(template, poses, "poses", 2 if prior is None else 1),
             None if shapes is None else checked_bodies(template, shapes, "shapes", 2))
 
 
@@ -319,7 +406,8 @@ def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
 def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement:
     """What a model learned with people (S, N, 3), metres, is worth: whether it means nothing, what it never saw."""
     learned = model.info.get("poses", 0)                # of nobody's poses are the examples of imported models
-    stiff = stiff_joints(model.pose_examples[:learned]) if learned else ()
+    known = "joints_of_prior" in model.info             # what no pose shows is known otherwise
+    stiff = stiff_joints(model.pose_examples[:learned]) if learned and not known else ()
     never, doubts = f"never bent more than {np.degrees(STIFF):.0f} degrees in your poses", []
     if len(stiff) and len(stiff) == len(model.skeleton.parents) - 1:
         doubts = [f"the poses are all alike: joints {never}"]

@@ -17,17 +17,16 @@ from ..body import BodyModel
 from ..digests import body_digests, digest
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
-from ..shape_statistics import SEXES
+from ..shape_statistics import PLANE, SEXES
 from .config import LearnConfig
-from .scape import POSES, Progress, Work, checked_training, learn_pose, seen_in_training, shape_deformations
-
-PLANE = "sex_plane"                  # its place in a model's info
+from .prior import TemplatePrior
+from .scape import POSES, Progress, Work, checked_training, learn_pose_with, seen_in_training, shape_deformations
 
 
 @one_thread()
 def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: Sequence[str], skeleton: Skeleton,
-                 config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once
-                 ) -> dict[str, ScapeModel]:
+                 config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once,
+                 prior: TemplatePrior | None = None) -> dict[str, ScapeModel]:
     """Learn a model of everybody and one of each sex: one pose space, and a space of shapes a group.
 
     Parameters
@@ -36,6 +35,8 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
         As for `learn_scape`.
     sexes : S strings
         "female", "male", or "" where it is not known; those count in the model of everybody alone.
+    prior : TemplatePrior, optional
+        Of the movement; shapes are those of the people alone.
 
     Returns
     -------
@@ -52,12 +53,12 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
     config = config or LearnConfig()
-    poses, people = checked_training(template, skeleton, poses, shapes)
+    poses, people = checked_training(template, skeleton, poses, shapes, prior)
     assert people is not None
     sex, groups = np.array(list(sexes), dtype=object), _groups(sexes, len(people))
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))
     work = Work(progress, step)
-    learned = learn_pose(parts, poses, config, work)
+    learned = learn_pose_with(prior, parts, poses, config, work)
 
     def learn(inner: Work) -> tuple[dict[str, ShapeSpace], dict[str, object] | None]:
         S = shape_deformations(parts, learned.space, people, config, inner)
@@ -71,7 +72,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
 
     spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
                                                    list(sexes)), 1 - POSES, learn)
-    kept = seen_in_training(template, skeleton, learned, poses, people, config)
+    kept = seen_in_training(template, skeleton, learned, poses, people, config, prior)
     models = {}
     for name, chosen in groups.items():
         info = {**kept["info"], "sex": name, "shapes": len(chosen), "digest": digest(template, poses, people[chosen]),

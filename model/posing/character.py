@@ -15,8 +15,8 @@ from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 
 from ..body import BodyModel, Progress
-from ..learning.sexes import PLANE
 from ..linear import check_pose
+from ..shape_statistics import PLANE
 
 # registrations of the template, each from where the last one left it: one alone does not stretch so far
 REGISTRATIONS = 2

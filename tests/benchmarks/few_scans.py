@@ -4,7 +4,8 @@
     SCAPEKIT_DATA=... python tests/benchmarks/few_scans.py --inner --offsets 1 -o inner.json          (for tuning)
     SCAPEKIT_DATA=... python tests/benchmarks/few_scans.py --poses 3 --men 1 -o fewest.json
 
-For each offset o the poses are mesh000 and those at `range(3 + o, 71, 9)[:7]`, the men `range(o, 227, 23)[:10]`. Held
+For each offset o the poses are mesh000 and those at `range(3 + o, 71, 9)[:7]`, the men `range(o, 227, 23)[:10]`; more
+are spread over all that are not held out. The model leans on the built-in people, with `--prior none` on nothing. Held
 out are the poses at indices 0 (mod 5) and the men at 2 (mod 5) that were not used; with `--inner` those at 1 and 3, so
 that what is tuned never meets what is reported. Rows: *poses*, *men*, the model fitted to held-out bodies; *known*,
 half views of held-out poses of the known man; *unknown*, half views of every third held-out man, of unknown shape;
@@ -31,14 +32,24 @@ from model import learn_scape
 from model.body import BodyModel
 from model.evaluation.errors import pose_errors, shape_errors
 from model.files import load_model
-from scanprep.skeleton.find import find_skeleton
+from model.learning.parts import choose_skeleton
+from model.learning.prior import bring_prior
 
 STAGES = ("poses", "men", "known", "unknown", "mosh")
 
 
-def training(offset: int, poses: int = 8, men: int = 10) -> tuple[np.ndarray, np.ndarray]:
+def training(offset: int, poses: int = 8, men: int = 10, inner: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the poses and of the men that a model is learned from."""
-    return np.array([0, *range(3 + offset, 71, 9)][:poses]), np.array(range(offset, 227, 23))[:men]
+    few_poses, few_men = np.array([0, *range(3 + offset, 71, 9)][:8]), np.array(range(offset, 227, 23))[:10]
+    rest_poses, rest_men = (np.flatnonzero(np.arange(count) % 5 != held)[offset:] for count, held in
+                            ((71, inner), (227, 3 if inner else 2)))
+    # more than those of the protocol: evenly over all that are not held out
+    return (few_poses[:poses] if poses <= 8 else np.union1d([0], _spread(rest_poses[rest_poses > 0], poses - 1)),
+            few_men[:men] if men <= 10 else _spread(rest_men, men))
+
+
+def _spread(indices: np.ndarray, count: int) -> np.ndarray:
+    return indices[np.linspace(0, len(indices) - 1, min(count, len(indices))).astype(int)]
 
 
 def held_out(offset: int, inner: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -48,18 +59,21 @@ def held_out(offset: int, inner: bool = False) -> tuple[np.ndarray, np.ndarray]:
     return np.setdiff1d(poses, used_poses), np.setdiff1d(men, used_men)
 
 
-def learned(data: RealData, offset: int, poses: int, men: int, folder: Path | None) -> BodyModel:
+def learn(data: RealData, offset: int, args: argparse.Namespace) -> BodyModel:
     """The model, read from a folder where it lies already."""
-    path = None if folder is None else folder / f"few_{offset}_{poses}_{men}.npz"
-    if path is not None and path.exists():
-        return load_model(path)
-    mine, people = training(offset, poses, men)
-    bodies = data.poses[mine]
-    model = learn_scape(data.template, bodies, data.shapes[people] if men > 1 else None,
-                        find_skeleton(data.template, bodies))
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        model.save(path)
+    name = f"few_{offset}_{args.poses}_{args.men}_{args.prior}.npz"
+    if args.models and (args.models / name).exists():
+        return load_model(args.models / name)
+    mine, people = training(offset, args.poses, args.men, args.inner)
+    bodies, prior = data.poses[mine], None
+    if args.prior != "none":
+        prior = bring_prior(load_model(args.prior), data.template)
+    chosen = choose_skeleton(data.template, bodies, known=None if prior is None else prior.poses[1:])
+    model = learn_scape(data.template, bodies, data.shapes[people] if args.men > 1 else None, chosen.skeleton,
+                        prior=prior)
+    if args.models:
+        args.models.mkdir(parents=True, exist_ok=True)
+        model.save(args.models / name)
     return model
 
 
@@ -121,22 +135,22 @@ def recovered_men(data: RealData, model: BodyModel, which: np.ndarray, offset: i
 
 def tried(data: RealData, offset: int, args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     """The rows of all stages of one draw."""
-    model = learned(data, offset, args.poses, args.men, args.models)
+    model = learn(data, offset, args)
     poses, men = held_out(offset, args.inner)
     rows: dict[str, list[dict[str, Any]]] = {}
     if "poses" in args.stages:
         mean = pose_errors(model, data.poses[poses]).errors.mean
         rows["poses"] = [{"offset": offset, "index": int(i), "error_mm": 1e3 * m}
                          for i, m in zip(poses, mean, strict=True)]
-    if "men" in args.stages and args.men > 1:
+    if "men" in args.stages and model.n_betas:
         mean = shape_errors(model, data.shapes[men], [model.n_betas]).errors[-1].mean
         rows["men"] = [{"offset": offset, "index": int(i), "error_mm": 1e3 * m}
                        for i, m in zip(men, mean, strict=True)]
     if "known" in args.stages:
         rows["known"] = half_views(data, model, True, poses, args, offset)
-    if "unknown" in args.stages and args.men > 1:
+    if "unknown" in args.stages and model.n_betas:
         rows["unknown"] = half_views(data, model, False, men, args, offset)
-    if "mosh" in args.stages and args.men > 1:
+    if "mosh" in args.stages and model.n_betas:
         rows["mosh"] = recovered_men(data, model, men, offset)
     return rows
 
@@ -171,6 +185,7 @@ def main() -> None:
     parser.add_argument("--inner", action="store_true")
     parser.add_argument("--poses", type=int, default=8)
     parser.add_argument("--men", type=int, default=10)
+    parser.add_argument("--prior", default="people", help="people, none or a model file")
     parser.add_argument("--marks", type=int, choices=(0, 7), default=7)
     parser.add_argument("--stages", nargs="*", choices=STAGES, default=list(STAGES))
     parser.add_argument("--only", type=int, nargs="*", help="half views of these places in the list")

@@ -1,0 +1,141 @@
+"""Models that lean on a known one where scans are few."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model import LearnConfig, learn_blendscape, learn_scape
+from model.features import QuadraticLift, part_features
+from model.fitting.vertices import fit_pose
+from model.learning.prior import TemplatePrior
+from model.learning.scape import judge_model
+from model.pose_space import PoseSpace
+from model.shape_space import add_people, learn_shape_space
+
+CONFIG = LearnConfig(refinements=1, components=6)
+
+
+def prior_of(model, seed=0, count=30):
+    """What a known model says of its own template."""
+    poses = random_poses(model, count, np.random.default_rng(seed), 0.4)
+    poses[0] = 0
+    steps = np.vstack([np.zeros(model.n_betas), np.eye(model.n_betas)])
+    people = np.stack([model.vertices(np.zeros((4, 3)), betas) for betas in steps])
+    return TemplatePrior("worms", model.skeleton, model.subject().vertices(poses), people)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return worm_model()
+
+
+@pytest.fixture(scope="module")
+def other():
+    """Another worm of the same skeleton, whose flesh moves in its own way."""
+    return worm_model(seed=5)
+
+
+def mean_error(model, truth, seed=9):
+    bodies = truth.subject().vertices(random_poses(truth, 8, np.random.default_rng(seed), 0.4))
+    return np.mean([fit_pose(model.subject(), body).mean for body in bodies])
+
+
+@pytest.mark.parametrize("learn", [learn_scape, learn_blendscape])
+def test_one_scan_is_enough(known, learn):
+    """The movement and the people are the prior's; the rest shape is the template's own."""
+    model = learn(known.template, known.template.vertices[None], None, known.skeleton, CONFIG, prior=prior_of(known))
+    np.testing.assert_allclose(model.vertices(np.zeros((4, 3))), known.template.vertices, atol=1e-3)
+    rigid = replace(known, pose_space=PoseSpace.identity(known.skeleton))
+    assert mean_error(model, known) < 0.6 * mean_error(rigid, known)
+    assert model.n_betas == known.n_betas
+    assert model.info["prior"] == "worms" and model.info["joint_evidence"] == [1.0, 0.0, 0.0, 0.0]
+    assert not judge_model(model).reasons
+
+
+def test_without_a_prior_one_scan_is_refused(known):
+    with pytest.raises(ValueError, match="poses: expected at least 2"):
+        learn_scape(known.template, known.template.vertices[None], None, known.skeleton, CONFIG)
+
+
+def test_few_scans_gain_and_many_have_their_own_way(known, other):
+    """The prior is of other flesh. With three poses it helps against nothing known; with sixty it changes little."""
+    prior, errors = prior_of(known), {}
+    for count in (3, 60):
+        poses = random_poses(other, count, np.random.default_rng(2), 0.4)
+        poses[0] = 0
+        bodies = other.subject().vertices(poses)
+        for name, given in (("with", prior), ("without", None)):
+            model = learn_scape(other.template, bodies, None, other.skeleton, CONFIG, prior=given)
+            errors[name, count] = mean_error(model, other)
+    assert errors["without", 60] < 0.7 * errors["without", 3]
+    assert errors["with", 60] < 1.05 * errors["without", 60]
+    # the same flesh from three poses: as good as known
+    poses = random_poses(known, 3, np.random.default_rng(2), 0.4)
+    poses[0] = 0
+    bodies = known.subject().vertices(poses)
+    alone, helped = (mean_error(learn_scape(known.template, bodies, None, known.skeleton, CONFIG, prior=given), known)
+                     for given in (None, prior))
+    assert helped < 0.5 * alone
+
+
+def test_a_joint_that_no_scan_bends_is_said_to_be_of_the_prior(known):
+    poses = random_poses(known, 12, np.random.default_rng(3), 0.4)
+    poses[0], poses[:, 1] = 0, 0
+    model = learn_scape(known.template, known.subject().vertices(poses), None, known.skeleton, CONFIG,
+                        prior=prior_of(known))
+    evidence = model.info["joint_evidence"]
+    assert evidence[1] < 0.05 and min(evidence[2:]) > 0.5
+    assert model.info["joints_of_prior"] == "joint of the part1"
+    # what the scans never showed moves as known
+    pose = np.zeros((4, 3))
+    pose[1] = [0, 0.6, 0]
+    body = known.subject().vertices(pose)
+    alone = learn_scape(known.template, known.subject().vertices(poses), None, known.skeleton, CONFIG)
+    assert fit_pose(model.subject(), body).mean < 0.8 * fit_pose(alone.subject(), body).mean
+
+
+def test_people_and_what_is_known_of_others_add_up_as_normal_inverse_wishart(known):
+    """Mean and covariance against the formula in full, of a few triangles."""
+    rng = np.random.default_rng(4)
+    prior, S, worth = rng.normal(size=(4, 5, 3, 3)), rng.normal(size=(6, 5, 3, 3)), 2.5
+    space = add_people(S, np.ones(6), prior, np.ones(4), worth, 40)
+    flat, known_mean = S.reshape(6, -1), prior[0].ravel()
+    mean = (flat.sum(axis=0) + worth * known_mean) / (6 + worth)
+    U, apart, off = prior[1:].reshape(3, -1) - known_mean, flat.mean(axis=0) - known_mean, flat - flat.mean(axis=0)
+    scatter = off.T @ off + worth * U.T @ U + 6 * worth / (6 + worth) * np.outer(apart, apart)
+    components = space.components.reshape(len(space.components), -1)
+    np.testing.assert_allclose(space.mean.ravel(), mean, atol=1e-6)
+    np.testing.assert_allclose(components.T @ components, scatter / (6 + worth), atol=1e-5)
+
+
+def test_nobody_beside_the_prior_leaves_its_people_and_many_are_themselves():
+    rng = np.random.default_rng(6)
+    prior = np.eye(3) + 0.1 * rng.normal(size=(3, 5, 3, 3))
+    alone = add_people(np.zeros((0, 5, 3, 3)), np.zeros(0), prior, np.ones(3), 10.0, 40)
+    U = (prior[1:] - prior[0]).reshape(2, -1)
+    np.testing.assert_allclose(alone.mean, prior[0], atol=1e-6)
+    np.testing.assert_allclose((C := alone.components.reshape(2, -1)).T @ C, U.T @ U, atol=1e-6)
+    S = np.eye(3) + 0.1 * rng.normal(size=(400, 5, 3, 3))
+    own, both = learn_shape_space(S, 8), add_people(S, np.ones(400), prior, np.ones(3), 1.0, 8)
+    np.testing.assert_allclose(both.mean, own.mean, atol=2e-3)
+    np.testing.assert_allclose(both.variances, own.variances, rtol=0.05)
+
+
+def test_pose_spaces_add_up(known, other):
+    poses = random_poses(known, 5, np.random.default_rng(7))
+    both = known.pose_space.add(other.pose_space)
+    np.testing.assert_allclose(both.gradients(poses), known.pose_space.gradients(poses)
+                               + other.pose_space.gradients(poses), atol=1e-5)
+    lift = QuadraticLift()
+    axes = [np.zeros((9, 0))] * 4
+    features = part_features(known.skeleton, lift, axes)
+    constant = tuple(np.zeros((1, len(f), 3, 3), np.float32) for f in known.pose_space.faces_of_part)
+    with pytest.raises(ValueError, match="linear and quadratic"):
+        known.pose_space.add(PoseSpace(features, constant))
+
+
+def test_a_prior_of_another_template_is_refused(known):
+    prior = prior_of(worm_model(rings=25))
+    with pytest.raises(ValueError, match="prior: it was brought to a template of 302 vertices"):
+        learn_scape(known.template, known.template.vertices[None], None, known.skeleton, CONFIG, prior=prior)
