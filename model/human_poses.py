@@ -28,9 +28,7 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
 
     A body counts as a person by the names of its parts, see `name_parts`.
     """
-    names = skeleton.names
-    chains = {(kind, side): limb_parts(names, skeleton.parents, skeleton.joints, kind, side)
-              for kind in LIMBS for side in ("left", "right")}
+    names, chains = skeleton.names, _limbs(skeleton)
     if not all(chains.values()):
         return None
     # axes (3, 3) take directions of the synthetic people, whose left is +x and who face -y, to the template's
@@ -60,6 +58,17 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
     poses = skeleton.pose_of(world @ at_rest)
     poses[:, [0, *(p for p, name in enumerate(names) if is_held(name))]] = 0
     return poses
+
+
+def is_person(skeleton: Skeleton) -> bool:
+    """Whether the parts of a skeleton have the names of a person's, so that `human_poses` hold for it."""
+    return all(_limbs(skeleton).values())
+
+
+def _limbs(skeleton: Skeleton) -> dict[tuple[str, str], list[int]]:
+    """The parts of every limb from the trunk outwards, by kind and side; none where names do not tell."""
+    return {(kind, side): limb_parts(skeleton.names, skeleton.parents, skeleton.joints, kind, side)
+            for kind in LIMBS for side in ("left", "right")}
 
 
 def is_held(name: str) -> bool:

@@ -17,7 +17,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration.cli import judge_registration
 from scanprep.registration.lead import lead_of
 from scanprep.registration.nonrigid import register
-from scanprep.registration.unmarked import find_rival, register_by_any, weigh_doubts
+from scanprep.registration.unmarked import Candidate, find_rival, register_by_any, weigh_doubts
 from scanprep.synthetic.people import BodyShape, Person, named_pose
 
 
@@ -95,9 +95,9 @@ def test_two_bodies_that_explain_a_scan_alike_are_both_kept(far):
     moved = replace(led.fit, mesh=egg.with_vertices(led.fit.mesh.vertices + (egg.vertices[:, 2:] > 0.6) * [0.5, 0, 0]))
     for seen in (True, False):
         hidden = [replace(fit, seen=(egg.vertices[:, 2] < 0.6) | seen) for fit in (led.fit, moved)]
-        best, other = ((0.0, fit, "") for fit in hidden)
+        best, other = (Candidate(0.0, fit, "") for fit in hidden)
         assert find_rival(egg, best, [best, other]) == (other if seen else None)
-        assert find_rival(egg, best, [best, (0.1, *other[1:])]) is None         # one that leaves more to doubt
+        assert find_rival(egg, best, [best, replace(other, doubt=0.1)]) is None         # one that leaves more to doubt
     assert lead_by(egg.vertices, back + [0.5, 0, 0]).rival is None              # one that explains less
     fit = register(egg, egg, start=egg.vertices, config=QUICK.scan.registration)
     assert judge_registration("egg", egg, egg, fit, None, None).verdict == "good"

@@ -15,6 +15,7 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
+from ..human_poses import is_person
 from .config import LearnConfig
 from .scape import Progress, Work, learn_pose
 
@@ -39,7 +40,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
     one, and a model of it gains from more parts than that: so finer skeletons are sought from the same restarts, a
     model is learned with each on a coarse copy of the bodies, and they are kept while the error of left-out poses
-    falls.
+    falls, and while a person's parts can be named.
 
     Parameters
     ----------
@@ -86,8 +87,8 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
         wanted = len(best.parents) + MORE
         finer = tried(wanted)
         tell(settings.restarts + done, whole)
-        if finer is None:
-            break
+        if finer is None or (is_person(best) and not is_person(finer[0])):
+            break                       # the pose prior of people goes by the names of parts, which are lost
         errors[wanted] = finer[1]
         # share of the left-out error that more parts must save to be kept
         if errors[wanted] > (1 - 0.03) * errors[len(best.parents)]:

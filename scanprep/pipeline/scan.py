@@ -103,7 +103,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
                 led = register_by_any(template, scan, landmarks, lead, parts, settings.registration,
                                       settings.correspondences, progress, task.model)
             except ValueError as error:
-                raise ValueError(f"{error} (a landmark file, or --through pose, needs no ends of limbs)") from None
+                raise ValueError(f"{error} (landmarks beside the scan need no ends of limbs)") from None
         problem = registration_problem(template, scan, led.fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")

@@ -6,7 +6,8 @@ nearly as well turned round or mirrored: where a second one leaves hardly more t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,18 @@ UNCOVERED = 0.005                    # share of the scan off the template, from 
 WORST = 0.1                          # share of the vertices that tells two bodies apart: about that of an arm
 RIVAL = "another body explains the scan as well"
 
-Candidate = tuple[float, Registration, str]        # how much is to be doubted, the registration, what led it
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A registration, how much speaks against it (`weigh_doubts`), and what led it, in words."""
+
+    doubt: float
+    fit: Registration
+    way: str
+
+    @property
+    def led(self) -> LedRegistration:
+        return LedRegistration(self.fit, self.way)
 
 
 @near_origin
@@ -57,57 +69,56 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
         if not registration_problem(template, scan, fit, marked=True):
             fit = repaired(template, scan, fit, parts, landmarks, config)
         return LedRegistration(fit, clicked[0])
-    found = list[Candidate]()
+    candidates = list[Candidate]()
     if lead is not None:
+        way = ", ".join([*clicked, f"model {lead.name}"])
         for vertices in lead(scan, landmarks, model):
             fit = register(template, scan, landmarks, config, progress, start=vertices)
-            found.append((weigh_doubts(template, parts, fit), fit, ", ".join([*clicked, f"model {lead.name}"])))
-            if not found[-1][0]:
-                return LedRegistration(fit, found[-1][2])      # nothing to doubt: no other body is sought
+            candidates.append(Candidate(weigh_doubts(template, parts, fit), fit, way))
+            if not candidates[-1].doubt:
+                return candidates[-1].led                      # nothing to doubt: no other body is sought
         # the best body and its rival, both repaired, stand for what they were
-        first = choose_clearly(found)
-        chosen = [one for one in (first, find_rival(template, first, found)) if one is not None]
-        others = [one for one in found if one not in chosen]
-        found.clear()
-        for _, fit, way in chosen:
-            fit = repaired(template, scan, fit, parts, landmarks, config)
-            found.append((weigh_doubts(template, parts, fit), fit, way))
-        found += others
-    if landmarks is None and all(doubt > GRAVE for doubt, _, _ in found):
+        first = choose_clearly(candidates)
+        chosen = [one for one in (first, find_rival(template, first, candidates)) if one is not None]
+        others = [one for one in candidates if one not in chosen]
+        mended = [repaired(template, scan, one.fit, parts, landmarks, config) for one in chosen]
+        candidates = [*(Candidate(weigh_doubts(template, parts, fit), fit, way) for fit in mended), *others]
+    if landmarks is None and all(one.doubt > GRAVE for one in candidates):
         try:
             fit, pairs = register_unmarked(template, scan, config, search, progress)
         except ValueError:
-            if not found:
+            if not candidates:
                 raise
         else:
             if not registration_problem(template, scan, fit, marked=False):
                 fit = repaired(template, scan, fit, parts, None, config, correspondences=pairs)
-            found.append((weigh_doubts(template, parts, fit), fit, number_of(len(pairs), "correspondence")))
-    best = choose_clearly(found)
-    rival = find_rival(template, best, [one for one in found if not registration_problem(
-        template, scan, one[1], landmarks is not None)])
-    return LedRegistration(*best[1:], None if rival is None else LedRegistration(*rival[1:]))
+            candidates.append(Candidate(weigh_doubts(template, parts, fit), fit,
+                                        number_of(len(pairs), "correspondence")))
+    best = choose_clearly(candidates)
+    rival = find_rival(template, best, [one for one in candidates if not registration_problem(
+        template, scan, one.fit, landmarks is not None)])
+    return replace(best.led, rival=None if rival is None else rival.led)
 
 
-def choose_clearly(found: Sequence[Candidate]) -> Candidate:
+def choose_clearly(candidates: Sequence[Candidate]) -> Candidate:
     """The first of some registrations, or the one of least doubt where that leaves clearly less."""
-    best = min(found, key=lambda one: one[0])
-    return best if best[0] < CLEARLY * found[0][0] else found[0]
+    best = min(candidates, key=attrgetter("doubt"))
+    return best if best.doubt < CLEARLY * candidates[0].doubt else candidates[0]
 
 
-def find_rival(template: Mesh, best: Candidate, found: Sequence[Candidate]) -> Candidate | None:
+def find_rival(template: Mesh, best: Candidate, candidates: Sequence[Candidate]) -> Candidate | None:
     """Of other bodies than the best the one of least doubt, where that is not clearly more; else None.
 
     Another body is one whose worst tenth is more than a hand's width off: a twisted limb makes none, and neither does
     a limb of which the scan shows nothing in either.
     """
     def apart(fit: Registration) -> float:
-        shown = fit.seen | best[1].seen
-        far = np.sort(np.linalg.norm(fit.mesh.vertices - best[1].mesh.vertices, axis=1)[shown])
+        shown = fit.seen | best.fit.seen
+        far = np.sort(np.linalg.norm(fit.mesh.vertices - best.fit.mesh.vertices, axis=1)[shown])
         return float(far[-max(1, int(WORST * len(far))):].mean()) if len(far) else 0.0
 
-    others = [one for one in found if CLEARLY * one[0] <= best[0] and apart(one[1]) > HAND * size(template)]
-    return min(others, key=lambda one: one[0], default=None)
+    others = [one for one in candidates if CLEARLY * one.doubt <= best.doubt and apart(one.fit) > HAND * size(template)]
+    return min(others, key=attrgetter("doubt"), default=None)
 
 
 def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -> float:
