@@ -5,13 +5,18 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
-from model import LearnConfig, learn_blendscape, learn_scape
+from completion.__main__ import main
+from model import LearnConfig, learn_blendscape, learn_scape, load_model
 from model.features import QuadraticLift, part_features
+from model.fitting.search import ModelMismatchError
 from model.fitting.vertices import fit_pose
 from model.learning.prior import TemplatePrior
 from model.learning.scape import judge_model
 from model.pose_space import PoseSpace
 from model.shape_space import add_people, learn_shape_space
+from scanprep import read_mesh, write_mesh
+from scanprep.decimation.decimate import decimate
+from scanprep.registration.person import average_person
 
 CONFIG = LearnConfig(refinements=1, components=6)
 
@@ -139,3 +144,62 @@ def test_a_prior_of_another_template_is_refused(known):
     prior = prior_of(worm_model(rings=25))
     with pytest.raises(ValueError, match="prior: it was brought to a template of 302 vertices"):
         learn_scape(known.template, known.template.vertices[None], None, known.skeleton, CONFIG, prior=prior)
+
+
+def test_people_told_to_be_one_are_doubted(known, other):
+    """Poses of one worm and meshes of others: the prior misses what it knows, and the judgement asks who it is."""
+    rng = np.random.default_rng(8)
+    bodies = [known.vertices(pose, 4 * rng.normal(size=3)) for pose in random_poses(known, 6, rng, 0.4)]
+    model = learn_scape(known.template, np.stack([known.template.vertices, *bodies]), None, known.skeleton, CONFIG,
+                        prior=prior_of(known))
+    assert any("two people" in reason for reason in judge_model(model).reasons)
+
+
+def test_a_model_file_is_the_prior_of_a_command(known, tmp_path, capsys):
+    known.save(tmp_path / "known.npz")
+    write_mesh(tmp_path / "poses" / "one.ply", known.template)
+    words = ["learn", "--poses", str(tmp_path / "poses"), "--prior", str(tmp_path / "known.npz"), "-o"]
+    assert main([*words, str(tmp_path / "m.npz")]) == 0
+    model = load_model(tmp_path / "m.npz")
+    assert model.n_betas == known.n_betas and model.info["prior"] == "scape"
+    assert "joints as in the prior" in capsys.readouterr().out
+    assert main([*words, str(tmp_path / "n.npz"), "--kind", "skinning"]) == 2
+    assert "expected the kind scape or blendscape" in capsys.readouterr().err
+    assert main([*words[:3], "--prior", "none", "-o", str(tmp_path / "n.npz")]) == 1
+    assert "expected at least 3, got 1" in capsys.readouterr().err
+
+
+def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(known, tmp_path, monkeypatch, capsys):
+    """The built-in people asked for on a worm; and on a template that has limbs and is no person after all."""
+    def does_not_lie(*_given):
+        raise ModelMismatchError("the model does not come to lie on the template")
+
+    monkeypatch.setattr("model.learning.prior.lay_model", does_not_lie)
+    monkeypatch.setattr("model.learning.cli.has_limbs", lambda template: True)
+    poses = random_poses(known, 12, np.random.default_rng(0), 0.4)
+    for i, body in enumerate(known.subject().vertices(poses)):
+        write_mesh(tmp_path / "poses" / f"{i:02d}.ply", known.template.with_vertices(body))
+    known.skeleton.save(tmp_path / "skeleton.json")
+    words = ["learn", "--poses", str(tmp_path / "poses"), "--template", str(tmp_path / "poses" / "00.ply"),
+             "--skeleton", str(tmp_path / "skeleton.json"), "-o", str(tmp_path / "m.npz")]
+    assert main([*words, "--prior", "people"]) == 1
+    assert "--prior people: the model does not come to lie" in capsys.readouterr().err
+    assert main(words) == 0
+    assert "learned without the built-in people" in capsys.readouterr().err
+    assert "prior" not in load_model(tmp_path / "m.npz").info
+
+
+def test_one_scan_of_a_person_gives_a_model_that_moves(tmp_path):
+    """Without a flag, of a template that is a person; its triangles are not those of the built-in people."""
+    write_mesh(tmp_path / "poses" / "one.ply", decimate(average_person().mesh, 4000))
+    assert main(["learn", "--poses", str(tmp_path / "poses"), "-o", str(tmp_path / "m.npz")]) == 0
+    model, people = load_model(tmp_path / "m.npz"), load_model("people")
+    assert model.info["prior"] == "built-in people" and model.n_betas == people.n_betas
+    assert {"thigh_left", "shin_left", "foot_left"} <= set(model.skeleton.names)
+    # a bent knee takes the foot up and back, and keeps the volume
+    pose = np.zeros((len(model.skeleton.parents), 3))
+    pose[model.skeleton.names.index("shin_left")] = [1.0, 0, 0]
+    body = model.template.with_vertices(model.subject().vertices(pose))
+    foot = model.skeleton.part_of_vertex(model.template) == model.skeleton.names.index("foot_left")
+    assert (body.vertices - model.template.vertices)[foot, 2].mean() > 0.08
+    assert body.volume == pytest.approx(read_mesh(tmp_path / "poses" / "one.ply").volume, rel=0.04)
