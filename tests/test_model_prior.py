@@ -12,6 +12,7 @@ from model.fitting.search import ModelMismatchError
 from model.fitting.vertices import fit_pose
 from model.learning.prior import TemplatePrior
 from model.learning.scape import judge_model
+from model.learning.sexes import learn_by_sex
 from model.pose_space import PoseSpace
 from model.shape_space import add_people, learn_shape_space
 from scanprep import read_mesh, write_mesh
@@ -146,6 +147,15 @@ def test_a_prior_of_another_template_is_refused(known):
         learn_scape(known.template, known.template.vertices[None], None, known.skeleton, CONFIG, prior=prior)
 
 
+def test_models_by_sex_take_the_movement_alone_from_the_prior(known):
+    rng = np.random.default_rng(3)
+    people = np.stack([known.vertices(np.zeros((4, 3)), betas) for betas in rng.normal(size=(5, 3))])
+    models = learn_by_sex(known.template, known.template.vertices[None], people, ["female"] * 3 + ["male"] * 2,
+                          known.skeleton, CONFIG, prior=prior_of(known))
+    assert {name: model.n_betas for name, model in models.items()} == {"neutral": 4, "female": 2, "male": 1}
+    assert mean_error(models["female"], known) < 0.02 and models["male"].info["prior"] == "worms"
+
+
 def test_people_told_to_be_one_are_doubted(known, other):
     """Poses of one worm and meshes of others: the prior misses what it knows, and the judgement asks who it is."""
     rng = np.random.default_rng(8)
@@ -163,8 +173,9 @@ def test_a_model_file_is_the_prior_of_a_command(known, tmp_path, capsys):
     model = load_model(tmp_path / "m.npz")
     assert model.n_betas == known.n_betas and model.info["prior"] == "scape"
     assert "joints as in the prior" in capsys.readouterr().out
-    assert main([*words, str(tmp_path / "n.npz"), "--kind", "skinning"]) == 2
-    assert "expected the kind scape or blendscape" in capsys.readouterr().err
+    for more in (["--kind", "skinning"], ["--preset", "published"]):
+        assert main([*words, str(tmp_path / "n.npz"), *more]) == 2
+        assert "expected the kind scape or blendscape and not --preset published" in capsys.readouterr().err
     assert main([*words[:3], "--prior", "none", "-o", str(tmp_path / "n.npz")]) == 1
     assert "expected at least 3, got 1" in capsys.readouterr().err
 

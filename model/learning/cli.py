@@ -84,8 +84,9 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         raise UsageError("--by-sex: it needs --shapes and the kind scape")
     if kind not in ("scape", "blendscape") and scape == LearnConfig.published():
         raise UsageError(f"--kind {kind}: the paper of --preset published has SCAPE alone")
-    if prior not in ("auto", "none") and kind not in WITH_PRIOR:
-        raise UsageError(f"--prior {prior}: expected the kind {' or '.join(WITH_PRIOR)}, got {kind}")
+    with_prior = kind in WITH_PRIOR and scape != LearnConfig.published()
+    if prior not in ("auto", "none") and not with_prior:
+        raise UsageError(f"--prior {prior}: expected the kind {' or '.join(WITH_PRIOR)} and not --preset published")
     # what is learned from, and what the model is to know besides
     if kind == "mixed":
         if not (poses / "set.json").exists():
@@ -100,7 +101,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     named = read_landmark_vertices(marks, body) if landmarks or marks.exists() else {}
     # the parts, where none are given, and the model
     step = KeptSteps(space)
-    known = _bring_prior(body, prior if kind in WITH_PRIOR else "none", step)
+    known = _bring_prior(body, prior if with_prior else "none", step)
     # the poses of a prior show joints that no scan bends: with them even 57 poses gave a better skeleton than alone
     found = parts is not None or (known is not None and skeleton is None)
     tree = None if found else _read_skeleton(skeleton, poses, body)

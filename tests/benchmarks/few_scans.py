@@ -11,6 +11,8 @@ that what is tuned never meets what is reported. Rows: *poses*, *men*, the model
 half views of held-out poses of the known man; *unknown*, half views of every third held-out man, of unknown shape;
 *mosh*, the shape of every sixth held-out man from 47 simulated markers. `judgement` and `limb_mm`, the mean of the
 worst part, are there for every half view: what a completion says about itself is compared with what it is worth.
+`within_once` and `within_twice` are the shares of the unseen vertices that are off by at most the error
+that was expected, or twice that.
 `wrong` is a half view whose unseen surface is off by more than 30 mm on average, or a part by more than 150 mm;
 `flagged` one that is not judged good.
 """
@@ -101,10 +103,12 @@ def half_views(data: RealData, model: BodyModel, known: bool, which: np.ndarray,
         view = half_view(truth, k, data.landmarks, np.random.default_rng(k))
         start = time.process_time()
         result = complete(body, view.points, view.landmarks if args.marks else None)
-        found = errors(truth, view, result, part)
+        found, off = errors(truth, view, result, part), np.linalg.norm(result.completed.vertices - vertices, axis=1)
         row = {"offset": offset, "k": k, "index": int(which[k]),
                "seen_mm": found["completed_seen_mm"], "unseen_mm": found["completed_unseen_mm"],
                "limb_mm": found["worst_part_mm"], "limb": found["worst_part"], **judged(result, part),
+               "within_once": float((off <= result.expected_error)[~result.seen].mean()),
+               "within_twice": float((off <= 2 * result.expected_error)[~result.seen].mean()),
                "cpu_seconds": round(time.process_time() - start, 1)}
         rows.append(row)
         print(row, flush=True)
@@ -159,7 +163,7 @@ def summary(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
     """Means and worst of each stage."""
     out = {}
     for stage, found in rows.items():
-        for name in ("error_mm", "seen_mm", "unseen_mm", "limb_mm", "cpu_seconds"):
+        for name in ("error_mm", "seen_mm", "unseen_mm", "limb_mm", "cpu_seconds", "within_once", "within_twice"):
             if values := [row[name] for row in found if name in row]:
                 out |= {f"{stage}_{name}": float(np.mean(values)), f"{stage}_{name}_worst": float(np.max(values))}
     views = [row for found in rows.values() for row in found if "limb_mm" in row]

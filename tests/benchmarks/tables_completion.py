@@ -62,7 +62,10 @@ def few_scans(report: dict) -> str:
     rows: Rows = [(label, mean[f"{name}_mm"], mean[f"{name}_mm_worst"]) for label, name in figures
                   if f"{name}_mm" in mean]
     told: Rows = [(label, mean[name]) for label, name in (
-        ("half views", "views"), ("with a part beyond 150 mm", "limbs_beyond_150_mm"),
+        ("share of unseen vertices within the expected error, known man", "known_within_once"),
+        ("within twice", "known_within_twice"), ("the same of unknown men", "unknown_within_once"),
+        ("within twice", "unknown_within_twice"), ("half views", "views"),
+        ("with a part beyond 150 mm", "limbs_beyond_150_mm"),
         ("of them judged good", "limbs_beyond_150_mm_said_good"),
         ("wrong: unseen beyond 30 mm, or a part beyond 150 mm", "wrong"), ("judged check or failed", "flagged"),
         ("both", "wrong_and_flagged"), ("rank correlation, expected and true error, unseen", "correlation_expected_mm"),
