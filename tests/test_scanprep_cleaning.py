@@ -14,6 +14,7 @@ from scanprep.cleaning.clean_scan import (
     CleanScanConfig,
     clean_scan,
     pieces,
+    take_clutter,
 )
 from scanprep.cleaning.floor import find_plane, floor_points, inside_outline, local_noise
 from scanprep.geometry import rotations
@@ -169,6 +170,17 @@ def test_what_a_depth_camera_did_not_see_is_not_taken_for_the_body(person):
     unseen = np.column_stack([rng.uniform(-15, 15, (200, 2)), np.full(200, 65.535)])
     clean = clean_scan(np.concatenate([person.vertices, unseen]))
     assert clean.kept[:-200].all() and not clean.kept[-200:].any()
+
+
+def test_clutter_goes_unasked_and_nothing_that_may_be_wanted(person):
+    """A small box beside the person is taken off. A second person, a room, and a person alone stay as they are."""
+    box = moved(ball(3, 0.1), [0.9, 0, 0.1])
+    clean, removed = take_clutter(joined(person, box))
+    np.testing.assert_array_equal(clean.vertices, person.vertices)
+    assert removed == pytest.approx(len(box.vertices) / (len(box.vertices) + len(person.vertices)))
+    for scan in (person, joined(person, moved(person, [1.5, 0, 0])),
+                 joined(person, moved(grid(5, 5, 0.02), [0, 0, -0.05])), np.zeros((0, 3))):
+        assert take_clutter(scan) == (scan, 0.0)
 
 
 def test_views_side_by_side_are_one_piece():

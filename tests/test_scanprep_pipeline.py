@@ -23,6 +23,7 @@ from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
 from scanprep.registration.limbs import Doubt
+from scanprep.registration.nonrigid import LedRegistration, register
 
 
 @pytest.fixture(name="template", scope="module")
@@ -197,7 +198,7 @@ def test_what_leads_the_template(scans, template, tmp_path):
     pose = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, through="pose"))
     tasks = find_scans(scans)[:2]
     best = prepare(tasks, template, MARKS, tmp_path / "best", QUICK)
-    assert best.registered.names == ("body1",) and "or --through pose" in best.failures[0]          # it has no limbs
+    assert best.registered.names == ("body1",) and "landmarks beside the scan" in best.failures[0]          # it has no limbs
     assert not any(task.landmarks for task in find_scans(scans, "none"))
     near = prepare(tasks, template, {}, tmp_path / "near", pose)
     assert [f.init for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
@@ -247,6 +248,24 @@ def test_clutter_is_cleaned_off_when_asked(scans, template, tmp_path):
     clean = prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "clean", asked).figures[0]
     assert (plain.removed, clean.removed) == (0, 0.5)
     assert plain.missed == pytest.approx(0.5, abs=0.01) and clean.missed == 0
+
+
+def test_little_clutter_is_taken_off_scans_without_landmarks(scans, template, tmp_path, monkeypatch):
+    """A person who clicked landmarks saw the scan; nobody saw this one."""
+    body = read_mesh(scans / "body0.ply")
+    box = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]) + 2,
+               np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
+    write_mesh(scans / "body0.ply", Mesh(np.vstack([body.vertices, box.vertices]),
+                                         np.vstack([body.faces, box.faces + len(body.vertices)])))
+    seen = []
+    fit = register(template, template, start=template.vertices, config=QUICK.scan.registration)
+    monkeypatch.setattr(one_scan, "register_by_any",
+                        lambda template, scan, *given: seen.append(len(scan.vertices)) or LedRegistration(fit, "none"))
+    clicked = prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "clicked", QUICK).figures[0]
+    (scans / "body0.landmarks.json").unlink()
+    alone = prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "alone", QUICK).figures[0]
+    assert seen == [len(body.vertices) + 4, len(body.vertices)]
+    assert clicked.removed == 0 and alone.removed == pytest.approx(4 / (len(body.vertices) + 4))
 
 
 def test_other_settings_or_template_do_all_anew(scans, template, tmp_path):

@@ -15,6 +15,7 @@ from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 MUTUAL, SPARSE = 6, 3.0              # neighbours of a point where points are few, and how far off, in links
+LITTLE = 0.2                         # share of a scan that may be taken off unasked: floor, chair and specks have 0.1
 STEPS = 5.0                          # spacings between the steps of a depth camera on a surface that it sees slantwise
 # a piece left out that is so large against the body, and has so many of its points, may be a person: a child has half
 SECOND = (0.5, 0.25)
@@ -83,6 +84,19 @@ def cleaning_doubts(found: CleanedScan) -> list[str]:
               and max(piece.size) >= SECOND[0] * body and piece.points >= SECOND[1] * points]
     return [f"a piece {max(piece.size):.2f} m large with {piece.points} points was left out: a second person?"
             for piece in others[:1]]
+
+
+def take_clutter(scan: Mesh | np.ndarray) -> tuple[Mesh | np.ndarray, float]:
+    """A scan that nobody looked at, without what is clearly not the body; and the share of its points taken off.
+
+    Where more than `LITTLE` would go, or what may be a second person, nothing does: whoever knows may decide.
+    """
+    try:
+        cleaned = clean_scan(scan)
+    except ValueError:                 # nothing would be left
+        return scan, 0.0
+    removed = 1 - float(cleaned.kept.mean())
+    return (cleaned.scan, removed) if 0 < removed <= LITTLE and not cleaning_doubts(cleaned) else (scan, 0.0)
 
 
 def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,

@@ -42,7 +42,8 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         landmarks: Folder of landmark files with the names of the scans; else scans/landmarks, or beside the scans; the
             word none leaves them out.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        clean: Take floor, furniture and specks off each scan before.
+        clean: Take floor, furniture and specks off each scan before. From scans without landmarks up to a fifth of the
+            points is taken off in any case, and the page says how much.
         subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
     """
     if clean and config.scan.clean is None:

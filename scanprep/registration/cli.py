@@ -8,6 +8,7 @@ import numpy as np
 
 from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
 from ..arguments import Place
+from ..cleaning.clean_scan import take_clutter
 from ..cli import MM, MeshArg, Output, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import find_correspondences
@@ -154,6 +155,9 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         with bar("trying other rolls of limbs") as progress:
             fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
     else:
+        if pairs is None:
+            data, removed = take_clutter(data)
+            led_by.append(Metric("points of the scan taken off as clutter", 100 * removed, "%"))
         with bar("registering") as progress:
             led = register_by_any(body, data, pairs, lead, parts, config, progress=progress)
         fit, rival = led.fit, led.rival

@@ -26,6 +26,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from wrong_inputs import box, chair, cut, together
 
+from scanprep.cleaning.clean_scan import take_clutter
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
@@ -85,6 +86,7 @@ def measure(data: RealData, parts: PersonParts, lead: Lead, kind: str, index: in
     scan, truth = change(what, item.scan, item.truth.vertices, parts, item.truth, np.random.default_rng(index))
     row: dict[str, object] = {"scan": item.name, "kind": kind, "change": what}
     cpu = time.process_time()
+    scan = take_clutter(scan)[0]               # as `scape prep run` does
     try:
         led = register_by_any(data.template, scan, None, lead, parts)
     except ValueError as error:
