@@ -125,19 +125,22 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         kept = dataclasses.replace(model, info={**model.info, "landmarks": named})     # type: ignore[type-var]
         kept.save(path)
         _draw(kept, path)
-    # seconds of every step; of one that had been begun before, of what was left
-    begun = {name.split("/")[0] for name in step.found if "/" in name}
-    times = [*(Metric(f"time: {name}", "done before") for name in step.found if "/" not in name),
-             *(Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
-               for name, value in step.seconds.items() if "/" not in name)]
     return Outcome(output, [
         *about(models["neutral"]), Metric("poses", len(posed)),
         Metric("people", 0 if people is None else len(people)), Metric("parts of the skeleton", len(tree.parents)),
         *_about_prior(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
-        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)), *times])],
+        *details([Metric("kind", models["neutral"].kind), Metric("triangles", len(body.faces)), *_about_steps(step)])],
         {"scape": scape, "skinning": skinning, "mixed": mixed}, judgement=judge_model(models["neutral"], people),
         following=f"look at it: scape view {output}")
+
+
+def _about_steps(step: KeptSteps) -> list[Metric]:
+    """The seconds of every step; of one that an earlier call had begun those of what was left."""
+    begun = {name.split("/")[0] for name in step.found if "/" in name}
+    return [*(Metric(f"time: {name}", "done before") for name in step.found if "/" not in name),
+            *(Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
+              for name, value in step.seconds.items() if "/" not in name)]
 
 
 def _bring_prior(body: Mesh, prior: str, step: Step) -> TemplatePrior | None:
@@ -148,7 +151,7 @@ def _bring_prior(body: Mesh, prior: str, step: Step) -> TemplatePrior | None:
     model = load_model(name)
     try:
         with bar(f"bringing the model {name} to the template") as progress:
-            return step("prior", (body, name, model.template, model.pose_examples),
+            return step("prior", (body, name, model.template, model.info, model.pose_examples),
                         lambda: bring_prior(model, body, progress))
     except ModelMismatchError as error:
         if prior == "auto":
