@@ -198,6 +198,10 @@ def test_a_model_of_something_else_is_refused_by_name_and_left_out_by_itself(kno
     assert main(words) == 0
     assert "learned without the built-in people" in capsys.readouterr().err
     assert "prior" not in load_model(tmp_path / "m.npz").info
+    # of many poses and people nobody asks
+    monkeypatch.setattr("model.learning.cli.ENOUGH", 12)
+    assert main([*words, "--shapes", str(tmp_path / "poses")]) == 0
+    assert "without the built-in people" not in capsys.readouterr().err
 
 
 def test_one_scan_of_a_person_gives_a_model_that_moves(tmp_path):

@@ -198,7 +198,7 @@ def test_what_leads_the_template(scans, template, tmp_path):
     pose = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, through="pose"))
     tasks = find_scans(scans)[:2]
     best = prepare(tasks, template, MARKS, tmp_path / "best", QUICK)
-    assert best.registered.names == ("body1",) and "landmarks beside the scan" in best.failures[0]          # it has no limbs
+    assert best.registered.names == ("body1",) and "landmarks beside the scan" in best.failures[0]     # it has no limbs
     assert not any(task.landmarks for task in find_scans(scans, "none"))
     near = prepare(tasks, template, {}, tmp_path / "near", pose)
     assert [f.init for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)

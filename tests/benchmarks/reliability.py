@@ -66,7 +66,7 @@ def change(what: str, scan: Mesh, truth: np.ndarray, parts: PersonParts, body: M
 
 
 def chosen(part: str, count: int) -> list[tuple[str, int, str]]:
-    """Kind, number and change of so many scans: half of them poses, most as they are."""
+    """Kind, number and change of so many scans: half of them poses, most as they are; fewer, where poses run out."""
     rng, held = random.Random(2), part == "held"
     poses = [k for k in range(1, 71) if (k % 5 == 2) == held]
     men = [k for k in range(227) if (k % 5 == 2) == held]
@@ -77,7 +77,7 @@ def chosen(part: str, count: int) -> list[tuple[str, int, str]]:
     for k in range(count // 2):
         out.append(("pose", poses[k % len(poses)], changes[(k + k // len(poses)) % 8]))
         out.append(("man", men[k % len(men)], changes[(k + 4) % 8]))
-    return out
+    return list(dict.fromkeys(out))
 
 
 def measure(data: RealData, parts: PersonParts, lead: Lead, kind: str, index: int, what: str) -> dict[str, object]:

@@ -213,6 +213,18 @@ def set_alone(report: dict) -> str:
     return f"{summary}\n\n{scans}"
 
 
+def reliability(report: dict) -> str:
+    """Verdicts against the truth, and what probabilities said beside what was."""
+    f = report["summary"]
+    verdicts = table(("registrations", "right", "wrong, called good", "right, called check", "right, called failed",
+                      "Brier score", "that of the share"),
+                     [tuple(f[n] for n in ("registrations", "right", "wrong_called_good", "right_called_check",
+                                           "right_called_failed", "brier", "brier_of_the_mean"))])
+    diagram = table(("probability from", "registrations", "said, mean", "right"),
+                    [(row["from"], row["count"], f"{row['said']:.0%}", f"{row['were']:.0%}") for row in f["diagram"]])
+    return f"{verdicts}\n\n{diagram}"
+
+
 def signatures(report: dict) -> str:
     """Means over the poses of the correlation at every scale."""
     names = {"reference": "published registration", "slid": "the same, slid 4 mm at random", "ours": "ours"}
