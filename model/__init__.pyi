@@ -25,6 +25,8 @@ from .importing import import_model as import_model
 from .learning.config import LearnConfig as LearnConfig
 from .learning.mixing import learn_scape_mix as learn_scape_mix
 from .learning.parts import choose_skeleton as choose_skeleton
+from .learning.prior import TemplatePrior as TemplatePrior
+from .learning.prior import bring_prior as bring_prior
 from .learning.scape import learn_blendscape as learn_blendscape
 from .learning.scape import learn_scape as learn_scape
 from .learning.sexes import SexGuess as SexGuess

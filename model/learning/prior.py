@@ -75,14 +75,14 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
     --------
     >>> from model import load_model
     >>> people = load_model("people")
-    >>> prior = bring_prior(people, people.template)           # doctest: +SKIP
-    >>> model = learn_scape(people.template, people.template.vertices[None], None, prior.skeleton, prior=prior)
-    ...                                                        # doctest: +SKIP
+    >>> prior = bring_prior(people, people.template)
+    >>> prior.poses.shape[1:] == people.template.vertices.shape
+    True
     """
     laid = lay_model(model, template, progress)
     own = own_body(model, laid.vertices)
     ride = Follower(laid.with_vertices(own.vertices), template)
-    # the person as the model moves it, in poses that it was learned from; imported models keep none of these
+    # the person as the model moves it, in poses that it was learned from, of which some models keep none
     known = model.pose_examples if len(model.pose_examples) else sample_poses(model, EXAMPLES, np.random.default_rng(0))
     examples = known[np.unique(np.linspace(0, len(known) - 1, EXAMPLES).astype(int))]
     moved = np.stack([ride.positions(own.subject.vertices(pose)) for pose in examples])

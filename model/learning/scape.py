@@ -100,7 +100,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     Returns
     -------
     ScapeModel
-        `info["prior"]` says how much of every joint and of the people is the prior's.
+        With a prior `info["joint_evidence"]` says how much of each joint's movement is of the scans, from 0 to 1.
 
     Raises
     ------
