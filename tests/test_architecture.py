@@ -34,10 +34,9 @@ ROOMS = {
         "viewer": "alignment batch depth_camera geometry pictures registration",
         "pipeline": "batch cleaning correspondence geometry pictures registration skeleton synthetic viewer"},
     "model": {
-        "fitting": "", "learning": "fitting", "measurement": "", "motion": "", "resolution": "",
-        "coregistration": "fitting learning",
-        "export": "motion", "posing": "export fitting learning motion", "statue": "export fitting motion",
-        "evaluation": "fitting posing"},
+        "fitting": "", "measurement": "", "motion": "", "resolution": "",
+        "export": "motion", "posing": "export fitting motion", "learning": "fitting posing resolution",
+        "coregistration": "fitting learning", "statue": "export fitting motion", "evaluation": "fitting posing"},
     "completion": {
         "mocap": "", "partial": "mocap", "demo": "mocap partial", "tracking": "mocap partial",
         "viewing": "mocap partial", "measuring": "partial viewing"}}
