@@ -154,6 +154,7 @@ def test_models_by_sex_take_the_movement_alone_from_the_prior(known):
                           known.skeleton, CONFIG, prior=prior_of(known))
     assert {name: model.n_betas for name, model in models.items()} == {"neutral": 4, "female": 2, "male": 1}
     assert mean_error(models["female"], known) < 0.02 and models["male"].info["prior"] == "worms"
+    assert {model.info["prior_people"] for model in models.values()} == {0}
 
 
 def test_people_told_to_be_one_are_doubted(known, other):

@@ -25,7 +25,7 @@ from ..priors import sample_poses
 from ..resolution.transfer import Follower, transfer_skeleton
 
 # Example poses of the model that are used, evenly over all. With 50 the skeleton of 8 poses had parts that nobody can
-# name, and learning took twice as long; held-out poses were 8.5 mm off with 50, and 9.1 mm with 25.
+# name; held-out poses were 8.5 mm off with 50, and 9.1 mm with 25.
 EXAMPLES = 25
 
 

@@ -42,7 +42,7 @@ POSES = 2 / 3                        # of the time of learning, where there are 
 PRIOR = LearnConfig(prunings=(0.01,), ridges=(1e-3,), refinements=0)
 WORTH = 10.0                         # people that the people of a prior count as
 ONE_POSE = 0.016                     # metres by which the built-in people's movement misses SCAPE poses of one scan
-# Metres by which a prior should not miss left-out poses: of one man 12 to 16 from two poses on, of four poses of him
+# Metres by which a prior should not miss left-out poses: of one man 12 to 16 from three poses on, of four of him
 # with four other men, told to be one person, 27
 STRANGE = 0.02
 
@@ -320,7 +320,7 @@ def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, p
     if prior is not None:                   # what joints do that no scan bends
         examples = np.concatenate([examples, pose_examples(
             template, skeleton, skeleton.pose_of(skeleton.fit_rotations(template, prior.poses)))])
-    of_prior = {} if prior is None else describe_prior(prior, skeleton, learned, 0 if shapes is None else len(shapes))
+    of_prior = {} if prior is None else describe_prior(prior, skeleton, learned)
     return {"pose_mean": mean, "pose_covariance": covariance, "pose_examples": examples, "info": {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
@@ -328,11 +328,12 @@ def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, p
         "digest": digest(template, poses, shapes), "digests": body_digests(poses, shapes), **of_prior}}
 
 
-def describe_prior(prior: TemplatePrior, skeleton: Skeleton, learned: LearnedPose, people: int) -> dict[str, Any]:
-    """What of a model is the prior's: its name, the joints, and how many of so many people its own count as."""
-    return {"prior": prior.name, "prior_people": WORTH, "joint_evidence": joint_evidence(learned),
-            "joints_of_prior": ", ".join(joint_in_words(skeleton.names[j]) for j, share in
-                                         enumerate(joint_evidence(learned)) if j and share < 0.5)}
+def describe_prior(prior: TemplatePrior, skeleton: Skeleton, learned: LearnedPose) -> dict[str, Any]:
+    """What of a model is the prior's: its name, how many people its own count as, and the joints."""
+    evidence = joint_evidence(learned)
+    joints = [joint_in_words(name) for name, share in zip(skeleton.names, evidence, strict=True) if share < 0.5]
+    return {"prior": prior.name, "prior_people": WORTH, "joint_evidence": evidence,
+            "joints_of_prior": ", ".join(joints)}
 
 
 def joint_evidence(learned: LearnedPose) -> list[float]:

@@ -73,6 +73,8 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
                                                    list(sexes)), 1 - POSES, learn)
     kept = seen_in_training(template, skeleton, learned, poses, people, config, prior)
+    if prior is not None:
+        kept["info"]["prior_people"] = 0.0                 # shapes are those of the people alone
     models = {}
     for name, chosen in groups.items():
         info = {**kept["info"], "sex": name, "shapes": len(chosen), "digest": digest(template, poses, people[chosen]),

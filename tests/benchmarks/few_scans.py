@@ -44,7 +44,7 @@ def training(offset: int, poses: int = 8, men: int = 10, inner: bool = False) ->
     """Indices of the poses and of the men that a model is learned from."""
     few_poses, few_men = np.array([0, *range(3 + offset, 71, 9)][:8]), np.array(range(offset, 227, 23))[:10]
     rest_poses, rest_men = (np.flatnonzero(np.arange(count) % 5 != held)[offset:] for count, held in
-                            ((71, inner), (227, 3 if inner else 2)))
+                            ((71, 1 if inner else 0), (227, 3 if inner else 2)))
     # more than those of the protocol: evenly over all that are not held out
     return (few_poses[:poses] if poses <= 8 else np.union1d([0], _spread(rest_poses[rest_poses > 0], poses - 1)),
             few_men[:men] if men <= 10 else _spread(rest_men, men))
