@@ -3,6 +3,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from scanprep.batch.opening import beside
 from scanprep.command_line import run
 from scanprep.skeleton import restarts
 
-STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
+STAGES = {"skeleton": (cli, "choose_skeleton"), "poses": (scape, "by_edges"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
 QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
 SKIN = {"rounds": 2, "components": 4}
@@ -82,20 +83,20 @@ def counted(monkeypatch):
 
 @pytest.fixture
 def searched(monkeypatch):
-    """A search for a skeleton that takes no time, for words with --parts."""
-    monkeypatch.setattr(cli, "find_skeleton", lambda *given: worm_model().skeleton)
+    """A search for a skeleton that takes no time, for words without --skeleton."""
+    monkeypatch.setattr(cli, "choose_skeleton", lambda *given: SimpleNamespace(skeleton=worm_model().skeleton))
 
 
-def words(bodies, output, *more, **settings):
+def words(bodies, output, *more, search=False, **settings):
     file = config_file(bodies, scape={**QUICK, **settings}, skinning=SKIN)
-    known = [] if "--parts" in more else ["--skeleton", str(bodies / "skeleton.json")]
+    known = [] if search else ["--skeleton", str(bodies / "skeleton.json")]
     return ["--poses", str(bodies / "poses"), "--shapes", str(bodies / "people"), "-o", str(bodies / output),
             "--config", str(file), *known, *map(str, more)]
 
 
-def learned(bodies, output, *more, **settings):
+def learned(bodies, output, *more, search=False, **settings):
     """The bytes of the model."""
-    assert run(learn, "scape learn", words(bodies, output, *more, **settings)) == 0
+    assert run(learn, "scape learn", words(bodies, output, *more, search=search, **settings)) == 0
     return (bodies / output).read_bytes()
 
 
@@ -177,30 +178,29 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
     (["--landmarks"], {"pictures": 1}),
     ({"components": 2}, {"people": 6, "components": 1, "pictures": 1}),
     ({"refinements": 2}, {"poses": 1, "people": 6, "components": 1, "pictures": 1}),
-    (["--parts", 4], {"skeleton": 1, "pictures": 1}),           # the same skeleton was found: nothing follows from it
+    (["--skeleton"], {"pictures": 1}),                          # the same that was found: nothing follows from it
     (["--force"], ALL)])
 def test_a_setting_that_changes(bodies, searched, counted, more, done):
-    learned(bodies, "m.npz", "--parts", 3)
-    since = dict(counted)
+    learned(bodies, "m.npz", search=True)
+    since, search = dict(counted), "--skeleton" not in more
     if "--landmarks" in more:
         (bodies / "marks.json").write_text('{"nose": 3}')
         more = ["--landmarks", bodies / "marks.json"]
-    settings, more = (more, []) if isinstance(more, dict) else ({}, more)
-    more = more if "--parts" in more else ["--parts", 3, *more]
-    found = learned(bodies, "m.npz", *more, **settings)
+    settings, more = (more, []) if isinstance(more, dict) else ({}, [word for word in more if word != "--skeleton"])
+    found = learned(bodies, "m.npz", *more, search=search, **settings)
     assert anew(counted, since) == done
-    assert found == learned(bodies, "fresh.npz", *more, **settings)
+    assert found == learned(bodies, "fresh.npz", *more, search=search, **settings)
 
 
 @pytest.mark.parametrize("file, done", [
     ("poses/pose3.ply", ALL), ("people/person3.ply", {"people": 6, "components": 1, "pictures": 1})])
 def test_a_mesh_that_changes(bodies, searched, counted, file, done):
-    learned(bodies, "m.npz", "--parts", 3)
+    learned(bodies, "m.npz", search=True)
     since = dict(counted)
     moved(bodies / file)
-    found = learned(bodies, "m.npz", "--parts", 3)
+    found = learned(bodies, "m.npz", search=True)
     assert anew(counted, since) == done
-    assert found == learned(bodies, "fresh.npz", "--parts", 3)
+    assert found == learned(bodies, "fresh.npz", search=True)
 
 
 def test_a_person_that_changes_while_learning_is_interrupted(bodies, counted):
@@ -214,18 +214,18 @@ def test_a_person_that_changes_while_learning_is_interrupted(bodies, counted):
 
 def test_times_tell_what_was_done_before(bodies, searched):
     for known in (0, 3):
-        learned(bodies, "m.npz", "--parts", 3)
+        learned(bodies, "m.npz", search=True)
         assert (bodies / "m.npz.report.json").read_text().count("done before") == known
 
 
 @pytest.mark.parametrize("step", ["skeleton", "pose space", "shape components"])
 def test_a_damaged_step_is_made_anew(bodies, searched, counted, step):
-    undisturbed, since = learned(bodies, "m.npz", "--parts", 3), dict(counted)
+    undisturbed, since = learned(bodies, "m.npz", search=True), dict(counted)
     path = bodies / ".m.npz.scapekit/done" / f"{step}.npz"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
-    assert learned(bodies, "m.npz", "--parts", 3) == undisturbed
+    assert learned(bodies, "m.npz", search=True) == undisturbed
     assert set(anew(counted, since)) >= {{"skeleton": "skeleton", "pose space": "poses"}.get(step, "components")}
 
 

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
-
 from scanprep.arguments import UsageError
 from scanprep.batch.opening import FileWorkspace
 from scanprep.batch.room import Step, inside
@@ -20,10 +18,7 @@ from scanprep.geometry.files import list_meshes, name_of
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
-from scanprep.ranges import Count
 from scanprep.registration.person import has_limbs
-from scanprep.skeleton.find import find_skeleton
-from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.roles import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 
@@ -35,7 +30,7 @@ from .config import LearnConfig
 from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
 from .prior import TemplatePrior, bring_prior
-from .scape import Progress, judge_model, learn_blendscape, learn_scape
+from .scape import judge_model, learn_blendscape, learn_scape
 from .sexes import learn_by_sex
 from .skinning import SkinConfig, learn_skinning
 
@@ -49,7 +44,7 @@ ENOUGH = 40
 
 def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
           skeleton: Path | None = None, landmarks: Path | None = None, subject: Annotated[str | None, Person] = None,
-          unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", by_sex: bool = False,
+          unit: Unit | None = None, kind: Kind = "scape", by_sex: bool = False,
           prior: str = "auto", scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(),
           mixed: LearnConfig = MIX, *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
@@ -66,11 +61,11 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         shapes: Folder of meshes of many people, or a registered set; without it the model has no shape of its own.
         template: The mesh that the others are deformations of; else the first of the poses, or the set's own.
         skeleton: JSON of `scape prep skeleton`; else the set's own, where there is no prior or 40 poses. Else it is
-            found from the poses and those of the prior, with as many parts as predict left-out poses best.
+            found from the poses and those of the prior, with as many parts as predict left-out poses best; for so many
+            parts as you like, `scape prep skeleton --parts`.
         landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
         subject: Of a registered set, whose meshes are the poses; else of the one with the most.
         unit: Unit of the meshes.
-        parts: Find a skeleton with so many parts, whatever skeleton there is.
         kind: SCAPE, BlendSCAPE, linear blend skinning with pose-corrective shapes, or SCAPE from a mix: the poses are
             then those of many people, a registered set that says whose mesh each is.
         prior: Where scans say little, as in this model: a file, "people", "none", or "auto", the built-in people for a
@@ -111,14 +106,13 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     known = _bring_prior(body, prior, step)
     # the poses of a prior show joints that few scans do not bend
     shown = None if known is None or many else known.poses[1:]
-    found = parts is not None or (shown is not None and skeleton is None)
-    tree = None if found else _read_skeleton(skeleton, poses, body)
+    tree = None if shown is not None and skeleton is None else _read_skeleton(skeleton, poses, body)
     if tree is None:
         if kind == "mixed":
             raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
         with bar("finding the skeleton") as progress:
-            tree = step("skeleton", (body, posed, parts, shown),
-                        lambda: _find_skeleton(body, posed, parts, shown, step, progress))
+            tree = step("skeleton", (body, posed, shown),
+                        lambda: choose_skeleton(body, posed, progress, inside(step, "skeleton"), shown).skeleton)
     with bar("learning the model") as progress:
         how = progress, step
         models: Mapping[str, BodyModel] = (
@@ -178,16 +172,6 @@ def _about_prior(model: BodyModel) -> list[Metric]:
             Metric("joints as in the prior, as no scan bends them", model.info["joints_of_prior"] or "none"),
             Metric("people of the prior count as", count, "people"),
             *details([Metric("share of each joint's movement that is of your scans", ", ".join(own))])]
-
-
-def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, known: np.ndarray | None, step: Step,
-                   progress: Progress) -> Skeleton:
-    """The skeleton of posed bodies (M, N, 3), and of those of a prior (K, N, 3), with so many parts or the best."""
-    within = inside(step, "skeleton")
-    if parts is None:
-        return choose_skeleton(body, posed, progress, within, known).skeleton
-    shown = posed if known is None else np.concatenate([posed, known])
-    return find_skeleton(body, shown, SkeletonConfig(parts=parts), progress, within)
 
 
 def _read_sexes(folder: Path) -> list[str]:
