@@ -178,18 +178,19 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
     (["--landmarks"], {"pictures": 1}),
     ({"components": 2}, {"people": 6, "components": 1, "pictures": 1}),
     ({"refinements": 2}, {"poses": 1, "people": 6, "components": 1, "pictures": 1}),
-    (["--skeleton"], {"pictures": 1}),                          # the same that was found: nothing follows from it
+    ({"search": False}, {"pictures": 1}),              # the skeleton that was found is given: nothing follows from it
     (["--force"], ALL)])
 def test_a_setting_that_changes(bodies, searched, counted, more, done):
     learned(bodies, "m.npz", search=True)
-    since, search = dict(counted), "--skeleton" not in more
+    since = dict(counted)
     if "--landmarks" in more:
         (bodies / "marks.json").write_text('{"nose": 3}')
         more = ["--landmarks", bodies / "marks.json"]
-    settings, more = (more, []) if isinstance(more, dict) else ({}, [word for word in more if word != "--skeleton"])
-    found = learned(bodies, "m.npz", *more, search=search, **settings)
+    settings, more = (more, []) if isinstance(more, dict) else ({}, more)
+    settings = {"search": True, **settings}
+    found = learned(bodies, "m.npz", *more, **settings)
     assert anew(counted, since) == done
-    assert found == learned(bodies, "fresh.npz", *more, search=search, **settings)
+    assert found == learned(bodies, "fresh.npz", *more, **settings)
 
 
 @pytest.mark.parametrize("file, done", [

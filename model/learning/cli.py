@@ -61,8 +61,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         shapes: Folder of meshes of many people, or a registered set; without it the model has no shape of its own.
         template: The mesh that the others are deformations of; else the first of the poses, or the set's own.
         skeleton: JSON of `scape prep skeleton`; else the set's own, where there is no prior or 40 poses. Else it is
-            found from the poses and those of the prior, with as many parts as predict left-out poses best; for so many
-            parts as you like, `scape prep skeleton --parts`.
+            found from the poses and those of the prior, with as many parts as predict left-out poses best. For a given
+            number of parts: `scape prep skeleton --parts`.
         landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
         subject: Of a registered set, whose meshes are the poses; else of the one with the most.
         unit: Unit of the meshes.
