@@ -1,0 +1,247 @@
+"""The body that explains points without names: its pose from one frame alone, and a lost limb anew.
+
+Every point is matched with at most one marker of the layout, by least total cost, and either may stay alone.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from model.features import twists
+from model.human_poses import human_poses
+from model.linear import Subject
+from model.priors import typical_poses
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from ..pose.marked_body import MarkedBody
+
+ALONE = 0.8                          # cost of a marker without a point; a match costs 1/2 at its scale, at most 1
+JUDGED = 0.08                        # metres, the scale at which the final matches of a frame are judged
+LIKELY = 0.0003                      # cost of one squared deviation of the pose, which tells a head or foot turned about
+POSES = 120                          # poses of people that are tried, beside the typical ones of the model
+TURNS = 16                           # about the axis along which the body is long
+KEPT = 40                            # candidates whose poses are solved for
+FIRST, REST = 2, 6                   # rounds of all rigid candidates, and of the promising ones
+PROMISING = 300
+WIDE = 0.25                          # metres, scale of the distances while candidates are laid as rigid bodies
+CLEAR = 0.2                          # misfit below which no other axis is tried; wrong ones leave 0.29 at least
+SD = 0.03                            # metres: the mean person carries the markers only roughly
+# scale of the matches, metres, and weight of the pose prior, of each round of solves
+ROUNDS = ((0.3, 3.0), (0.2, 3.0), (0.2, 1.0), (0.15, 1.0), (0.12, 1.0), (0.1, 1.0), (0.1, 1.0))
+LIMB_ROUNDS = ((0.2, 1.0), (0.12, 1.0), (0.1, 1.0))
+LIMB_POSES = 40
+TRUNK = ("pelvis", "abdomen", "chest", "trunk", "spine", "neck", "head")
+Axis = tuple[float, float, float]
+UPS: tuple[Axis, ...] = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))             # axes that files have upwards
+# where nobody stands: heads down, and people who lie along four directions
+OTHERS: tuple[Axis, ...] = ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0),
+                            (0.7, 0.7, 0.0), (-0.7, 0.7, 0.0), (0.7, -0.7, 0.0), (-0.7, -0.7, 0.0),
+                            (0.7, 0.0, 0.7), (-0.7, 0.0, 0.7), (0.0, 0.7, 0.7), (0.0, -0.7, 0.7))
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A body in one frame of points.
+
+    Attributes
+    ----------
+    x : (P,) float
+        Unknowns of the marked body: pose and place.
+    matches : (L,) int
+        The point of each marker, -1 without one.
+    misfit : float
+        Mean cost of the matches, and a little of the pose: 0.03 to 0.2 where the body is right, above 0.3 where not.
+    """
+
+    x: np.ndarray
+    matches: np.ndarray
+    misfit: float
+
+
+def match_points(places: np.ndarray, points: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+    """The point (L,) of each marker at places (L, 3), -1 without one, and the mean cost; points are (N, 3).
+
+    A pair at distance d costs d² / (d² + scale²), a marker without a point `ALONE`.
+
+    Examples
+    --------
+    >>> match_points(np.eye(3), np.array([[0, 1, 0.01], [9, 9, 9], [1, 0, 0]]), 0.1)[0].tolist()
+    [2, 0, -1]
+    """
+    squared = ((places[:, None] - points)**2).sum(axis=-1)
+    return assign(squared / (squared + scale**2), ALONE)
+
+
+def assign(costs: np.ndarray, alone: float) -> tuple[np.ndarray, float]:
+    """The column (L,) of each row of costs (L, N), -1 where staying `alone` is cheaper, and the mean cost."""
+    L, N = costs.shape
+    rows, columns = linear_sum_assignment(np.concatenate([costs, np.full((L, L), alone)], axis=1))
+    total = np.concatenate([costs, np.full((L, L), alone)], axis=1)[rows, columns]
+    return np.where(columns < N, columns, -1), float(total.mean())
+
+
+class BodySearch:
+    """Searches for a body of known shape with markers in frames of points, from many poses and headings.
+
+    Parameters
+    ----------
+    body : MarkedBody
+    subject : Subject
+        The same body; its template stands upright.
+    """
+
+    def __init__(self, body: MarkedBody, subject: Subject) -> None:
+        self.body = body
+        typical = typical_poses(subject.pose_mean, subject.pose_covariance, axes=6)
+        people = human_poses(subject.template, subject.skeleton, POSES, np.random.default_rng(0))
+        self.poses = typical if people is None else np.concatenate([typical, people])
+        self.limbs = limb_trees(subject.skeleton)
+        self.upright = long_axis(subject.template)
+        self._laid: dict[Axis, tuple[np.ndarray, np.ndarray]] = {}
+
+    def find(self, points: np.ndarray, axes: Sequence[Axis] = UPS) -> Placement:
+        """The best body in a frame of points (N, 3), metres, whose long axis is along one of some axes of the file."""
+        best = self._find_along(points, axes[0])
+        for axis in axes[1:]:
+            if best.misfit < CLEAR:
+                break
+            best = min(best, self._find_along(points, axis), key=lambda placement: placement.misfit)
+        return best
+
+    def _find_along(self, points: np.ndarray, axis: Axis) -> Placement:
+        # all poses at all turns about the axis are laid on the points as rigid bodies
+        x, at = self._candidates(axis)
+        n = self.body.body.n_angles
+        centre = points.mean(axis=0)
+        R, t, scores = lay_rigidly(at + centre, points)
+        best = np.argsort(scores)[:KEPT]
+        x, moved = x[best].copy(), np.einsum("bij,blj->bli", R[best], at[best] + centre) + t[best, None]
+        x[:, :3] = rotations.log(R[best] @ rotations.exp(x[:, :3]))
+        x[:, n:n + 3] += (moved - self.body.positions(x)).mean(axis=1)
+        # the likeliest bend towards the points, matched anew in every round
+        return self.refine(x, points, ROUNDS)
+
+    def _candidates(self, along: Axis) -> tuple[np.ndarray, np.ndarray]:
+        """Unknowns (n, P) of every pose at every turn, the markers' centroid at the origin, and markers (n, L, 3)."""
+        if along not in self._laid:
+            body, axis = self.body, np.asarray(along) / np.linalg.norm(along)
+            turn = np.arange(TURNS)[:, None] * 2 * np.pi / TURNS * axis
+            turns = rotations.exp(turn) @ rotation_between(self.upright, axis)
+            poses = np.repeat(self.poses, TURNS, axis=0)
+            poses[:, 0] = rotations.log(np.tile(turns, (len(self.poses), 1, 1)) @ rotations.exp(poses[:, 0]))
+            x = body.body.join(poses, np.zeros((len(poses), 3)))
+            at = np.concatenate([body.positions(x[i:i + 256]) for i in range(0, len(x), 256)])
+            x[:, body.body.n_angles:body.body.n_angles + 3] -= at.mean(axis=1)
+            self._laid[along] = x, at - at.mean(axis=1, keepdims=True)
+        return self._laid[along]
+
+    def refine(self, x: np.ndarray, points: np.ndarray, rounds: tuple[tuple[float, float], ...]) -> Placement:
+        """The best placement that any of the unknowns (n, P) lead to, in rounds of matching and solving."""
+        for scale, stiff in rounds:
+            at = self.body.positions(x)
+            targets = np.full(at.shape, np.nan)
+            for target, places in zip(targets, at, strict=True):
+                matches, _ = match_points(places, points, scale)
+                target[matches >= 0] = points[matches[matches >= 0]]
+            x = self.body.solve(x, targets, robust_weights(at, targets, scale), 6, 1e-3, stiff).x
+        return min((self.judge(one, points) for one in x), key=lambda placement: placement.misfit)
+
+    def judge(self, x: np.ndarray, points: np.ndarray) -> Placement:
+        """The placement of some unknowns (P,)."""
+        matches, cost = match_points(self.body.positions(x), points, JUDGED)
+        pose, _, _ = self.body.body.split(x[None])
+        off = self.body.prior.whitening @ (twists(pose).reshape(-1) - self.body.prior.mean)
+        return Placement(x, matches, cost + LIKELY * float(off @ off))
+
+    def restart_limbs(self, placement: Placement, points: np.ndarray) -> Placement:
+        """The best placement with one limb after the other from other poses: a foot may be turned about."""
+        some = self.poses[np.random.default_rng(0).permutation(len(self.poses))[:LIMB_POSES]]
+        for limb in self.limbs:
+            x = np.repeat(placement.x[None], len(some), axis=0)
+            for joint in limb:
+                x[:, 3 * joint:3 * joint + 3] = some[:, joint]
+            placement = min(placement, self.refine(x, points, LIMB_ROUNDS), key=lambda one: one.misfit)
+        return placement
+
+
+def robust_weights(places: np.ndarray, targets: np.ndarray, scale: float, sd: float = SD) -> np.ndarray:
+    """Weights (..., L) of matches between places and targets (..., L, 3), NaN without one; far ones lose theirs."""
+    squared = ((places - targets)**2).sum(axis=-1)
+    return np.where(np.isnan(squared), 0.0, sd**-2 / (1 + np.nan_to_num(squared) / scale**2)**2)
+
+
+def lay_rigidly(at: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations (B, 3, 3) and translations (B, 3) that lay marker sets (B, L, 3) on points (N, 3); mean costs (B,).
+
+    Iterated closest points of both directions with weights that fall with the distance; the best `PROMISING` after
+    `FIRST` rounds have all of them.
+    """
+    B = len(at)
+    R, t, scores = np.tile(np.eye(3), (B, 1, 1)), np.zeros((B, 3)), np.full(B, np.inf)
+    rows = np.arange(B)
+    for rounds in (FIRST, REST):
+        for some in np.array_split(rows, max(1, len(rows) // 128)):     # so many at once fit into the cache
+            R[some], t[some], scores[some] = _closest_points(at[some], points, R[some], t[some], rounds)
+        rows = np.argsort(scores)[:PROMISING]
+    return R, t, np.where(np.isin(np.arange(B), rows), scores, np.inf)
+
+
+def _closest_points(at: np.ndarray, points: np.ndarray, R: np.ndarray, t: np.ndarray, rounds: int
+                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Some rounds of `lay_rigidly` from rotations and translations, and the costs after them."""
+    y, length = at @ np.swapaxes(R, 1, 2) + t[:, None], (points**2).sum(axis=-1)
+    for _ in range(rounds):
+        squared = np.maximum((y**2).sum(axis=-1)[..., None] + length - 2 * y @ points.T, 0)
+        there, back = squared.argmin(axis=2), squared.argmin(axis=1)
+        weights = np.concatenate([squared.min(axis=2), squared.min(axis=1)], axis=1)
+        weights = 1 / (1 + weights / WIDE**2)**2
+        source = np.concatenate([y, np.take_along_axis(y, back[..., None], axis=1)], axis=1)
+        target = np.concatenate([points[there], np.broadcast_to(points, (len(y), *points.shape))], axis=1)
+        weights /= weights.sum(axis=1, keepdims=True)
+        c, d = ((weights[:, None] @ of)[:, 0] for of in (source, target))
+        moments = np.swapaxes(weights[..., None] * (target - d[:, None]), 1, 2) @ (source - c[:, None])
+        U, _, V = np.linalg.svd(moments)
+        U[..., 2] *= np.sign(np.linalg.det(U @ V))[:, None]
+        step = U @ V
+        y = (y - c[:, None]) @ np.swapaxes(step, 1, 2) + d[:, None]
+        t = (step @ (t - c)[..., None])[..., 0] + d
+        R = step @ R
+    squared = np.maximum((y**2).sum(axis=-1)[..., None] + length - 2 * y @ points.T, 0)
+    return R, t, sum((least / (least + WIDE**2)).mean(axis=1) for least in (squared.min(axis=2), squared.min(axis=1)))
+
+
+def limb_trees(skeleton: Skeleton) -> list[list[int]]:
+    """The joints of each limb: where a part that is none of the trunk's begins, and all that follow it."""
+    parents, names = skeleton.parents, skeleton.names
+    trees = []
+    for joint, parent in enumerate(parents):
+        if parent >= 0 and not names[joint].startswith(TRUNK) and names[parent].startswith(TRUNK):
+            tree = [joint]
+            tree += [later for later in range(joint + 1, len(parents)) if _is_below(parents, later, joint)]
+            trees.append(tree)
+    return trees
+
+
+def _is_below(parents: np.ndarray, joint: int, above: int) -> bool:
+    while joint > above:
+        joint = int(parents[joint])
+    return joint == above
+
+
+def long_axis(template: Mesh) -> np.ndarray:
+    """(3,) the axis along which a template that stands is longest."""
+    return np.eye(3)[np.ptp(template.vertices, axis=0).argmax()]
+
+
+def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3, 3) the shortest rotation from a coordinate axis to another unit axis."""
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-9:                                                     # none, or a half turn about whatever is across
+        return np.eye(3) if a @ b > 0 else rotations.exp(np.pi * np.roll(np.abs(a).round(), 1))
+    return rotations.exp(axis / sine * np.arctan2(sine, a @ b))
