@@ -23,6 +23,7 @@ from .body_search import OTHERS, UPS, BodySearch, Placement
 from .follow_points import assign_by_places, elect, take_columns, vote
 from .tracks import link_points
 
+UNKNOWN, GHOST = -1, -2              # in labels that are known: nothing is, and: this point is no marker
 FEWEST = 10                          # points in a frame, of which no body can be told otherwise
 STARTS = 5                           # frames in which the body is sought
 FOUND = 0.3                          # misfit of a frame above which no body was found; right ones had at most 0.18
@@ -50,7 +51,11 @@ class LabelledMarkers:
     tracks : (T, C) int
         The track of every point, -1 without one.
     motion : Motion
-        Of the body that told.
+        Of the body that the labels were found with.
+    subject : Subject
+        That body: the one that was given, or the one that was found.
+    layout : MarkerLayout
+        Where the markers sit on it.
     person : PersonFit or None
         Who was found, where the shape was not known.
     """
@@ -61,6 +66,8 @@ class LabelledMarkers:
     unlabelled: np.ndarray
     tracks: np.ndarray
     motion: Motion
+    subject: Subject
+    layout: MarkerLayout
     person: PersonFit | None
 
     @property
@@ -82,7 +89,7 @@ class LabelledMarkers:
 
 @one_thread()
 def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: MarkerLayout,
-                  progress: Progress | None = None) -> LabelledMarkers:
+                  known: np.ndarray | None = None, progress: Progress | None = None) -> LabelledMarkers:
     """Find the label of every point in every frame, from nothing but where the points are.
 
     Points are joined to tracks as far as their motion tells. In a few frames the body is sought in many poses and
@@ -97,6 +104,8 @@ def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: Ma
         Its labels are not looked at. Columns may be tracks, or shuffled in every frame.
     layout : MarkerLayout
         Where markers sit. Those that are not in the recording stay without points.
+    known : (T, C) int, optional
+        Labels that are known: the row of the layout that a point is, `GHOST` for a point that is no marker, `UNKNOWN`.
     progress : callable, optional
         Called with (done, total).
 
@@ -143,7 +152,8 @@ def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: Ma
     unlabelled = points.seen.copy()
     frames, rows = np.nonzero(columns >= 0)
     unlabelled[frames, columns[frames, rows]] = False
-    return LabelledMarkers(_sequence(at, columns, layout, rate), columns, sure, unlabelled, tracks, motion, fit)
+    return LabelledMarkers(_sequence(at, columns, layout, rate), columns, sure, unlabelled, tracks, motion, subject,
+                           worn, fit)
 
 
 def _label_by_votes(search: BodySearch, points: np.ndarray, tracks: np.ndarray, rate: float,
