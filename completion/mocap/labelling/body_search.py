@@ -22,7 +22,7 @@ from ..pose.marked_body import MarkedBody
 
 ALONE = 0.8                          # cost of a marker without a point; a match costs 1/2 at its scale, at most 1
 JUDGED = 0.08                        # metres, the scale at which the final matches of a frame are judged
-LIKELY = 0.0003                      # cost of one squared deviation of the pose, which tells a head or foot turned about
+LIKELY = 0.0003                      # cost of a squared deviation of the pose, which tells a head or foot turned about
 POSES = 120                          # poses of people that are tried, beside the typical ones of the model
 TURNS = 16                           # about the axis along which the body is long
 KEPT = 40                            # candidates whose poses are solved for
@@ -34,7 +34,7 @@ SD = 0.03                            # metres: the mean person carries the marke
 # scale of the matches, metres, and weight of the pose prior, of each round of solves
 ROUNDS = ((0.3, 3.0), (0.2, 3.0), (0.2, 1.0), (0.15, 1.0), (0.12, 1.0), (0.1, 1.0), (0.1, 1.0))
 LIMB_ROUNDS = ((0.2, 1.0), (0.12, 1.0), (0.1, 1.0))
-LIMB_POSES = 40
+LIMB_POSES = 8
 TRUNK = ("pelvis", "abdomen", "chest", "trunk", "spine", "neck", "head")
 Axis = tuple[float, float, float]
 UPS: tuple[Axis, ...] = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))             # axes that files have upwards
@@ -66,7 +66,7 @@ class Placement:
 def match_points(places: np.ndarray, points: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
     """The point (L,) of each marker at places (L, 3), -1 without one, and the mean cost; points are (N, 3).
 
-    A pair at distance d costs d² / (d² + scale²), a marker without a point `ALONE`.
+    A pair at distance d costs d² / (d² + scale²), a marker without a point `ALONE`; points that are NaN are not there.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def match_points(places: np.ndarray, points: np.ndarray, scale: float) -> tuple[
     [2, 0, -1]
     """
     squared = ((places[:, None] - points)**2).sum(axis=-1)
-    return assign(squared / (squared + scale**2), ALONE)
+    return assign(np.where(np.isnan(squared), 1.0, squared / (squared + scale**2)), ALONE)
 
 
 def assign(costs: np.ndarray, alone: float) -> tuple[np.ndarray, float]:
@@ -124,7 +124,7 @@ class BodySearch:
         x[:, :3] = rotations.log(R[best] @ rotations.exp(x[:, :3]))
         x[:, n:n + 3] += (moved - self.body.positions(x)).mean(axis=1)
         # the likeliest bend towards the points, matched anew in every round
-        return self.refine(x, points, ROUNDS)
+        return self.refine(x, points, ROUNDS, JUDGED)
 
     def _candidates(self, along: Axis) -> tuple[np.ndarray, np.ndarray]:
         """Unknowns (n, P) of every pose at every turn, the markers' centroid at the origin, and markers (n, L, 3)."""
@@ -140,7 +140,8 @@ class BodySearch:
             self._laid[along] = x, at - at.mean(axis=1, keepdims=True)
         return self._laid[along]
 
-    def refine(self, x: np.ndarray, points: np.ndarray, rounds: tuple[tuple[float, float], ...]) -> Placement:
+    def refine(self, x: np.ndarray, points: np.ndarray, rounds: tuple[tuple[float, float], ...],
+               judged: float) -> Placement:
         """The best placement that any of the unknowns (n, P) lead to, in rounds of matching and solving."""
         for scale, stiff in rounds:
             at = self.body.positions(x)
@@ -149,23 +150,23 @@ class BodySearch:
                 matches, _ = match_points(places, points, scale)
                 target[matches >= 0] = points[matches[matches >= 0]]
             x = self.body.solve(x, targets, robust_weights(at, targets, scale), 6, 1e-3, stiff).x
-        return min((self.judge(one, points) for one in x), key=lambda placement: placement.misfit)
+        return min((self.judge(one, points, judged) for one in x), key=lambda placement: placement.misfit)
 
-    def judge(self, x: np.ndarray, points: np.ndarray) -> Placement:
-        """The placement of some unknowns (P,)."""
-        matches, cost = match_points(self.body.positions(x), points, JUDGED)
+    def judge(self, x: np.ndarray, points: np.ndarray, scale: float) -> Placement:
+        """The placement of some unknowns (P,), with matches of a scale."""
+        matches, cost = match_points(self.body.positions(x), points, scale)
         pose, _, _ = self.body.body.split(x[None])
         off = self.body.prior.whitening @ (twists(pose).reshape(-1) - self.body.prior.mean)
         return Placement(x, matches, cost + LIKELY * float(off @ off))
 
-    def restart_limbs(self, placement: Placement, points: np.ndarray) -> Placement:
+    def restart_limbs(self, placement: Placement, points: np.ndarray, judged: float) -> Placement:
         """The best placement with one limb after the other from other poses: a foot may be turned about."""
         some = self.poses[np.random.default_rng(0).permutation(len(self.poses))[:LIMB_POSES]]
         for limb in self.limbs:
             x = np.repeat(placement.x[None], len(some), axis=0)
             for joint in limb:
                 x[:, 3 * joint:3 * joint + 3] = some[:, joint]
-            placement = min(placement, self.refine(x, points, LIMB_ROUNDS), key=lambda one: one.misfit)
+            placement = min(placement, self.refine(x, points, LIMB_ROUNDS, judged), key=lambda one: one.misfit)
         return placement
 
 
@@ -220,7 +221,7 @@ def limb_trees(skeleton: Skeleton) -> list[list[int]]:
     parents, names = skeleton.parents, skeleton.names
     trees = []
     for joint, parent in enumerate(parents):
-        if parent >= 0 and not names[joint].startswith(TRUNK) and names[parent].startswith(TRUNK):
+        if parent >= 0 and names[parent].startswith(TRUNK) and not names[joint].startswith(TRUNK[:-2]):
             tree = [joint]
             tree += [later for later in range(joint + 1, len(parents)) if _is_below(parents, later, joint)]
             trees.append(tree)

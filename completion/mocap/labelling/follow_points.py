@@ -1,124 +1,322 @@
-"""A body followed through points without names: which track is which marker, as key frames vote."""
+"""A body followed through points without names: key frames are solved, and vote which track is which marker."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..pose.marked_body import MarkedBody
-from .body_search import JUDGED, BodySearch, Placement, assign, match_points, robust_weights
-from .tracks import mean_along_tracks
+from .body_search import ALONE, JUDGED, BodySearch, Placement, assign, robust_weights
 
 EVERY = 0.1                          # seconds between key frames
-SCALES = (0.15, 0.12)                # metres, of the matches of a key frame, one round after the other
-KNOWN = 0.06                         # metres, scale about where a marker was on the body in the key frame before
 HELD = 0.3                           # what a track that has a label costs less with it
 NEAR = 0.15                          # metres from its place beyond which no point keeps a label
 GOOD = 0.7                           # share of markers within 10 cm, below which the body is sought anew
+BETTER = 0.2                         # markers of misfit that a new start has to gain; a turned foot costs 0.3 to 1
+WAIT, LONGEST = 0.5, 2.0             # seconds from a search that found nothing better to the next, doubled each time
 LONE = 2                             # markers and points without each other, from which on limbs are sought anew
-WAIT = 0.5                           # seconds from a search that found nothing better to the next
-# cost of a marker without a point, and the most that one away from its place counts, in half squared deviations
-ALONE, AWAY = 6.0, 8.0
-WINDOW = 0.25                        # seconds to either side over which a track is judged
+FORCED = 100.0                       # cost of a match that a label which is known forbids
 
 
-def vote(search: BodySearch, points: np.ndarray, tracks: np.ndarray, rate: float, start: tuple[int, Placement],
-         tell: Callable[[int], None]) -> np.ndarray:
-    """How often key frames gave each track (K) each label (K, L + 1), the last column: none.
+@dataclass(frozen=True)
+class Scales:
+    """How far points lie from the markers of a body, metres: as a solution is judged, in successive rounds of matches,
+    and from where the marker was on the body in the key frame before."""
 
-    The body goes from key frame to key frame, both ways from a frame in which it was found. Tracks that go on keep
-    their label and carry it along; the rest are matched with what is left. Where the body has lost the points it is
-    sought anew, a limb or all of it.
+    judged: float
+    matches: tuple[float, ...]
+    held: float
+
+
+MEAN_PERSON = Scales(JUDGED, (0.15, 0.12), 0.06)
+# of the person who was found, with markers as worn: 0.08 as above exchanged a foot's markers in 2 of 4 recordings
+OWN_PERSON = Scales(0.04, (0.12, 0.06), 0.04)
+
+
+@dataclass(frozen=True, eq=False)
+class KeyFrame:
+    """The points (N, 3) of a frame, metres, their tracks (N,), and what is known of them (N,) as of `label_markers`."""
+
+    points: np.ndarray
+    tracks: np.ndarray
+    known: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A body in a key frame.
+
+    Attributes
+    ----------
+    x : (P,) float
+        Pose and place.
+    matches : (L,) int
+        The point of each marker, -1 without one.
+    off : (L, 3) float, metres
+        Where the point of each marker is from its place on the body; of one without a point, where it was before.
+    total : float
+        Misfit, in markers without a point.
     """
-    L, (first, placement) = search.body.count, start
-    votes = np.zeros((tracks.max() + 1, L + 1))
+
+    x: np.ndarray
+    matches: np.ndarray
+    off: np.ndarray
+    total: float
+
+    @property
+    def strain(self) -> float:
+        """What the markers that have a point cost."""
+        return self.total - ALONE * float((self.matches < 0).sum())
+
+    @property
+    def near(self) -> np.ndarray:
+        """(L,) distance of each marker's point from its place, metres; infinite without one."""
+        return np.where(self.matches >= 0, np.linalg.norm(self.off, axis=1), np.inf)
+
+    def labels(self, tracks: np.ndarray) -> dict[int, int]:
+        """Track -> marker, of those near their place."""
+        return {int(tracks[self.matches[row]]): int(row) for row in np.flatnonzero(self.near < NEAR)}
+
+
+Solutions = tuple[Solution, ...]     # of each person
+
+
+def key_frames(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, rate: float, first: int
+               ) -> tuple[np.ndarray, list[KeyFrame]]:
+    """The frames (K,) that are solved, `first` among them, and their points."""
     every = max(1, round(EVERY * rate))
-    done = 0
-    for way in (range(first, len(points), every), range(first, -1, -every)):
-        follower = _Follower(search, placement.x, round(WAIT / EVERY))
-        for t in way:
-            seen = np.flatnonzero(np.isfinite(points[t, :, 0]))
-            follower.push(points[t, seen], tracks[t, seen], votes)
-            done += every
-            tell(min(done, len(points)))
+    times = np.arange(first % every, len(points), every)
+    seen = [np.flatnonzero(tracks[t] >= 0) for t in times]
+    return times, [KeyFrame(points[t, s], tracks[t, s], known[t, s]) for t, s in zip(times, seen, strict=True)]
+
+
+def follow_keys(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], begin: int, placements: Sequence[Placement],
+                tell: Callable[[int], None]) -> list[Solutions | None]:
+    """The people in every key frame, from the one in which they were found both ways.
+
+    Tracks that go on keep their label and carry it along; the rest are matched with what is left, of all people at
+    once. Limbs, and a body that has lost the points, are sought anew now and then, and where the body fits worse than
+    before. Where key frames side by side disagree about the label of a track, each is tried from the other.
+    """
+    solver = _KeyFrameSolver(searches, MEAN_PERSON)
+    found: list[Solutions | None] = [None] * len(keys)
+    done, N = 0, len(searches)
+    for way in (range(begin, len(keys)), range(begin - 1, -1, -1)):
+        before = solver.place([placement.x for placement in placements], keys[begin])
+        nothing = [dict[int, int]() for _ in searches]
+        held = nothing if way.step > 0 else _labels(found[begin] or before, keys[begin].tracks)
+        wait, quiet, usual = np.full(N, WAIT), np.zeros(N), np.full(N, np.inf)
+        for i in way:
+            done += 1
+            tell(done)
+            quiet -= EVERY
+            if len(keys[i].points) < 3:
+                held = nothing
+                continue
+            after = solver.carry([before], [held], [keys[i]])[0]
+            for k in range(N):
+                if quiet[k] > 0 and after[k].strain <= usual[k] + BETTER:
+                    continue
+                new = solver.start_anew(after, k, keys[i])
+                wait[k] = WAIT if new is not after else min(2 * wait[k], LONGEST)
+                after, quiet[k], usual[k] = new, wait[k], new[k].strain
+            found[i] = before = after
+            held = _labels(after, keys[i].tracks)
+    solver.reconcile(keys, found)
+    return found
+
+
+def solve_again(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], found: Sequence[Solutions | None],
+                labels: np.ndarray) -> list[Solutions | None]:
+    """The same for the people who were found, from solutions of other bodies and the labels (K,) of tracks, -1 without.
+
+    All key frames are solved together; limbs are sought anew where the body fits worse than it usually does.
+    """
+    solver = _KeyFrameSolver(searches, OWN_PERSON)
+    some = [i for i, solutions in enumerate(found) if solutions is not None]
+    before = [tuple(replace(one, off=np.zeros_like(one.off)) for one in found[i]) for i in some]
+    held = [[{int(track): int(labels[track]) - first for track in keys[i].tracks if first <= labels[track] < end}
+             for first, end in solver.rows] for i in some]
+    again: list[Solutions | None] = [None] * len(keys)
+    for i, solutions in zip(some, solver.carry(before, held, [keys[i] for i in some]), strict=True):
+        again[i] = solutions
+    for k in range(len(searches)):
+        usual, last = float(np.median([again[i][k].strain for i in some])) if some else 0.0, -np.inf
+        for i in some:
+            taken = sum(int((one.matches >= 0).sum()) for one in again[i])
+            lone = min((again[i][k].matches < 0).sum(), len(keys[i].points) - taken)
+            if again[i][k].strain > usual + BETTER or (lone >= LONE and (i - last) * EVERY >= WAIT):
+                again[i], last = solver.start_anew(again[i], k, keys[i]), i
+    solver.reconcile(keys, again)
+    return again
+
+
+def count_votes(keys: Sequence[KeyFrame], found: Sequence[Solutions | None], count: int) -> np.ndarray:
+    """How often the key frames that were solved gave each track each label (count, L + 1), the last column: none; L is
+    of all people."""
+    sizes = next([len(one.matches) for one in solutions] for solutions in found if solutions is not None)
+    ends = np.cumsum(sizes)
+    votes = np.zeros((count, ends[-1] + 1))
+    for key, solutions in zip(keys, found, strict=True):
+        if solutions is None:
+            continue
+        votes[key.tracks, -1] += 0.5
+        for one, end in zip(solutions, ends, strict=True):
+            good = (one.near < 0.1).sum() > (GOOD - 0.1) * min(len(one.matches), len(key.points))
+            for track, label in one.labels(key.tracks).items():
+                votes[track, -1] -= 0.5
+                votes[track, end - len(one.matches) + label] += float(good)
     return votes
 
 
-class _Follower:
-    """The body on its way through key frames."""
+def _labels(solutions: Solutions, tracks: np.ndarray) -> list[dict[int, int]]:
+    """Track -> marker, of each person."""
+    return [one.labels(tracks) for one in solutions]
 
-    def __init__(self, search: BodySearch, x: np.ndarray, wait: int) -> None:
-        self.search, self.body, self.x = search, search.body, x
-        self.held: dict[int, int] = {}                                  # track -> marker
-        self.off = np.zeros((self.body.count, 3))                       # of each point from its marker's place
-        self.wait, self.quiet = wait, 0
 
-    def push(self, points: np.ndarray, tracks: np.ndarray, votes: np.ndarray) -> None:
-        """The next key frame: points (N, 3) of tracks (N,)."""
-        body, L = self.body, self.body.count
-        if len(points) < 3:
-            self.held = {}
-            return
-        # the body where the tracks that go on have it
-        x = self.x[None]
-        targets = np.full((L, 3), np.nan)
-        for point, track in zip(points, tracks, strict=True):
-            if track in self.held:
-                targets[self.held[track]] = point
-        there = np.isfinite(targets[:, 0])
-        if there.sum() >= 4:
+class _KeyFrameSolver:
+    """Bodies of some people in key frames, from those in others."""
+
+    def __init__(self, searches: Sequence[BodySearch], scales: Scales) -> None:
+        self.searches, self.scales = searches, scales
+        ends = np.cumsum([search.body.count for search in searches]).tolist()
+        self.rows = list(zip([0, *ends[:-1]], ends, strict=True))       # of the markers of each person
+
+    def place(self, x: Sequence[np.ndarray], key: KeyFrame) -> Solutions:
+        """The solution of unknowns (P,) of each person as they are."""
+        out = []
+        for search, one in zip(self.searches, x, strict=True):
+            judged = search.judge(one, key.points, self.scales.judged)
+            out.append(self._solution(search, one, judged.matches, key.points, np.zeros((search.body.count, 3))))
+        return tuple(out)
+
+    def carry(self, before: Sequence[Solutions], held: Sequence[Sequence[dict[int, int]]], keys: Sequence[KeyFrame]
+              ) -> list[Solutions]:
+        """The bodies of some key frames in others, each in one, where some tracks have a label of a person."""
+        unknowns = [self._lay_on_tracks(search, [solutions[k] for solutions in before], [of[k] for of in held], keys)
+                    for k, search in enumerate(self.searches)]
+        # all points, matched with where the bodies have their markers and where they were on them before
+        matches = np.full((len(keys), self.rows[-1][1]), -1)
+        for scale in self.scales.matches:
+            places = [search.body.positions(x) for search, x in zip(self.searches, unknowns, strict=True)]
+            for i, key in enumerate(keys):
+                cost = np.concatenate([self._costs(places[k][i], before[i][k].off, held[i][k], key, scale)
+                                       for k in range(len(self.searches))])
+                forbid(cost, key.known)
+                matches[i] = assign(cost, 0.75)[0]
+            for k, (search, (first, end)) in enumerate(zip(self.searches, self.rows, strict=True)):
+                targets = np.stack([_targets(key.points, m[first:end]) for key, m in zip(keys, matches, strict=True)])
+                unknowns[k] = _solve(search, unknowns[k], targets, scale)
+        out = []
+        for i, key in enumerate(keys):
+            out.append(tuple(
+                self._solution(search, unknowns[k][i], matches[i, first:end],
+                               _others_hidden(key.points, np.delete(matches[i], np.s_[first:end])), before[i][k].off)
+                for k, (search, (first, end)) in enumerate(zip(self.searches, self.rows, strict=True))))
+        return out
+
+    def _lay_on_tracks(self, search: BodySearch, before: Sequence[Solution], held: Sequence[dict[int, int]],
+                       keys: Sequence[KeyFrame]) -> np.ndarray:
+        """Unknowns (K, P) of a body where the tracks that have a label put it."""
+        body, x = search.body, np.stack([solution.x for solution in before])
+        targets = np.full((len(x), body.count, 3), np.nan)
+        for target, labels, key in zip(targets, held, keys, strict=True):
+            for point, track in zip(key.points, key.tracks, strict=True):
+                if int(track) in labels:
+                    target[labels[int(track)]] = point
+        there = np.isfinite(targets[..., 0])
+        enough = there.sum(axis=1) >= 4
+        if enough.any():
             n = body.body.n_angles
-            x = x.copy()
-            x[:, n:n + 3] += (targets - body.positions(x[0]))[there].mean(axis=0)
-            x = self._solve(x, targets, np.inf)
-        # all points, matched with where the body has its markers and where they were on it before
-        for scale in SCALES:
-            places = body.positions(x[0])
-            cost = sum(0.5 * squared / (squared + s**2) for at, s in ((places, scale), (places + self.off, KNOWN))
-                       for squared in [((at[:, None] - points)**2).sum(axis=-1)])
-            for j, track in enumerate(tracks):
-                if track in self.held:
-                    cost[self.held[track], j] -= HELD
-            matches, _ = assign(cost, 0.75)
-            targets = _targets(points, matches)
-            x = self._solve(x, targets, scale)
-        x, matches, share = self._anew(x[0], matches, points)
-        # what was found, for the next key frame and for the votes
-        self.x, off = x, _targets(points, matches) - body.positions(x)
-        self.off = np.where(np.isnan(off), self.off, off)
-        near = np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf) < NEAR
-        self.held = {int(tracks[matches[row]]): int(row) for row in np.flatnonzero(near)}
-        for track in tracks:
-            label = self.held.get(int(track))
-            if label is None:
-                votes[track, L] += 0.5
-            elif share > GOOD - 0.1:
-                votes[track, label] += 1
+            step = np.where(there[..., None], targets - body.positions(x), 0.0).sum(axis=1)
+            x[enough, n:n + 3] += (step / np.maximum(there.sum(axis=1, keepdims=True), 1))[enough]
+            x[enough] = _solve(search, x[enough], targets[enough], np.inf)
+        return x
 
-    def _anew(self, x: np.ndarray, matches: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Unknowns, matches and the share of markers near their points, after a search where they speak for one."""
-        judged = self.search.judge(x, points)
-        lone = min((judged.matches < 0).sum(), len(points) - (judged.matches >= 0).sum())
-        self.quiet -= 1
-        if self.quiet <= 0 and lone >= LONE:
-            found = self.search.restart_limbs(judged, points)
-            if self._share(found.x, found.matches, points) < GOOD:
-                found = min(found, self.search.find(points), key=lambda one: one.misfit)
-            if found.misfit < 0.85 * judged.misfit:
-                x, matches = found.x, found.matches
-                self.off[:] = 0
-            else:
-                self.quiet = self.wait
-        return x, matches, self._share(x, matches, points)
+    def _costs(self, places: np.ndarray, off: np.ndarray, held: dict[int, int], key: KeyFrame, scale: float
+               ) -> np.ndarray:
+        """What each point (L, N) costs as each marker at places (L, 3), or where it was before."""
+        cost = np.zeros((len(places), len(key.points)))
+        for at, s in ((places, scale), (places + off, self.scales.held)):
+            squared = ((at[:, None] - key.points)**2).sum(axis=-1)
+            cost += 0.5 * squared / (squared + s**2)
+        for j, track in enumerate(key.tracks):
+            if int(track) in held:
+                cost[held[int(track)], j] -= HELD
+        return cost
 
-    def _share(self, x: np.ndarray, matches: np.ndarray, points: np.ndarray) -> float:
-        """The share of markers, or of points if they are fewer, whose match is within 10 cm."""
-        off = np.linalg.norm(_targets(points, matches) - self.body.positions(x), axis=1)
-        return float((off < 0.1).sum() / min(self.body.count, len(points)))
+    def start_anew(self, solutions: Solutions, k: int, key: KeyFrame) -> Solutions:
+        """The solutions, or better ones with a limb or all of the body of person k sought anew."""
+        search, scale, before = self.searches[k], self.scales.judged, solutions[k]
+        others = np.concatenate([one.matches for j, one in enumerate(solutions) if j != k] or [np.empty(0, dtype=int)])
+        points = _others_hidden(key.points, others)
+        judged = search.judge(before.x, points, scale)
+        found = search.restart_limbs(judged, points, scale)
+        near = self._solution(search, found.x, found.matches, points, before.off).near
+        visible = points[np.isfinite(points[:, 0])]
+        if (near < 0.1).sum() < GOOD * min(search.body.count, len(visible)) and len(visible) > 3:
+            other = search.judge(search.find(visible).x, points, scale)
+            found = min(found, other, key=lambda one: one.misfit)
+        if (judged.misfit - found.misfit) * search.body.count < BETTER:
+            return solutions
+        new = self._solution(search, found.x, found.matches, points, np.zeros_like(before.off))
+        return (*solutions[:k], new, *solutions[k + 1:])
 
-    def _solve(self, x: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
-        weights = robust_weights(self.body.positions(x), targets, scale)
-        return self.body.solve(x, targets[None], weights, 6, 1e-3).x
+    def reconcile(self, keys: Sequence[KeyFrame], found: list[Solutions | None]) -> None:
+        """Carry the solution of one of two key frames that give a track different labels into the other, if that gains.
+        """
+        pairs = deque(range(len(keys) - 1))
+        waiting = set(pairs)
+        while pairs:
+            i = pairs.popleft()
+            waiting.discard(i)
+            for source, target in ((i, i + 1), (i + 1, i)):
+                a, b = found[source], found[target]
+                if a is None or b is None:
+                    continue
+                held, other = _labels(a, keys[source].tracks), _labels(b, keys[target].tracks)
+                mine, theirs = ({track: (k, label) for k, labels in enumerate(of) for track, label in labels.items()}
+                                for of in (held, other))
+                if all(theirs.get(track, label) == label for track, label in mine.items()):
+                    continue
+                new = self.carry([a], [held], [keys[target]])[0]
+                if sum(one.total for one in new) < sum(one.total for one in b) - 0.5 * BETTER:
+                    found[target] = new
+                    for near in (target - 1, target):
+                        if 0 <= near < len(keys) - 1 and near not in waiting:
+                            pairs.append(near)
+                            waiting.add(near)
+
+    def _solution(self, search: BodySearch, x: np.ndarray, matches: np.ndarray, points: np.ndarray, off: np.ndarray
+                  ) -> Solution:
+        """A solution; markers without a point keep where they were from their place, `off` (L, 3)."""
+        new = _targets(points, matches) - search.body.positions(x)
+        total = search.judge(x, points, self.scales.judged).misfit * search.body.count
+        return Solution(x, matches, np.where(np.isnan(new), off, new), total)
+
+
+def _solve(search: BodySearch, x: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
+    weights = robust_weights(search.body.positions(x), targets, scale)
+    return search.body.solve(x, targets, weights, 6, 1e-3).x
+
+
+def _others_hidden(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Points (N, 3) without those of some columns, which are NaN."""
+    if not len(others):
+        return points
+    points = points.copy()
+    points[others[others >= 0]] = np.nan
+    return points
+
+
+def forbid(cost: np.ndarray, known: np.ndarray) -> None:
+    """Raise costs (L, N) of matches that labels which are known (N,) forbid, in place."""
+    labelled = np.flatnonzero(known >= 0)
+    taken = cost[known[labelled], labelled] - FORCED                    # before its row and column are raised
+    cost[:, known != -1] += FORCED
+    cost[known[labelled]] += FORCED
+    cost[known[labelled], labelled] = taken
 
 
 def _targets(points: np.ndarray, matches: np.ndarray) -> np.ndarray:
@@ -126,63 +324,3 @@ def _targets(points: np.ndarray, matches: np.ndarray) -> np.ndarray:
     targets = np.full((len(matches), 3), np.nan)
     targets[matches >= 0] = points[matches[matches >= 0]]
     return targets
-
-
-def elect(votes: np.ndarray, tracks: np.ndarray) -> np.ndarray:
-    """The column (T, L) of each marker, -1 without one, where each track has the label most key frames gave it."""
-    L = votes.shape[1] - 1
-    share = (votes / np.maximum(votes.sum(axis=1, keepdims=True), 1))[:, :L]
-    columns = np.full((len(tracks), L), -1)
-    for t, row in enumerate(tracks):
-        seen = np.flatnonzero(row >= 0)
-        chosen, _ = assign(-share[row[seen]].T, -0.5)                   # no label without half of the votes
-        columns[t, chosen >= 0] = seen[chosen[chosen >= 0]]
-    return columns
-
-
-def assign_by_places(points: np.ndarray, tracks: np.ndarray, places: np.ndarray, rate: float, sd: float,
-                     fixed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The column (T, L) of each marker by where a body has them in every frame, and how sure that is (T, L).
-
-    What a point costs as a marker, half its squared deviations, is averaged along its track; then every frame is
-    matched by itself. So a track may be cut, exchanged and joined, where that is what the body says for a while.
-
-    Parameters
-    ----------
-    points : (T, C, 3) float, metres
-    tracks : (T, C) int
-    places : (T, L, 3) float, metres
-    rate : float, frames per second
-    sd : float, metres
-        How far a marker lies from its place, in each direction.
-    """
-    T, L = places.shape[:2]
-    costs = np.full((*tracks.shape, L), AWAY)
-    for some in _pieces(T):
-        squared = ((points[some, :, None] - places[some, None])**2).sum(axis=-1)
-        costs[some] = np.minimum(np.nan_to_num(squared / (2 * sd**2), nan=AWAY), AWAY)
-    costs = mean_along_tracks(costs, tracks, max(1, round(WINDOW * rate)))
-    columns, sure = np.full((T, L), -1), np.zeros((T, L))
-    for t in range(T):
-        seen = np.flatnonzero(tracks[t] >= 0)
-        chosen, _ = assign(costs[t, seen].T, ALONE)
-        rows = np.flatnonzero(chosen >= 0)
-        own = costs[t, seen[chosen[rows]]]                              # (n, L) of each chosen point as every marker
-        as_this = own[np.arange(len(rows)), rows].copy()
-        own[np.arange(len(rows)), rows] = np.inf
-        of_this = costs[t, seen][:, rows].T.copy()                      # (n, N) of every point as this marker
-        of_this[np.arange(len(rows)), chosen[rows]] = np.inf
-        rival = np.minimum(np.minimum(own.min(axis=1, initial=np.inf), of_this.min(axis=1, initial=np.inf)), ALONE)
-        columns[t, rows] = seen[chosen[rows]]
-        sure[t, rows] = 1 / (1 + np.exp(as_this - rival))
-    return columns, sure
-
-
-def _pieces(count: int, size: int = 256) -> Iterator[slice]:
-    return (slice(start, start + size) for start in range(0, count, size))
-
-
-def take_columns(points: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """The points (T, L, 3) in some columns (T, L), NaN where that is -1."""
-    taken = np.take_along_axis(points, np.maximum(columns, 0)[..., None], axis=1)
-    return np.where((columns < 0)[..., None], np.nan, taken)

@@ -1,8 +1,8 @@
 """Labels for markers without names: which point of every frame is which marker of a body."""
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,8 +19,10 @@ from ..pose.follow import animate
 from ..pose.marked_body import AnimateConfig, MarkedBody
 from ..subject.frame_starts import mean_person
 from ..subject.person import PersonFit, find_person
+from .apart import frames_apart
+from .assignment import assign_by_places, elect, find_displaced, label_of_track, take_columns
 from .body_search import OTHERS, UPS, BodySearch, Placement
-from .follow_points import assign_by_places, elect, take_columns, vote
+from .follow_points import count_votes, follow_keys, key_frames, solve_again
 from .tracks import link_points
 
 UNKNOWN, GHOST = -1, -2              # in labels that are known: nothing is, and: this point is no marker
@@ -79,7 +81,7 @@ class LabelledMarkers:
         residual = float(np.nanmedian(self.motion.residuals)) if there.any() else np.inf
         bad, check = [], []
         if residual > 0.04:
-            bad.append(f"labelled points lie {1000 * residual:.0f} mm from the body: another layout, or not one person?")
+            bad.append(f"labelled points lie {1000 * residual:.0f} mm from the body: another layout or person?")
         if doubted > 0.02:
             check.append(f"{100 * doubted:.0f}% of the labels are doubtful")
         if alone > 0.1:
@@ -87,7 +89,6 @@ class LabelledMarkers:
         return Judgement.of(bad, check)
 
 
-@one_thread()
 def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: MarkerLayout,
                   known: np.ndarray | None = None, progress: Progress | None = None) -> LabelledMarkers:
     """Find the label of every point in every frame, from nothing but where the points are.
@@ -113,72 +114,164 @@ def label_markers(model: BodyModel | Subject, points: MarkerSequence, layout: Ma
     ------
     ValueError
         No frame with ten points, no body that fits them, a layout of another body.
+
+    Examples
+    --------
+    >>> points = read_markers("raw.c3d")
+    >>> layout, _ = choose_layout(model, "cmu41", ())
+    >>> label_markers(model, points, layout).markers.labels[:2]
+    ('LFHD', 'RFHD')
+    """
+    return label_people([(model, layout)], points, known, progress)[0]
+
+
+@one_thread()
+def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], points: MarkerSequence,
+                 known: np.ndarray | None = None, progress: Progress | None = None) -> list[LabelledMarkers]:
+    """The same for several people in one volume, each with a model or a subject, and a layout.
+
+    All markers of all people compete for the points of a frame, so that none takes what is another's.
+
+    Parameters
+    ----------
+    people : sequence of (BodyModel or Subject, MarkerLayout)
+    points : MarkerSequence
+    known : (T, C) int, optional
+        As of `label_markers`; rows of the layouts are counted on from person to person.
+    progress : callable, optional
+        Called with (done, total).
+
+    Raises
+    ------
+    ValueError
+        As of `label_markers`; no frame in which the people stand apart.
     """
     tell = progress or (lambda done, total: None)
-    T, at, rate = len(points.positions), points.positions, points.rate
-    most = int(points.seen.sum(axis=1).max(initial=0))
-    if most < FEWEST:
-        raise ValueError(f"points: expected a frame with at least {FEWEST} points to find a body in, the best has {most}")
+    at, rate, T = points.positions, points.rate, len(points.positions)
+    known = _checked(known, points, sum(len(layout.labels) for _, layout in people))
     tracks = link_points(at, rate)
-    known = model if isinstance(model, Subject) else None
-    total = (1 if known else 2) * (T + STARTS) + len(DEVIATIONS) * T
 
-    # labels by the votes of key frames: of the mean person, then of the person who is found by them
-    subject, fit = known or model.subject(), None
-    body = mean_person(subject, layout) if known is None else _own(subject, layout)
-    columns = told = _label_by_votes(BodySearch(body, subject), at, tracks, rate, lambda done: tell(done, total))
-    if known is None:
-        fit = find_person(model, _sequence(at, columns, layout, rate), layout)
-        subject = model.subject(fit.betas)
-        body = _own(subject, fit.layout)
-        columns = _label_by_votes(BodySearch(body, subject), at, tracks, rate,
-                                  lambda done: tell(T + STARTS + done, total))
+    # key frames, from one in which the bodies are found: mean people, or those who are known
+    unknown = [isinstance(model, BodyModel) for model, _ in people]
+    bodies = [_Person.start(model, layout) for model, layout in people]
+    searches = [BodySearch(body.marked, body.subject) for body in bodies]
+    first, placements = find_start(searches, at, lambda done: tell(done, 4 * T))
+    times, keys = key_frames(at, tracks, known, rate, first)
+    begin = int(np.searchsorted(times, first))
+    found = follow_keys(searches, keys, begin, placements,
+                        lambda done: tell(T * done // len(keys), 4 * T))
+    columns = elect(count_votes(keys, found, tracks.max() + 1), tracks)
 
-    # the motion of the person tells the labels anew, and these the person, ever closer
-    worn = layout if fit is None else fit.layout
-    done = total - len(DEVIATIONS) * T
-    for sd in DEVIATIONS:
-        markers = _sequence(at, columns, layout, rate)
-        if known is None and (columns != told).mean() > SAME:
-            told = columns
-            fit = find_person(model, markers, layout)
-            subject, worn = model.subject(fit.betas), fit.layout
-            body = _own(subject, worn)
-        motion = animate(subject, markers, worn, POSES)
-        places = body.positions(body.body.join(motion.poses, motion.trans))
-        columns, sure = assign_by_places(at, tracks, places, rate, sd)
-        done += T
-        tell(done, total)
+    # the same by the people themselves
+    bodies = [_found(body, model, at, mine, rate) if is_unknown else body for body, (model, _), is_unknown, mine
+              in zip(bodies, people, unknown, _of_each(bodies, columns), strict=True)]
+    searches = [BodySearch(body.marked, body.subject) for body in bodies]
+    labels = label_of_track(columns, tracks)
+    found = solve_again(searches, keys, found, labels)
+    columns = elect(count_votes(keys, found, tracks.max() + 1), tracks)
+
+    # the motion of each tells the labels anew, and these the person, ever closer
+    told = np.full_like(columns, -2)
+    for i, sd in enumerate(DEVIATIONS):
+        changed = (columns != told).mean() > SAME
+        told = columns
+        for k, mine in enumerate(_of_each(bodies, columns)):
+            if unknown[k] and changed:
+                bodies[k] = _found(bodies[k], people[k][0], at, mine, rate)
+            bodies[k] = bodies[k].follow(at, mine, rate)
+        places = np.concatenate([body.places for body in bodies], axis=1)
+        turns = np.concatenate([body.turns for body in bodies], axis=1)
+        offsets = find_displaced(at, columns, places, turns)
+        places += np.einsum("tlij,lj->tli", turns, offsets)
+        columns, sure = assign_by_places(at, tracks, known, places, rate, sd)
+        tell((i + 2) * T, (len(DEVIATIONS) + 1) * T)
+
     unlabelled = points.seen.copy()
     frames, rows = np.nonzero(columns >= 0)
     unlabelled[frames, columns[frames, rows]] = False
-    return LabelledMarkers(_sequence(at, columns, layout, rate), columns, sure, unlabelled, tracks, motion, subject,
-                           worn, fit)
+    return [LabelledMarkers(_sequence(at, mine, body.layout, rate), mine, certain, unlabelled, tracks, body.motion,
+                            body.subject, body.layout, body.fit)
+            for body, mine, certain in zip(bodies, _of_each(bodies, columns), _of_each(bodies, sure), strict=True)]
 
 
-def _label_by_votes(search: BodySearch, points: np.ndarray, tracks: np.ndarray, rate: float,
-                    tell: Callable[[int], None]) -> np.ndarray:
-    """Columns (T, L) of the markers by the votes of key frames, from the best of a few frames on."""
-    start = find_start(search, points, tell)
-    return elect(vote(search, points, tracks, rate, start, lambda done: tell(STARTS + done)), tracks)
+@dataclass(frozen=True, eq=False)
+class _Person:
+    """A person, and what is known of it: markers on its body, its motion, places (T, L, 3) of markers in it, and the
+    rotations (T, L, 3, 3) of the parts that carry them."""
+
+    subject: Subject
+    layout: MarkerLayout
+    usual: MarkerLayout
+    marked: MarkedBody
+    fit: PersonFit | None = None
+    motion: Motion | None = None
+    places: np.ndarray | None = None
+    turns: np.ndarray | None = None
+
+    @staticmethod
+    def start(model: BodyModel | Subject, layout: MarkerLayout) -> _Person:
+        """The mean person of a model, or the one that is known."""
+        if isinstance(model, Subject):
+            return _Person(model, layout, layout, _own(model, layout))
+        subject = model.subject()
+        return _Person(subject, layout, layout, mean_person(subject, layout))
+
+    def follow(self, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:
+        """With the motion by the labels that columns (T, L) give."""
+        motion = animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, POSES)
+        x = self.marked.body.join(motion.poses, motion.trans)
+        part = self.subject.skeleton.part_of_vertex(self.subject.template)[self.layout.nearest]
+        turns = self.marked.shapes.rotations(np.swapaxes(motion.poses, 0, 1))[part]
+        return replace(self, motion=motion, places=self.marked.positions(x), turns=np.swapaxes(turns, 0, 1))
 
 
-def find_start(search: BodySearch, points: np.ndarray, tell: Callable[[int], None]) -> tuple[int, Placement]:
-    """The frame, of a few well seen ones, in which a body fits best, and where it is there."""
+def _found(person: _Person, model: BodyModel, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:
+    """A person of unknown shape by the labels that columns (T, L) give."""
+    fit = find_person(model, _sequence(points, columns, person.usual, rate), person.usual)
+    subject = model.subject(fit.betas)
+    return _Person(subject, fit.layout, person.usual, _own(subject, fit.layout), fit)
+
+
+def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callable[[int], None]
+               ) -> tuple[int, list[Placement]]:
+    """The frame, of a few well seen ones, in which the bodies fit best, and where they are there."""
     seen = np.isfinite(points[..., 0])
     full = np.flatnonzero(seen.sum(axis=1) >= max(FEWEST, 0.9 * seen.sum(axis=1).max()))
     frames = full[np.unique(np.linspace(0, len(full) - 1, STARTS + 2).round().astype(int)[1:-1])]
-    tried = list[tuple[int, Placement]]()
+    groups = [[points[t, seen[t]]] for t in frames]
+    if len(searches) > 1:
+        frames, groups = frames_apart(points[full], len(searches))
+        frames = full[frames]
+    tried = list[tuple[int, list[Placement]]]()
     for axes in (UPS, OTHERS):
-        for i, t in enumerate(frames):
-            tried.append((int(t), search.find(points[t, seen[t]], axes)))
+        for i, (t, group) in enumerate(zip(frames, groups, strict=True)):
+            tried.append((int(t), [search.find(some, axes) for search, some in zip(searches, group, strict=True)]))
             tell(i + 1)
-        best = min(tried, key=lambda one: one[1].misfit)
-        if best[1].misfit < FOUND:
+        best = min(tried, key=lambda one: max(placement.misfit for placement in one[1]))
+        worst = max(placement.misfit for placement in best[1])
+        if worst < FOUND:
             return best
     raise ValueError(f"points: no body with these markers was found in frames {', '.join(map(str, frames))}: the best "
-                     f"leaves {best[1].misfit:.2f}, expected below {FOUND}; another layout, several people, or metres "
+                     f"leaves {worst:.2f}, expected below {FOUND}; another layout, several people, or metres "
                      "taken for millimetres?")
+
+
+def _checked(known: np.ndarray | None, points: MarkerSequence, count: int) -> np.ndarray:
+    """What is known of the points (T, C), and that there are enough of them."""
+    most = int(points.seen.sum(axis=1).max(initial=0))
+    if most < FEWEST:
+        raise ValueError(f"points: expected a frame with at least {FEWEST} points, the best has {most}")
+    shape = points.positions.shape[:2]
+    known = np.full(shape, UNKNOWN) if known is None else np.asarray(known)
+    if known.shape != shape or known.max(initial=-1) >= count or known.min(initial=-1) < GHOST:
+        raise ValueError(f"known: expected {shape} rows of the layout below {count}, {UNKNOWN} or {GHOST}, got "
+                         f"{known.shape} from {known.min(initial=-1)} to {known.max(initial=-1)}")
+    return known
+
+
+def _of_each(bodies: Sequence[_Person], values: np.ndarray) -> list[np.ndarray]:
+    """The columns of an array (T, L) of all markers that are each person's."""
+    return np.split(values, np.cumsum([len(body.layout.labels) for body in bodies])[:-1], axis=1)
 
 
 def _own(subject: Subject, layout: MarkerLayout) -> MarkedBody:

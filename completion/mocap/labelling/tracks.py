@@ -4,8 +4,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-# Two frames at 120 Hz of four recordings miss constant velocity by 0.6 mm at the median, 9 mm at the 99th percentile and
-# 18 mm at the 99.9th; other markers are 25 mm away at least, 55 mm at the first percentile.
+# At 120 Hz the markers of four recordings miss constant velocity by 0.6 mm at the median, 9 mm at the 99th percentile
+# and 18 mm at the 99.9th; other markers are 25 mm away at least, 55 mm at the first percentile.
 NOISE = 0.010                        # metres that a prediction may miss at any rate
 ACCELERATION = 100.0                 # m/s²; what it may miss besides, over the time since the last observation
 SPEED = 5.0                          # m/s of a marker that was seen once, whose velocity is not known
@@ -94,7 +94,7 @@ def has_tracks(points: np.ndarray, rate: float) -> bool:
 
 
 def mean_along_tracks(values: np.ndarray, tracks: np.ndarray, half: int) -> np.ndarray:
-    """Means (T, C, L) of values (T, C, L) over the observations of a track (T, C) from `half` before to `half` after."""
+    """Means (T, C, L) of values (T, C, L) over the observations of a track (T, C), `half` of them to either side."""
     T, C, L = values.shape
     order = np.argsort(tracks.ravel(), kind="stable")
     order = order[tracks.ravel()[order] >= 0]
