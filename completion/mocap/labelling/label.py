@@ -1,6 +1,7 @@
 """Labels for markers without names: which point of every frame is which marker of a body."""
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,7 +23,8 @@ from ..subject.person import PersonFit, find_person
 from .apart import frames_apart
 from .assignment import assign_by_places, elect, find_displaced, label_of_track, take_columns
 from .body_search import OTHERS, UPS, BodySearch, Placement
-from .follow_points import count_votes, follow_keys, key_frames, solve_again
+from .follow_points import KeyFrame, Solutions, count_votes, follow_keys, key_frames, solve_again
+from .layout_order import order_by_layout
 from .tracks import link_points
 
 UNKNOWN, GHOST = -1, -2              # in labels that are known: nothing is, and: this point is no marker
@@ -32,6 +34,7 @@ FOUND = 0.3                          # misfit of a frame above which no body was
 # metres from its place that a marker lies, in each direction: of the mean person's first, of the person's own at last
 DEVIATIONS = (0.03, 0.02, 0.012)
 SAME = 0.001                         # share of labels that may change without the person being found anew
+SOME = 0.1                           # share of key frames in which a marker has to be for its place to be told
 SURE = 0.9                           # confidence below which a label is doubted
 POSES = PoseConfig.weighted(2.0, 0.3, 57600.0)                          # as of `mosh`
 
@@ -161,6 +164,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     found = follow_keys(searches, keys, begin, placements,
                         lambda done: tell(T * done // len(keys), 4 * T))
     columns = elect(count_votes(keys, found, tracks.max() + 1), tracks)
+    columns, found = _in_order(bodies, columns, keys, found)
 
     # the same by the people themselves
     bodies = [_found(body, model, at, mine, rate) if is_unknown else body for body, (model, _), is_unknown, mine
@@ -169,6 +173,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     labels = label_of_track(columns, tracks)
     found = solve_again(searches, keys, found, labels)
     columns = elect(count_votes(keys, found, tracks.max() + 1), tracks)
+    columns, found = _in_order(bodies, columns, keys, found)
 
     # the motion of each tells the labels anew, and these the person, ever closer
     told = np.full_like(columns, -2)
@@ -208,6 +213,11 @@ class _Person:
     places: np.ndarray | None = None
     turns: np.ndarray | None = None
 
+    @property
+    def part(self) -> np.ndarray:
+        """(L,) the part that carries each marker."""
+        return self.subject.skeleton.part_of_vertex(self.subject.template)[self.layout.nearest]
+
     @staticmethod
     def start(model: BodyModel | Subject, layout: MarkerLayout) -> _Person:
         """The mean person of a model, or the one that is known."""
@@ -220,8 +230,7 @@ class _Person:
         """With the motion by the labels that columns (T, L) give."""
         motion = animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, POSES)
         x = self.marked.body.join(motion.poses, motion.trans)
-        part = self.subject.skeleton.part_of_vertex(self.subject.template)[self.layout.nearest]
-        turns = self.marked.shapes.rotations(np.swapaxes(motion.poses, 0, 1))[part]
+        turns = self.marked.shapes.rotations(np.swapaxes(motion.poses, 0, 1))[self.part]
         return replace(self, motion=motion, places=self.marked.positions(x), turns=np.swapaxes(turns, 0, 1))
 
 
@@ -230,6 +239,30 @@ def _found(person: _Person, model: BodyModel, points: np.ndarray, columns: np.nd
     fit = find_person(model, _sequence(points, columns, person.usual, rate), person.usual)
     subject = model.subject(fit.betas)
     return _Person(subject, fit.layout, person.usual, _own(subject, fit.layout), fit)
+
+
+def _in_order(bodies: Sequence[_Person], columns: np.ndarray, keys: Sequence[KeyFrame],
+              found: Sequence[Solutions | None]) -> tuple[np.ndarray, list[Solutions | None]]:
+    """Columns (T, L) and solutions with labels put back that were exchanged throughout among the markers of a part."""
+    orders = []
+    for k, body in enumerate(bodies):
+        part, marked = body.part, body.marked
+        solved = [solutions[k] for solutions in found if solutions is not None]
+        pose, _, _ = marked.body.split(np.stack([one.x for one in solved]))
+        turns = marked.shapes.rotations(np.swapaxes(pose, 0, 1))[part]                            # (L, K, 3, 3)
+        off = np.stack([np.where(one.matches[:, None] >= 0, one.off, np.nan) for one in solved])
+        local = np.einsum("lkji,klj->kli", turns, off)
+        enough = np.isfinite(local[..., 0]).mean(axis=0) > SOME
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)                # a marker that was never seen
+            places = body.layout.place(body.subject.template) + np.nanmedian(local, axis=0)
+        places[~enough] = np.nan
+        orders.append(order_by_layout(places, body.usual.place(body.subject.template), part))
+    again = [None if solutions is None else tuple(
+        replace(one, matches=one.matches[np.argsort(order)], off=one.off[np.argsort(order)])
+        for one, order in zip(solutions, orders, strict=True)) for solutions in found]
+    return np.concatenate([mine[:, np.argsort(order)] for mine, order
+                           in zip(_of_each(bodies, columns), orders, strict=True)], axis=1), again
 
 
 def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callable[[int], None]

@@ -1,6 +1,9 @@
 """A layout as a marker set of OpenSim: every marker on the body that carries it, to begin with in the scale tool."""
 from __future__ import annotations
 
+from pathlib import Path
+from xml.etree import ElementTree
+
 import numpy as np
 
 from model.export.names import names_of
@@ -8,11 +11,19 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import stance
 from scanprep.skeleton.tree import Skeleton
 
+from ..files.text import MarkerFileError
 from .layout import MarkerLayout
+from .named import layout_on
 from .symmetry import label_pairs
 
 _LIMBS = {"humerus": "ulna", "ulna": "hand", "femur": "tibia", "tibia": "calcn"}      # y of each points back from these
 _WITH = {"head": "torso"}            # bodies that most models do not have
+# bodies of Rajagopal's and gait2392's models that are ours under another name, and where they begin in it, metres
+_SAME = {"radius": ("ulna", (-0.0067, -0.0130, 0.0261)), "talus": ("tibia", (-0.010, -0.400, 0.0)),
+         "toes": ("calcn", (0.1788, -0.002, 0.0011)), "head": ("torso", (-0.020, 0.3715, 0.0))}
+# metres, of Rajagopal's model: of the limbs, and from the lowest lumbar joint up to the shoulders
+_LENGTHS = {"femur": 0.408, "tibia": 0.400, "humerus": 0.286, "ulna": 0.249}
+_TORSO = 0.3715
 
 
 def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dict[str, tuple[str, np.ndarray]]:
@@ -48,6 +59,61 @@ def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dic
         origin, axes = frames[name]
         found[label] = f"/bodyset/{name}", axes.T @ (place - origin)
     return found
+
+
+def opensim_layout(path: Path, body: Mesh, skeleton: Skeleton) -> MarkerLayout:
+    """The layout of a marker set or model of OpenSim (.xml, .osim) on a body at rest, as near as its frames are known.
+
+    What is left, some centimetres, `find_person` finds; the limbs' markers are laid along the limb as its length says.
+
+    Parameters
+    ----------
+    path : Path
+        With markers on bodies of gait2392 or Rajagopal's model, such as `/bodyset/femur_r`.
+    body : Mesh
+    skeleton : Skeleton
+
+    Raises
+    ------
+    MarkerFileError
+        Not XML, no markers, a marker on a body that is not known.
+    """
+    try:
+        tree = ElementTree.parse(path)
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise MarkerFileError(f"{path}: expected XML of OpenSim ({error})") from None
+    joints = {name: skeleton.joints[skeleton.names.index(part)] for part, name in names_of(skeleton, "opensim").items()
+              if name not in _WITH}
+    vertical, ahead = stance(body)
+    frames = _frames(joints, vertical, ahead)
+    scale = float(np.linalg.norm(joints["femur_l"] - joints["femur_r"])) / 0.167
+    places = {}
+    for marker in tree.iter("Marker"):
+        name, text = marker.get("name", ""), (marker.findtext("location") or "").split()
+        frame = (marker.findtext("socket_parent_frame") or marker.findtext("body") or "").rpartition("/")[2]
+        kind, _, side = frame.partition("_")
+        kind, begin = _SAME.get(kind, (kind, (0.0, 0.0, 0.0)))
+        carrier = f"{kind}_{side}" if side else kind
+        if carrier not in frames or len(text) != 3:
+            raise MarkerFileError(f"{path}: marker '{name}': expected a location of three numbers on one of "
+                                  f"{', '.join(sorted(frames))}, found '{' '.join(text)}' on '{frame}'")
+        try:
+            place = np.array([float(word) for word in text])
+        except ValueError:
+            raise MarkerFileError(f"{path}: marker '{name}': expected numbers, found '{' '.join(text)}'") from None
+        # z is right in all bodies of OpenSim
+        place = scale * (place + begin * np.array([1.0, 1.0, -1.0 if side == "l" else 1.0]))
+        below = f"{_LIMBS.get(kind)}_{side}"
+        if kind in _LENGTHS and below in joints:
+            place[1] *= float(np.linalg.norm(joints[carrier] - joints[below])) / (_LENGTHS[kind] * scale)
+        elif kind == "torso" and {"humerus_l", "humerus_r"} <= joints.keys():
+            shoulders = (joints["humerus_l"] + joints["humerus_r"]) / 2
+            place[1] *= float(vertical @ (shoulders - frames["torso"][0])) / (_TORSO * scale)
+        origin, axes = frames[carrier]
+        places[name] = origin + axes @ place
+    if not places:
+        raise MarkerFileError(f"{path}: expected markers of OpenSim, found none")
+    return layout_on(body, places)[0]
 
 
 def _frames(joints: dict[str, np.ndarray], vertical: np.ndarray, ahead: np.ndarray

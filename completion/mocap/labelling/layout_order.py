@@ -1,0 +1,78 @@
+"""Labels that were exchanged among the markers of one part of the body, all the time: told by the shape of the layout.
+
+Four markers of a plate on a thigh lie closer to each other than the plate lies to its usual place. Which of them is
+which is not told by where they are, but by how they lie to each other.
+"""
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+FARTHEST = 0.15                      # metres from its place, all markers of the part moved together, that still counts
+GAIN = 0.5                           # share of the squared distances that another order leaves at most
+LEAST = 0.015                        # metres by which each marker that changes has to come closer, in the square mean
+ROUNDS = 10
+
+
+def order_by_layout(places: np.ndarray, usual: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Which marker (L,) each of the markers truly is, if those of one part may bear each other's label.
+
+    The markers of a part may have moved together; of all orders the one is taken that leaves the least of the squared
+    distances from the usual places, where it is clearly better than the labels as they are.
+
+    Parameters
+    ----------
+    places : (L, 3) float, metres
+        Where the markers were found on the body at rest, NaN for those that were not.
+    usual : (L, 3) float, metres
+        Where the layout has them.
+    part : (L,) int
+        The part of the body that carries each.
+
+    Examples
+    --------
+    >>> plate = np.array([[0, 0, 0], [0, 0, 0.05], [0, 0.04, 0], [0, 0.04, 0.06]])
+    >>> order_by_layout(plate[[0, 3, 2, 1]] + [0, 0, 0.07], plate, np.zeros(4, dtype=int)).tolist()
+    [0, 3, 2, 1]
+    """
+    order = np.arange(len(places))
+    for of in np.unique(part):
+        mine = np.flatnonzero(part == of)
+        seen = mine[np.isfinite(places[mine, 0])]
+        if len(seen) < 3:
+            continue
+        as_it_is, _ = _least(places[seen], usual[mine], np.searchsorted(mine, seen), fixed=True)
+        best, chosen = min((_least(places[seen], usual[mine], start, fixed=False)
+                            for start in _starts(places[seen], usual[mine])), key=lambda one: one[0])
+        changed = int((mine[chosen] != seen).sum())
+        if changed and best < GAIN * as_it_is and as_it_is - best > changed * LEAST**2:
+            order[seen] = mine[chosen]
+            # labels that are given up go to the markers that lost theirs
+            lost = np.setdiff1d(mine, order[seen])
+            order[np.setdiff1d(mine, seen)] = lost
+    return order
+
+
+def _starts(places: np.ndarray, usual: np.ndarray) -> list[np.ndarray]:
+    """Orders to begin with: after every shift that brings one place to one of the usual ones."""
+    starts = []
+    for place in places:
+        for goal in usual:
+            apart = ((places + goal - place)[:, None] - usual)
+            starts.append(linear_sum_assignment((apart**2).sum(axis=-1))[1])
+    return starts
+
+
+def _least(places: np.ndarray, usual: np.ndarray, chosen: np.ndarray, fixed: bool) -> tuple[float, np.ndarray]:
+    """The squared distances that an order leaves after the shift that suits it, and that order, improved if not fixed.
+    """
+    cost = np.inf
+    for _ in range(ROUNDS):
+        shift = np.median(places - usual[chosen], axis=0)
+        squared = np.minimum((((places - shift)[:, None] - usual)**2).sum(axis=-1), FARTHEST**2)
+        better = chosen if fixed else linear_sum_assignment(squared)[1]
+        cost = float(squared[np.arange(len(places)), better].sum())
+        if (better == chosen).all():
+            break
+        chosen = better
+    return cost, chosen
