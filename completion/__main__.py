@@ -15,6 +15,7 @@ COMMANDS = {
     "learn": ("Registered meshes -> a body model.", "model.learning.cli:learn"),
     "model": ("Look into a body model and pose it.", "model.cli:group"),
     "complete": ("A partial scan, or several views -> the whole body.", "completion.partial.cli:complete_scan"),
+    "label": ("Markers without names -> which point is which marker.", "completion.mocap.labelling.cli:label_file"),
     "animate": ("Markers -> the person and a moving body.", "completion.mocap.animate.cli:animate_markers"),
     "mosh": ("Markers -> shape, motion and soft tissue; a file, or a folder of people.",
              "completion.mocap.mosh.cli:mosh_markers"),

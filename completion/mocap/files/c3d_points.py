@@ -1,4 +1,4 @@
-"""More points for a C3D file that is there, beside its own."""
+"""More points for a C3D file that is there, or other labels for its own; all else in the file stays."""
 from __future__ import annotations
 
 import struct
@@ -35,25 +35,56 @@ def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Seq
     points[np.isnan(points).any(axis=2)] = [0, 0, 0, -1]
     if table.kind == "i2" and not holds(points):
         return add_points(path, as_floats(path, data), labels, descriptions, positions, unit)
-    begin, parameters = (data[0] - 1) * BLOCK, file_parameters(data, table.numbers)
-    described = [str(text) for text in parameters.get(("POINT", "DESCRIPTIONS"), [])]
+    if table.kind == "i2":
+        points = np.rint(points)
+    return _with_points(path, data, table, np.concatenate([table.words(data), points], axis=1),
+                        [*table.labels, *labels], [*_descriptions(data, table), *descriptions])
 
-    # every frame with the new points between its own and its analog channels
+
+def rename_points(path: Path, data: bytes, labels: Sequence[str], source: np.ndarray) -> bytes:
+    """The file with its measured points under other labels; all else, and points that hold no positions, stay.
+
+    Cameras and residuals go with their point. `labels` (M) are those of the new columns, `source` (T, M) the column of
+    `RawMarkers` that each was measured as in every frame, -1 where it is missing.
+    """
+    table = point_table(path, data)
+    words, kept = table.words(data), np.array(table.kept)
+    if source.shape != (table.frames, len(labels)) or source.max(initial=-1) >= len(kept):
+        raise MarkerFileError(f"{path}: expected a file of {len(source)} frames with more than "
+                              f"{source.max(initial=-1)} points, found {table.frames} with {len(kept)}")
+    taken = np.take_along_axis(words, kept[np.maximum(source, 0)][..., None], axis=1)
+    taken[source < 0] = [0, 0, 0, -1]
+    rest = [i for i in range(len(table.labels)) if i not in table.kept]
+    described = _descriptions(data, table)
+    return _with_points(path, data, table, np.concatenate([taken, words[:, rest]], axis=1),
+                        [*labels, *(table.labels[i] for i in rest)],
+                        [*[""] * len(labels), *(described[i] for i in rest)])
+
+
+def _descriptions(data: bytes, table: PointTable) -> list[str]:
+    """What the file says of each of its points."""
+    told = [str(text) for text in file_parameters(data, table.numbers).get(("POINT", "DESCRIPTIONS"), [])]
+    return (told + [""] * len(table.labels))[:len(table.labels)]
+
+
+def _with_points(path: Path, data: bytes, table: PointTable, words: np.ndarray, labels: list[str],
+                 descriptions: list[str]) -> bytes:
+    """The file with these points (T, N, 4) in the place of its own."""
+    begin, parameters = (data[0] - 1) * BLOCK, file_parameters(data, table.numbers)
+    # every frame with the points before its analog channels
     size, T, behind = 4 if table.kind == "f4" else 2, table.frames, rotations_start(parameters, table.start, len(data))
     rows = np.frombuffer(data, np.uint8, T * table.width, table.start).reshape(T, -1)
-    added = np.frombuffer(table.numbers.encoded(points if size == 4 else np.rint(points), table.kind), np.uint8)
+    encoded = np.frombuffer(table.numbers.encoded(words, table.kind), np.uint8)
     own = 4 * len(table.labels) * size
-    body = _padded(np.concatenate([rows[:, :own], added.reshape(T, -1), rows[:, own:]], axis=1).tobytes())
+    body = _padded(np.concatenate([encoded.reshape(T, -1), rows[:, own:]], axis=1).tobytes())
     behind = behind if behind >= table.start + table.frames * table.width else 0
-    described = (described + [""] * len(table.labels))[:len(table.labels)]
     try:
-        section = _section(path, data, begin, table, [*table.labels, *labels], [*described, *descriptions],
-                           len(body) // BLOCK if behind else 0)
+        section = _section(path, data, begin, table, labels, descriptions, len(body) // BLOCK if behind else 0)
     except (struct.error, IndexError, ValueError, OverflowError, StopIteration) as error:
         raise MarkerFileError(f"{path}: expected C3D parameters with a group POINT that can take more points "
                               f"({type(error).__name__} {error})") from None
     head = bytearray(data[:begin])
-    struct.pack_into(f"{table.numbers.order}H", head, 2, len(table.labels) + len(labels))
+    struct.pack_into(f"{table.numbers.order}H", head, 2, len(labels))
     struct.pack_into(f"{table.numbers.order}H", head, 16, (begin + len(section)) // BLOCK + 1)
     return bytes(head) + section + body + (data[behind:] if behind else b"")
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from ..pose.marked_body import batches
 from .body_search import assign
@@ -40,7 +41,7 @@ def label_of_track(columns: np.ndarray, tracks: np.ndarray) -> np.ndarray:
 
 
 def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, places: np.ndarray, rate: float,
-                     sd: float) -> tuple[np.ndarray, np.ndarray]:
+                     sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The column (T, L) of each marker by where a body has them in every frame, and how sure that is (T, L).
 
     What a point costs as a marker, half its squared deviations, is averaged along its track; then every frame is
@@ -54,8 +55,8 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
         As of `label_markers`.
     places : (T, L, 3) float, metres
     rate : float, frames per second
-    sd : float, metres
-        How far a marker lies from its place, in each direction.
+    sd : (L,) float, metres
+        How far each marker lies from its place, in each direction.
     """
     T, L = places.shape[:2]
     costs = np.full((*tracks.shape, L), AWAY)
@@ -81,11 +82,32 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
     return columns, sure
 
 
-def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, turns: np.ndarray) -> np.ndarray:
+def mean_offsets(points: np.ndarray, columns: np.ndarray, places: np.ndarray, turns: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray]:
+    """Median offsets (L, 3), metres, of the labelled points from places (T, L, 3), in the axes of their parts.
+
+    And how far (L,) they lie from there, a standard deviation of each direction. Both are zero for markers that fewer
+    frames than `MISSING` have.
+    """
+    L = columns.shape[1]
+    offsets, deviations = np.zeros((L, 3)), np.zeros(L)
+    for row in np.flatnonzero((columns >= 0).mean(axis=0) >= MISSING):
+        t = np.flatnonzero(columns[:, row] >= 0)
+        off = points[t, columns[t, row]] - places[t, row]
+        local = np.einsum("tji,tj->ti", turns[t, row], off)
+        offsets[row] = np.median(local, axis=0)
+        # of a distance in space the median is 1.54 standard deviations
+        deviations[row] = np.median(np.linalg.norm(local - offsets[row], axis=1)) / 1.54
+    return offsets, deviations
+
+
+def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, turns: np.ndarray, part: np.ndarray
+                   ) -> np.ndarray:
     """Offsets (L, 3), metres, of markers that are worn elsewhere on their part of the body, in the part's own axes.
 
-    A marker that hardly any frame has is sought among the points without a label: where one keeps its place on the
-    part in most frames, within `REACH` of the usual place, it is that marker.
+    Markers that hardly any frame has are sought among the points without a label: where some keep their place on the
+    part in most frames, within `REACH` of the usual places, they are these markers. Of several each is the nearest to
+    where the layout has it, moved as the other markers of the part are.
 
     Parameters
     ----------
@@ -96,37 +118,47 @@ def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, 
         Where the body has the markers.
     turns : (T, L, 3, 3) float
         Rotations of their parts.
+    part : (L,) int
+        The part that carries each.
     """
-    L = columns.shape[1]
     free = np.isfinite(points[..., 0])
     frames, rows = np.nonzero(columns >= 0)
     free[frames, columns[frames, rows]] = False
-    offsets = np.zeros((L, 3))
-    for row in np.flatnonzero((columns >= 0).mean(axis=0) < MISSING):
-        open_frames = np.flatnonzero(columns[:, row] < 0)
-        some = open_frames[np.unique(np.linspace(0, len(open_frames) - 1, FRAMES).astype(int))]
+    some = np.unique(np.linspace(0, len(points) - 1, FRAMES).astype(int))
+    missing = (columns >= 0).mean(axis=0) < MISSING
+    (usual, _), offsets = mean_offsets(points, columns, places, turns), np.zeros((columns.shape[1], 3))
+    for of in np.unique(part[missing]):
+        mine, known = np.flatnonzero(missing & (part == of)), np.flatnonzero(~missing & (part == of))
+        # everything in the axes of the part, from the first of its missing markers
+        R, origin = turns[some, mine[0]], places[some, mine[0]]
+        wanted = np.einsum("tji,tlj->tli", R, places[some][:, mine] - origin[:, None]).mean(axis=0)
+        wanted += np.median(usual[known], axis=0) if len(known) else 0.0
         frame, column = np.nonzero(free[some])
-        local = np.einsum("nji,nj->ni", turns[some[frame], row], points[some[frame], column] - places[some[frame], row])
-        near = np.linalg.norm(local, axis=1) < REACH
-        local, frame = local[near], frame[near]
-        if not len(local):
-            continue
-        # the place with a point in most frames, and the mean of the points there
-        tries = local[:: max(1, len(local) // 500)]
-        close = ((tries[:, None] - local)**2).sum(axis=-1) < TIGHT**2
-        counts = [len(np.unique(frame[each])) for each in close]
-        best = int(np.argmax(counts))
-        if counts[best] >= OFTEN * len(some):
-            offsets[row] = local[close[best]].mean(axis=0)
-            here = np.zeros_like(free)
-            here[some[frame[close[best]]]] = True
-            free &= ~(here & _close_to(points, places[:, row] + np.einsum("tij,j->ti", turns[:, row], offsets[row])))
+        local = np.einsum("nji,nj->ni", R[frame], points[some[frame], column] - origin[frame])
+        near = (np.linalg.norm(local[:, None] - wanted, axis=2) < REACH).any(axis=1)
+        found = _steady_places(local[near], frame[near], OFTEN * len(some))
+        if len(found):
+            apart = np.linalg.norm(wanted[:, None] - found, axis=2)
+            for row, place in zip(*linear_sum_assignment(apart), strict=True):
+                if apart[row, place] < REACH:
+                    begin = np.einsum("tji,tj->ti", R, places[some, mine[row]] - origin).mean(axis=0)
+                    offsets[mine[row]] = found[place] - begin
     return offsets
 
 
-def _close_to(points: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Which points (T, C, 3) are within `TIGHT` of one place (T, 3) of their frame."""
-    return np.nan_to_num(np.linalg.norm(points - places[:, None], axis=2), nan=np.inf) < TIGHT
+def _steady_places(local: np.ndarray, frame: np.ndarray, often: float) -> np.ndarray:
+    """The places (n, 3) within `TIGHT` of which so many frames (N,) have one of the points (N, 3)."""
+    places = list[np.ndarray]()
+    while len(local):
+        tries = local[:: max(1, len(local) // 500)]
+        close = ((tries[:, None] - local)**2).sum(axis=-1) < TIGHT**2
+        counts = [len(np.unique(frame[each])) for each in close]
+        best = close[int(np.argmax(counts))]
+        if max(counts) < often:
+            break
+        places.append(local[best].mean(axis=0))
+        local, frame = local[~best], frame[~best]
+    return np.array(places).reshape(-1, 3)
 
 
 def take_columns(points: np.ndarray, columns: np.ndarray) -> np.ndarray:

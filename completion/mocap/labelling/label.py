@@ -20,18 +20,18 @@ from ..pose.follow import animate
 from ..pose.marked_body import AnimateConfig, MarkedBody
 from ..subject.frame_starts import mean_person
 from ..subject.person import PersonFit, find_person
-from .apart import frames_apart
-from .assignment import assign_by_places, elect, find_displaced, label_of_track, take_columns
+from .assignment import assign_by_places, elect, find_displaced, label_of_track, mean_offsets, take_columns
 from .body_search import OTHERS, UPS, BodySearch, Placement
 from .follow_points import KeyFrame, Solutions, count_votes, follow_keys, key_frames, solve_again
 from .layout_order import order_by_layout
+from .separate import separate_people
 from .tracks import link_points
 
 UNKNOWN, GHOST = -1, -2              # in labels that are known: nothing is, and: this point is no marker
 FEWEST = 10                          # points in a frame, of which no body can be told otherwise
 STARTS = 5                           # frames in which the body is sought
 FOUND = 0.3                          # misfit of a frame above which no body was found; right ones had at most 0.18
-# metres from its place that a marker lies, in each direction: of the mean person's first, of the person's own at last
+# metres from its place that a marker lies at least, in each direction, of the three passes at last
 DEVIATIONS = (0.03, 0.02, 0.012)
 SAME = 0.001                         # share of labels that may change without the person being found anew
 SOME = 0.1                           # share of key frames in which a marker has to be for its place to be told
@@ -186,9 +186,12 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
             bodies[k] = bodies[k].follow(at, mine, rate)
         places = np.concatenate([body.places for body in bodies], axis=1)
         turns = np.concatenate([body.turns for body in bodies], axis=1)
-        offsets = find_displaced(at, columns, places, turns)
+        # markers keep their places on these parts, wherever the fitted layout has them
+        part = np.concatenate([body.part + 1000 * k for k, body in enumerate(bodies)])
+        offsets, deviations = mean_offsets(at, columns, places, turns)
+        offsets = offsets + find_displaced(at, columns, places, turns, part)
         places += np.einsum("tlij,lj->tli", turns, offsets)
-        columns, sure = assign_by_places(at, tracks, known, places, rate, sd)
+        columns, sure = assign_by_places(at, tracks, known, places, rate, np.clip(deviations, sd, DEVIATIONS[0]))
         tell((i + 2) * T, (len(DEVIATIONS) + 1) * T)
 
     unlabelled = points.seen.copy()
@@ -273,7 +276,7 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
     frames = full[np.unique(np.linspace(0, len(full) - 1, STARTS + 2).round().astype(int)[1:-1])]
     groups = [[points[t, seen[t]]] for t in frames]
     if len(searches) > 1:
-        frames, groups = frames_apart(points[full], len(searches))
+        frames, groups = separate_people(points[full], len(searches))
         frames = full[frames]
     tried = list[tuple[int, list[Placement]]]()
     for axes in (UPS, OTHERS):

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components
 
 FARTHEST = 0.15                      # metres from its place, all markers of the part moved together, that still counts
 GAIN = 0.5                           # share of the squared distances that another order leaves at most
 LEAST = 0.015                        # metres by which each marker that changes has to come closer, in the square mean
+NEAR = 0.10                          # metres between markers of one plate or hand
 ROUNDS = 10
 
 
@@ -36,20 +38,26 @@ def order_by_layout(places: np.ndarray, usual: np.ndarray, part: np.ndarray) -> 
     [0, 3, 2, 1]
     """
     order = np.arange(len(places))
-    for of in np.unique(part):
-        mine = np.flatnonzero(part == of)
-        seen = mine[np.isfinite(places[mine, 0])]
-        if len(seen) < 3:
-            continue
-        as_it_is, _ = _least(places[seen], usual[mine], np.searchsorted(mine, seen), fixed=True)
-        best, chosen = min((_least(places[seen], usual[mine], start, fixed=False)
-                            for start in _starts(places[seen], usual[mine])), key=lambda one: one[0])
-        changed = int((mine[chosen] != seen).sum())
-        if changed and best < GAIN * as_it_is and as_it_is - best > changed * LEAST**2:
-            order[seen] = mine[chosen]
-            # labels that are given up go to the markers that lost theirs
-            lost = np.setdiff1d(mine, order[seen])
-            order[np.setdiff1d(mine, seen)] = lost
+    # markers of one part, then those that are near each other: a plate may lie over two parts
+    _, plate = connected_components(np.linalg.norm(usual[:, None] - usual, axis=2) < NEAR)
+    for group in (part, plate):
+        at = np.full_like(places, np.nan)
+        at[order] = places                                             # under the labels they have by now
+        change = np.arange(len(places))
+        for of in np.unique(group):
+            mine = np.flatnonzero(group == of)
+            seen = mine[np.isfinite(at[mine, 0])]
+            if len(seen) < 3:
+                continue
+            as_it_is, _ = _least(at[seen], usual[mine], np.searchsorted(mine, seen), fixed=True)
+            best, chosen = min((_least(at[seen], usual[mine], start, fixed=False)
+                                for start in _starts(at[seen], usual[mine])), key=lambda one: one[0])
+            changed = int((mine[chosen] != seen).sum())
+            if changed and best < GAIN * as_it_is and as_it_is - best > changed * LEAST**2:
+                change[seen] = mine[chosen]
+                # labels that are given up go to the markers that lost theirs
+                change[np.setdiff1d(mine, seen)] = np.setdiff1d(mine, mine[chosen])
+        order = change[order]
     return order
 
 

@@ -9,7 +9,7 @@ TRIED = 60                           # frames that are looked at
 FEWEST = 10                          # points of a person
 
 
-def frames_apart(points: np.ndarray, people: int) -> tuple[np.ndarray, list[list[np.ndarray]]]:
+def separate_people(points: np.ndarray, people: int) -> tuple[np.ndarray, list[list[np.ndarray]]]:
     """The frames (n,) in which people are farthest from each other on the ground, and the points of each person there.
 
     The ground is the plane, of those along two axes of the file, in which the points fall into the clearest groups.

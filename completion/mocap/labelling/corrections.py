@@ -1,0 +1,102 @@
+"""The table of labels: one row for each stretch of a track with one label, to be corrected and given back."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.geometry import tables
+from scanprep.geometry.storage import StorageError
+
+from .label import GHOST, UNKNOWN
+
+COLUMNS = ("track", "point", "begin", "end", "label", "confidence", "fixed")
+YES = ("yes", "y", "x", "1", "true")
+NO = ("", "no", "n", "0", "false")
+
+
+def write_labels(path: Path, points: Sequence[str], tracks: np.ndarray, rows: np.ndarray, names: Sequence[str],
+                 confidence: np.ndarray, fixed: np.ndarray) -> None:
+    """Write the label of every track, a row for each stretch that has one, the least certain first.
+
+    Parameters
+    ----------
+    points : C strings
+        Names of the columns of the recording.
+    tracks : (T, C) int
+        The track of each point, -1 without one.
+    rows : (T, C) int
+        The marker that each point is, -1 for none.
+    names : strings
+        Labels of the markers.
+    confidence : (T, C) float
+        Of each label.
+    fixed : (T, C) bool
+        Labels that were known.
+    """
+    frames, columns = np.nonzero(tracks >= 0)
+    number, label = tracks[frames, columns], rows[frames, columns]
+    order = np.lexsort((frames, number))
+    frames, columns, number, label = frames[order], columns[order], number[order], label[order]
+    certain, known = confidence[frames, columns], fixed[frames, columns]
+    edges = np.flatnonzero((np.diff(number) != 0) | (np.diff(label) != 0) | (np.diff(known.astype(int)) != 0)) + 1
+    out = []
+    for some in np.split(np.arange(len(frames)), edges):
+        if not len(some):
+            continue
+        row, first, last = int(label[some[0]]), some[0], some[-1]
+        out.append((int(number[first]), points[columns[first]], int(frames[first]), int(frames[last]),
+                    names[row] if row >= 0 else "", round(float(certain[some].mean()), 3) if row >= 0 else "",
+                    "yes" if known[first] else ""))
+    out.sort(key=lambda each: (each[5] == "", each[5] if each[5] != "" else 0.0, each[0], each[2]))
+    tables.write_table(path, COLUMNS, out)
+
+
+def read_corrections(path: Path, tracks: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """What a table of labels says for certain (T, C), in the rows that are `fixed`, as `label_markers` takes it.
+
+    Parameters
+    ----------
+    path : Path
+        As of `write_labels`, with labels changed and `yes` in the column fixed.
+    tracks : (T, C) int
+        Those of the same recording.
+    names : strings
+        Labels of the markers.
+
+    Raises
+    ------
+    StorageError
+        A row that is not of this recording, an unknown label, two labels for one point.
+    """
+    known = np.full(tracks.shape, UNKNOWN)
+    for line, row in tables.read_table(path, COLUMNS, ("track", "begin", "end", "label", "fixed")):
+        said = row["fixed"].strip().lower()
+        if said not in YES:
+            if said not in NO:
+                raise StorageError(f"{path}: line {line}: expected yes or nothing in the column fixed, found '{said}'")
+            continue
+        try:
+            track, begin, end = (int(row[name]) for name in ("track", "begin", "end"))
+        except ValueError:
+            raise StorageError(f"{path}: line {line}: expected whole numbers for track, begin and end, found "
+                               f"'{row['track']}', '{row['begin']}', '{row['end']}'") from None
+        label = row["label"].strip()
+        if label and label not in names:
+            raise StorageError(f"{path}: line {line}: expected a label of the layout or nothing, found '{label}'; it "
+                               f"has {', '.join(names)}")
+        here = np.zeros(tracks.shape, dtype=bool)
+        if 0 <= begin <= end < len(tracks):
+            here[begin:end + 1] = tracks[begin:end + 1] == track
+        if not here.any():
+            raise StorageError(f"{path}: line {line}: expected frames of track {track} in {begin} to {end}, this "
+                               f"recording of {len(tracks)} frames has none there; was the table made from another?")
+        known[here] = names.index(label) if label else GHOST
+    # one label twice in a frame cannot be
+    for row in range(len(names)):
+        twice = np.flatnonzero((known == row).sum(axis=1) > 1)
+        if len(twice):
+            raise StorageError(f"{path}: expected each label once in a frame, {names[row]} is fixed for two points in "
+                               f"frame {twice[0]}")
+    return known

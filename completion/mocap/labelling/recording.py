@@ -1,0 +1,174 @@
+"""A recording without labels: read, labelled, and written again with all that was in it."""
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import Subject
+from scanprep.console import Metric, details, judgement_row
+from scanprep.geometry import storage
+from scanprep.judgement import Judgement
+
+from ...motion import Progress
+from ..files.c3d_points import rename_points
+from ..files.markers import MarkerSequence, read_markers, write_markers
+from ..marker_sets.layout import MarkerLayout
+from .corrections import read_corrections, write_labels
+from .label import UNKNOWN, LabelledMarkers, label_people
+from .tracks import link_points
+
+NAMELESS = "*"                       # what labels of points that are no marker begin with
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledRecording:
+    """A recording with the labels of one person or several.
+
+    Attributes
+    ----------
+    path : Path
+        The recording.
+    points : MarkerSequence
+        As it was.
+    people : list of LabelledMarkers
+    names : strings
+        Labels of all people, `Person1:LKNE` where there are several.
+    known : (T, C) int
+        What was known of the labels: by the file, or by a table of corrections.
+    """
+
+    path: Path
+    points: MarkerSequence
+    people: list[LabelledMarkers]
+    names: tuple[str, ...]
+    known: np.ndarray
+
+    @property
+    def columns(self) -> np.ndarray:
+        """(T, L) the column of each marker of all people, -1 without one."""
+        return np.concatenate([one.columns for one in self.people], axis=1)
+
+    @property
+    def confidence(self) -> np.ndarray:
+        """(T, L) of each label."""
+        return np.concatenate([one.confidence for one in self.people], axis=1)
+
+    @property
+    def judgement(self) -> Judgement:
+        """What the labels of all people are worth."""
+        if len(self.people) == 1:
+            return self.people[0].judgement
+        return Judgement().joined(*(Judgement.of([f"person {k}: {why}" for why in one.judgement.problems],
+                                                 [f"person {k}: {why}" for why in one.judgement.doubts])
+                                    for k, one in enumerate(self.people, start=1)))
+
+    def write(self, output: Path) -> None:
+        """Write the labelled recording: markers first, then points that are none, packed as `*1`, `*2`, ...
+
+        A C3D of a C3D keeps analog channels, events, parameters, and points that hold no positions.
+        """
+        loose = pack_tracks(self.people[0].tracks, self.people[0].unlabelled)
+        source = np.concatenate([self.columns, loose], axis=1)
+        labels = (*self.names, *(f"{NAMELESS}{i}" for i in range(1, loose.shape[1] + 1)))
+        if output.suffix.lower() == self.path.suffix.lower() == ".c3d":
+            data = self.path.read_bytes()
+            with storage.writing(output) as beside:
+                beside.write_bytes(rename_points(self.path, data, labels, source))
+            return
+        taken = np.take_along_axis(self.points.positions, np.maximum(source, 0)[..., None], axis=1)
+        taken[source < 0] = np.nan
+        write_markers(output, MarkerSequence(taken, labels, self.points.rate))
+
+    def write_table(self, path: Path) -> None:
+        """Write the table of labels, to be corrected."""
+        rows, sure = np.full(self.known.shape, -1), np.zeros(self.known.shape)
+        frames, markers = np.nonzero(self.columns >= 0)
+        columns = self.columns[frames, markers]
+        rows[frames, columns], sure[frames, columns] = markers, self.confidence[frames, markers]
+        write_labels(path, self.points.labels, self.people[0].tracks, rows, self.names, sure, self.known != UNKNOWN)
+
+    def metrics(self) -> list[Metric]:
+        """The figures of the closing table."""
+        there = self.columns >= 0
+        points, sure = int(self.points.seen.sum()), self.confidence[there]
+        missing = [name for name, has in zip(self.names, there.any(axis=0), strict=True) if not has]
+        tracks = self.people[0].tracks
+        return [judgement_row(self.judgement), Metric("points with a label", 100 * there.sum() / max(points, 1), "%"),
+                Metric("labels that are doubtful", 100 * float((sure < 0.9).mean()) if len(sure) else 100.0, "%"),
+                Metric("markers found in a frame, mean", float(there.sum(axis=1).mean())),
+                *([Metric("markers of the layout without any point", ", ".join(missing))] if missing else []),
+                *details([Metric("people", len(self.people)), Metric("frames", len(there)),
+                          Metric("points", points), Metric("tracks", int(tracks.max() + 1)),
+                          Metric("labels that were known", int((self.known >= 0).sum()))])]
+
+
+def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subject, layout: MarkerLayout,
+                    people: int = 1, corrections: Path | None = None, relabel: bool = False,
+                    progress: Progress | None = None) -> LabelledRecording:
+    """Label a recording that was read.
+
+    Labels of the recording that are the layout's are known, unless `relabel`; so are those of the table `corrections`,
+    which go before. Arguments else as of `label_people`.
+    """
+    names = layout.labels if people == 1 else tuple(f"Person{k}:{label}" for k in range(1, people + 1)
+                                                    for label in layout.labels)
+    known = np.full(points.positions.shape[:2], UNKNOWN)
+    if not relabel and people == 1:
+        known = known_columns(points, layout)
+    if corrections is not None:
+        said = read_corrections(corrections, link_points(points.positions, points.rate), names)
+        for row in np.unique(said[said >= 0]):                         # the file's own label gives way in these frames
+            known[(known == row) & (said == row).any(axis=1, keepdims=True)] = UNKNOWN
+        known = np.where(said == UNKNOWN, known, said)
+    found = label_people([(model, layout)] * people, points, known, progress)
+    return LabelledRecording(path, points, found, names, known)
+
+
+def known_columns(points: MarkerSequence, layout: MarkerLayout) -> np.ndarray:
+    """The rows of a layout (T, C) that the labels of a recording tell, `UNKNOWN` for others."""
+    known = np.full(points.positions.shape[:2], UNKNOWN)
+    spelled = layout.spelled(points.labels)
+    for row, label in enumerate(spelled.labels):
+        if label in points.labels:
+            column = points.labels.index(label)
+            known[points.seen[:, column], column] = row
+    return known
+
+
+def pack_tracks(tracks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The columns (T, n) of points (T, C) that are wanted, in as few series as hold one track after the other.
+
+    Examples
+    --------
+    >>> pack_tracks(np.array([[0, -1], [0, 1], [-1, 1]]), np.array([[True, False], [False, True], [False, True]]))
+    array([[0],
+           [1],
+           [1]])
+    """
+    frames, columns = np.nonzero(wanted)
+    number = tracks[frames, columns]
+    order = np.lexsort((frames, number))
+    pieces = np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else []
+    ends, series = list[int](), list[np.ndarray]()
+    for piece in sorted(pieces, key=lambda each: int(frames[each[0]])):
+        begin = int(frames[piece[0]])
+        free = next((i for i, end in enumerate(ends) if end < begin), len(ends))
+        if free == len(ends):
+            ends.append(-1)
+            series.append(np.full(len(tracks), -1))
+        ends[free] = int(frames[piece[-1]])
+        series[free][frames[piece]] = columns[piece]
+    return np.stack(series, axis=1) if series else np.empty((len(tracks), 0), dtype=int)
+
+
+def read_unlabelled(path: Path, unit: str | None, rate: float | None) -> MarkerSequence:
+    """The points of a recording, whoever's labels they bear."""
+    with warnings.catch_warnings():
+        # labels that come twice, or of several people, do not matter here
+        warnings.filterwarnings("ignore", message=".*(comes? more often|taken as those of one person).*")
+        return read_markers(path, unit, None, rate)
+
