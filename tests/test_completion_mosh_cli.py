@@ -242,7 +242,7 @@ def test_who_is_who(tmp_path):
     assert [a.name for a in find_actors([tmp_path / "zoe"], Grouping("all"))] == ["zoe"]
     one = {"Eve": ["dance"], "Adam": ["dance"]}                             # a file by itself as in a folder
     assert names(find_actors([tmp_path / "dance.c3d"], Grouping())) == one
-    assert [a.name for a in find_actors([tmp_path / "dance.c3d"], Grouping.of("auto", "Eve"))] == ["Eve"]
+    assert [a.name for a in find_actors([tmp_path / "dance.c3d"], Grouping.of("Eve"))] == ["Eve"]
     table = tmp_path / "who.csv"
     write_table(table, find_actors([tmp_path / "dance.c3d"], Grouping()))
     mended = find_actors([tmp_path / "dance.c3d"], Grouping.of(str(table)))

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.linear import Subject
 from model.posing.cli import read_subject
-from scanprep.arguments import Place
+from scanprep.arguments import Place, UsageError
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
@@ -32,8 +32,9 @@ MarkersArg = Annotated[Path, Place("MARKERS")]
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: Unit | None = None, rate: Positive | None = None,
                     subject_prefix: str | None = None, retarget_to: Path | None = None, betas_to: Path | None = None,
-                    config: AnimateConfig = AnimateConfig(), person: PersonConfig = PersonConfig(),
-                    workers: Workers = Workers(), *, space: Workspace) -> Outcome:
+                    unlabelled: bool = False, config: AnimateConfig = AnimateConfig(),
+                    person: PersonConfig = PersonConfig(), workers: Workers = Workers(), *, space: Workspace
+                    ) -> Outcome:
     """The motion of a person from markers, and the person; or a motion of another skeleton on a body.
 
     A folder is worked through file by file, each into a folder of its name; called again, it goes on where it was,
@@ -69,6 +70,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], keys in seconds
             {"0": [...], "2.5": [...]}, or [[b1, b2, ...], ...] of every frame: morph.glb.
+        unlabelled: The markers have no names: they are labelled first, as by `scape label`; --layout says which are
+            worn.
         config: Settings.
         person: Settings of the person from markers.
         workers: Who works through the files of a folder.
@@ -79,15 +82,19 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     names = [path.stem for path in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):      # written over each other
         raise ValueError(f"{markers}: expected files of different names, {twice[0]} comes with several endings")
-    if markers.is_file() and is_motion(markers) and (layout or subject_prefix):
-        raise ValueError(f"{markers}: a motion has no markers; leave out --layout and --subject-prefix")
+    if markers.is_file() and is_motion(markers) and (layout or subject_prefix or unlabelled):
+        raise ValueError(f"{markers}: a motion has no markers; leave out --layout, --subject-prefix and --unlabelled")
+    if unlabelled and layout is None:
+        raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
+    if unlabelled and subject_prefix:
+        raise UsageError("--unlabelled: markers without names have no --subject-prefix")
     loaded, name = read_model(model)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout),
                 body if isinstance(body, Subject) else None,
                 None if retarget_to is None else read_subject(loaded, retarget_to, unit),
                 None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix, rate,
-                config, person)
+                config, person, unlabelled)
     settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         return do_one("following the markers", space, work, Task("motion", markers), settings,

@@ -31,6 +31,8 @@ from ...motion_pictures import (
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion
 from ..files.opensim import believed
+from ..labelling.labelled_file import label_first
+from ..labelling.recording import named_only
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import find_coverage
@@ -60,6 +62,7 @@ class Work:
     rate: float | None                   # frames a second, where a file does not say
     animate: AnimateConfig
     person: PersonConfig
+    unlabelled: bool = False             # markers have no names
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
         """Follow the markers of a file, or bring its motion onto the body, write everything into the folder of a room,
@@ -85,7 +88,13 @@ class Work:
 
     def _follow(self, path: Path, room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
         """The motion of the markers of a file."""
-        sequence = read_markers(path, self.unit, self.who, self.rate)
+        labelling = Judgement()
+        if self.unlabelled:
+            worn, _ = choose_layout(self.model, self.layout, ())
+            file = label_first(room, "", path, self.subject or self.model, worn, self.unit, self.rate)
+            sequence, labelling = named_only(read_markers(file.path, file.unit, None, file.rate)), file.judgement
+        else:
+            sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
         body, found, worn, placed = self.subject, None, Worn(), Judgement()
@@ -108,7 +117,7 @@ class Work:
         covered = find_coverage(body, layout, [motion], [sequence])
         moving = Judgement.of(motion_problem(motion, body.template, layout, sequence),
                               motion_doubts([motion], [sequence], body.template))
-        judgement = covered.judgement().joined(moving, worn.judgement(sequence.labels), placed)
+        judgement = covered.judgement().joined(labelling, moving, worn.judgement(sequence.labels), placed)
         if found is not None:
             judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *figures(motion)]

@@ -195,6 +195,15 @@ def marker_subjects(path: str | Path) -> tuple[str, ...]:
     return tuple(who for who in people if who not in props)
 
 
+def label_prefixes(path: str | Path) -> set[str]:
+    """What stands before the colon of the labels of a file; none of one that cannot be read."""
+    try:
+        labels = _read_raw(Path(path)).labels
+    except MarkerFileError:
+        return set()
+    return {label.rpartition(":")[0] for label in labels if ":" in label}
+
+
 def people_of(labels: Sequence[str]) -> tuple[tuple[str, ...], ...]:
     """The prefixes of each person's labels, `Subject:Label`.
 

@@ -100,7 +100,7 @@ def follow_keys(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], begin:
     before. Where key frames side by side disagree about the label of a track, each is tried from the other.
     """
     solver = _KeyFrameSolver(searches, MEAN_PERSON)
-    found: list[Solutions | None] = [None] * len(keys)
+    found: list[Solutions | None] = [None for _ in keys]
     done, N = 0, len(searches)
     for way in (range(begin, len(keys)), range(begin - 1, -1, -1)):
         before = solver.place([placement.x for placement in placements], keys[begin])
@@ -138,7 +138,7 @@ def solve_again(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], found:
     before = [tuple(replace(one, off=np.zeros_like(one.off)) for one in found[i]) for i in some]
     held = [[{int(track): int(labels[track]) - first for track in keys[i].tracks if first <= labels[track] < end}
              for first, end in solver.rows] for i in some]
-    again: list[Solutions | None] = [None] * len(keys)
+    again: list[Solutions | None] = [None for _ in keys]
     for i, solutions in zip(some, solver.carry(before, held, [keys[i] for i in some]), strict=True):
         again[i] = solutions
     for k in range(len(searches)):

@@ -15,7 +15,6 @@ from scanprep.threads import one_thread
 from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..mosh.mosh import PoseConfig
 from ..pose.follow import animate
 from ..pose.marked_body import AnimateConfig, MarkedBody
 from ..subject.frame_starts import mean_person
@@ -36,7 +35,7 @@ DEVIATIONS = (0.03, 0.02, 0.012)
 SAME = 0.001                         # share of labels that may change without the person being found anew
 SOME = 0.1                           # share of key frames in which a marker has to be for its place to be told
 SURE = 0.9                           # confidence below which a label is doubted
-POSES = PoseConfig.weighted(2.0, 0.3, 57600.0)                          # as of `mosh`
+POSES = AnimateConfig(marker_sd=0.007)                                  # metres: markers where they sit, as in `mosh`
 
 
 @dataclass(frozen=True, eq=False)

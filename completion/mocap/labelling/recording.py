@@ -139,6 +139,11 @@ def known_columns(points: MarkerSequence, layout: MarkerLayout) -> np.ndarray:
     return known
 
 
+def named_only(markers: MarkerSequence) -> MarkerSequence:
+    """The markers of a labelled recording, without the points that are none."""
+    return markers.select([label for label in markers.labels if not label.startswith(NAMELESS)])
+
+
 def pack_tracks(tracks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """The columns (T, n) of points (T, C) that are wanted, in as few series as hold one track after the other.
 

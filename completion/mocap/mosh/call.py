@@ -37,16 +37,16 @@ class MoshCall(KeptCall):
     model: tuple[Path, ...] = ()
     layout: str | None = None
     subjects: str = "auto"
-    subject_prefix: str | None = None
     hold_out: tuple[str, ...] = ()
     retarget_to: Path | None = None
     unit: Unit | None = None
     rate: float | None = None
+    unlabelled: bool = False
     config: MoshConfig = field(default_factory=MoshConfig)
 
     def actors(self, output: Path) -> list[Actor]:
         """The people of the recordings as they are now."""
-        return find_actors(self.markers, Grouping.of(self.subjects, self.subject_prefix), output)
+        return find_actors(self.markers, Grouping.of(self.subjects), output)
 
     def models(self) -> Models:
         """All that was named, read."""

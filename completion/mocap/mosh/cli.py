@@ -29,9 +29,10 @@ Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
 
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
-                 subjects: str = "auto", subject_prefix: str | None = None, hold_out: tuple[str, ...] = (),
+                 subject_prefix: Annotated[str, Called("--subjects")] = "auto", hold_out: tuple[str, ...] = (),
                  retarget_to: Annotated[Path | None, Called("--character")] = None, unit: Unit | None = None,
-                 rate: Positive | None = None, config: MoshConfig = MoshConfig(),
+                 rate: Positive | None = None, unlabelled: bool = False,
+                 config: MoshConfig = MoshConfig(),
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
@@ -60,24 +61,26 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
             times, a model of both sexes, one of women and one of men: the markers tell the sex, by the first.
         layout: Where the markers usually sit: one of `scape layout list`, or a JSON file {"markersets":
             [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.
-        subjects: Who is who: a CSV file with the columns file and subject, or JSON {file: subject}, where files that
-            are left out are not used; or a rule: "name", by what stands before the first _, - or blank of the file
+        subject_prefix: Who is who: a CSV file with the columns file and subject, or JSON {file: subject}, where files
+            that are left out are not used; or a rule: "name", by what stands before the first _, - or blank of the file
             name; "label", by what stands before the colon of the labels; "each", every file is of another person;
-            "all", they are of one; "auto".
-        subject_prefix: Whose markers, in files with several people: what stands before the colon of the labels.
-            Several, as Head,Trunk, are of one person.
+            "all", they are of one; "auto". Or whose markers, in files with several people: what stands before the
+            colon of the labels, as Ann; several, as Head,Trunk, are of one person.
         hold_out: Labels of markers that no stage sees, which then tell how well the body predicts.
         retarget_to: Model whose mean is a character, which makes the motion too: character.glb.
         unit: Unit of the markers, where the file cannot tell.
         rate: Frames a second, where a file does not say or says it wrongly.
+        unlabelled: The markers have no names: they are labelled first, as by `scape label`; --layout says which are
+            worn.
         config: Settings.
         workers: Who does the work, a person at a time.
     """
     if not markers:
         raise ValueError("MARKERS: expected at least one file or folder")
     held = tuple(label for words in hold_out for label in words.split(",") if label)
-    call = MoshCall(markers, model, layout, subjects, subject_prefix, held, retarget_to, unit, rate,
-                    config)
+    if unlabelled and layout is None:
+        raise ValueError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
+    call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, unit, rate, unlabelled, config)
     with bar("people") as people, bar("one of them") as inside:
         return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)
 
@@ -87,7 +90,7 @@ def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, 
     actors, loaded = call.actors(space.folder), call.models()
     work = Work(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
                 None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
-                call.unit, call.rate, call.config, command)
+                call.unit, call.rate, call.unlabelled, call.config, command)
     # who is who into subjects.csv; one that was mended stays as it is, and has to be named
     table = space.folder / TABLE
     if not table.exists() or space.is_ours(TABLE):

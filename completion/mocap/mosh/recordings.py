@@ -11,7 +11,7 @@ from scanprep.arguments import UsageError
 from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage, tables
 
-from ..files.markers import READERS, marker_subjects
+from ..files.markers import READERS, label_prefixes, marker_subjects
 from ..files.text import MarkerFileError
 
 By = Literal["auto", "name", "label", "each", "all"]
@@ -50,14 +50,16 @@ class Grouping:
     who: str | None = None               # whose markers, in files with several people
 
     @staticmethod
-    def of(subjects: str, who: str | None = None) -> Grouping:
-        """By a rule that is named, or by a table."""
+    def of(subjects: str) -> Grouping:
+        """By a rule that is named, by a table, or whose markers they are."""
         if subjects in get_args(By):
-            return Grouping(cast(By, subjects), None, who)
-        if Path(subjects).suffix.lower() not in (".csv", ".json"):
-            raise UsageError(f"--subjects: expected a file .csv or .json, or one of {', '.join(get_args(By))}, "
-                             f"got '{subjects}'")
-        return Grouping("auto", Path(subjects), who)
+            return Grouping(cast(By, subjects))
+        if Path(subjects).suffix.lower() in (".csv", ".json"):
+            return Grouping("auto", Path(subjects))
+        if Path(subjects).suffix or "/" in subjects:
+            raise UsageError(f"--subjects: expected a file .csv or .json, one of {', '.join(get_args(By))}, or what "
+                             f"stands before the colon of labels, got '{subjects}'")
+        return Grouping("auto", None, subjects)
 
 
 def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None = None) -> list[Actor]:
@@ -67,6 +69,12 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
         if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
             raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
     found = list(_files(given, output, grouping))
+    if grouping.who is not None and found:
+        there = set().union(*(label_prefixes(file.path) for file in found))
+        if not there & set(grouping.who.split(",")):
+            raise UsageError(f"--subjects: expected a file .csv or .json, one of {', '.join(get_args(By))}, or what "
+                             f"stands before the colon of labels ({', '.join(sorted(there)) or 'here: none'}), "
+                             f"got '{grouping.who}'")
     if not found:
         raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(READERS)}, found none")
     whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given)

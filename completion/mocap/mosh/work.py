@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
 from ..files.opensim import centre_sequence, known_centres
+from ..labelling.labelled_file import label_first
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage
@@ -60,6 +61,7 @@ class Work:
     hold_out: tuple[str, ...]            # labels that no stage sees
     unit: str | None
     rate: float | None                   # frames a second, where a file does not say
+    unlabelled: bool                     # markers have no names
     config: MoshConfig
     command: str = field(metadata={"digest": False})
 
@@ -124,6 +126,7 @@ class _Found:
     takes: list[Take]
     usual: MarkerLayout
     layout_name: str
+    labelling: Judgement                 # of labels that were found
 
     @cached_property
     def person(self) -> Judgement:
@@ -143,16 +146,26 @@ class _Found:
         problems = [(f"{take.name}: " if several else "") + why for take in takes if (why := motion_problem(
             take.motion, take.subject.template, result.layout, take.markers))]
         moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body))
-        own = self.covered.judgement().joined(moving, result.worn.judgement(self.usual.labels),
+        own = self.covered.judgement().joined(self.labelling, moving, result.worn.judgement(self.usual.labels),
                                               result.person.judgement(self.usual))
         return judge_motions(self.person, own, motions, body)
 
 
 def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     recordings, sequences, failures = list[Recording](), list[MarkerSequence](), list[str]()
+    labelling = list[Judgement]()
     for recording in actor.recordings:
         try:
-            sequences.append(read_markers(recording.path, work.unit, recording.who, work.rate))
+            if work.unlabelled:
+                assert work.layout is not None, "the command asks for one"
+                file = label_first(room, recording.name, recording.path, work.model, work.layout[0], work.unit,
+                                     work.rate)
+                labelling.append(Judgement.of(
+                    check=[f"labels of {recording.name}: {why}" for why in file.judgement.reasons]))
+                recording = replace(recording, path=file.path)
+                sequences.append(read_markers(file.path, file.unit, None, file.rate))
+            else:
+                sequences.append(read_markers(recording.path, work.unit, recording.who, work.rate))
             recordings.append(recording)
         except ValueError as error:
             failures.append(" ".join(str(error).split()))
@@ -182,7 +195,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
         takes.append(Take(source, work.unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
                           held, light))
-    return _Found(model, guess, result, takes, usual, layout_name), failures
+    return _Found(model, guess, result, takes, usual, layout_name, Judgement().joined(*labelling)), failures
 
 
 def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]
