@@ -15,6 +15,7 @@ from .body_search import BodySearch, Placement, assign
 from .follow_points import OWN_PERSON
 from .label import FEWEST, FOUND
 
+STEPS = 2                            # of the solution of a frame, which begins where it is expected; 3 label alike
 PLACE_SD = 0.025                     # metres that a point lies from where the body is expected to have its marker
 TRACK_SD = 0.008                     # metres, and from where constant velocity has its point; 0.6 mm at 120 Hz, 7 at 30
 ACCELERATION = 15.0                  # m/s² that the latter may miss besides, half of it over the squared frame time
@@ -87,7 +88,7 @@ class LabelStream:
         config = AnimateConfig()
         self.body = MarkedBody(subject, layout, config.prior_weight, config.prior_shrinkage)
         self.search, self.rate = BodySearch(self.body, subject), rate
-        self.tracker = Tracker(self.body, config, rate)
+        self.tracker = Tracker(self.body, config, rate, STEPS)
         L = self.body.count
         self.last, self.velocity = np.full((L, 3), np.nan), np.zeros((L, 3))
         self.age = np.full(L, np.inf)                                   # frames since each marker had a point
