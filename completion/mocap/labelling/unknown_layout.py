@@ -1,0 +1,302 @@
+"""A layout that is not known: where on the body each track of a recording sits."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from model.body import BodyModel
+from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.surface import Surface
+from scanprep.judgement import Judgement
+from scanprep.threads import one_thread
+
+from ...motion import Progress
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import DISTANCE, MarkerLayout
+from ..marker_sets.named import choose_layout, layout_names
+from ..subject.frame_starts import mean_person, stand_off
+from ..subject.latent_fit import PersonConfig
+from ..subject.person import PersonFit, find_person, spread_frames
+from .body_search import OTHERS, UPS, BodySearch, Placement, match_points
+from .tracks import has_tracks, link_points
+
+SKIN = 250                           # points of the skin among which a body is sought: 9 cm apart
+STARTS = 5                           # frames in which it is sought
+TRIED = 4                            # of what was found there, that are followed through other frames
+# of the person and the places together: more frames than usual and poses hardly held, since the motions of a recording
+# are not the prior's: of 88 simulated markers 60% were within 15 mm, 48% with twelve frames and usual weights
+CLOSER = PersonConfig(frames=24, pose=0.02)
+ROUNDS = 5                           # each holds the places to those of the one before; 2 left 4 mm more
+NAMED = 2                            # rounds in which markers that a usual set has are held to its places
+WORSE = 1.15                         # ratio of what is left above which a usual set is not the one that is worn
+LIKE = 0.06                          # metres from the place of a usual set within which a marker may be its
+SHARE = 0.75                         # of the markers that a usual set has to explain
+LONG = 0.3                           # share of the frames that a track has to have
+FEWEST = 10                          # tracks
+REACH = (0.0, 0.04)                  # metres that a marker may be off the skin
+OUTLIER = 0.06                       # metres beyond which it does not matter how far a track is from a place
+LEFT_OUT = 0.035                     # metres, median distance from its place on which a track is no marker
+SAME = 0.025                         # metres between the places of two tracks, never seen together, that are one marker
+LIKE_NEXT = 1.15                     # ratio of what the next best body leaves, below which they cannot be told apart
+# metres that a place is uncertain by, beside what its residuals tell: of a marker of a usual set, and of another
+UNCERTAIN = 0.006, 0.020
+
+
+@dataclass(frozen=True, eq=False)
+class FoundLayout:
+    """Where the markers of a recording sit.
+
+    Attributes
+    ----------
+    layout : MarkerLayout
+        A marker for each track, or for several that are one, with a name by anatomy: that of a usual set where one
+        explains the markers, else of the part and a number.
+    tracks : dict
+        Label -> the labels of the tracks that it was found from.
+    uncertainty : (L,) float, metres
+        Expected distance of each place, along the skin, from the true one.
+    left_out : dict
+        Label of a track -> why it is no marker.
+    person : PersonFit
+    margin : float
+        What the next best body leaves, over what this one does.
+    """
+
+    layout: MarkerLayout
+    tracks: dict[str, tuple[str, ...]]
+    uncertainty: np.ndarray
+    left_out: dict[str, str]
+    person: PersonFit
+    margin: float
+
+    @property
+    def judgement(self) -> Judgement:
+        """What the layout is worth."""
+        bad, check = [], []
+        if self.person.residual > 0.02:
+            bad.append(f"the tracks lie {1000 * self.person.residual:.0f} mm from the body: no person, or several?")
+        if self.margin < LIKE_NEXT:
+            check.append("another pose explains the tracks nearly as well: left and right, or front and back, may be "
+                         "exchanged")
+        if (self.uncertainty > 0.03).mean() > 0.2:
+            check.append("the person hardly moves in the recording: places are uncertain by more than 3 cm")
+        if self.left_out:
+            check.append(f"{len(self.left_out)} tracks are no markers of this body: {', '.join(self.left_out)}")
+        return Judgement.of(bad, check)
+
+
+@one_thread()
+def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | None = None) -> FoundLayout:
+    """Where on the skin each track of a recording sits, of a person and a layout that are both unknown.
+
+    In a few frames the body is sought whose skin passes below all points; a point sits where it is nearest. Of these
+    bodies the one is taken on whose skin the tracks keep their places in other frames, too. Then places, person and
+    poses tell each other in turn.
+
+    Parameters
+    ----------
+    model : BodyModel
+        With betas.
+    points : MarkerSequence
+        Tracks of one person; broken ones are joined as far as their motion tells.
+    progress : callable, optional
+        Called with (done, total).
+
+    Raises
+    ------
+    ValueError
+        A model without betas, fewer than ten tracks, no body that fits them.
+    """
+    if not model.n_betas:
+        raise ValueError("model: expected one with betas, this one knows its template's body only")
+    tell = progress or (lambda done, total: None)
+    tracks = long_tracks(points)
+    total = STARTS + TRIED + ROUNDS
+
+    # bodies whose skin passes below all points of a frame
+    starts = _search_skin(model, tracks, lambda done: tell(done, total))
+    # the one on whose skin the tracks keep their places
+    tried = list[tuple[float, PersonFit]]()
+    for i, (t, placement) in enumerate(starts):
+        fit = find_person(model, tracks, _layout_below(model, tracks, t, placement))
+        tried.append((_cost(fit), fit))
+        tell(STARTS + i + 1, total)
+    tried.sort(key=lambda one: one[0])
+    best, fit = tried[0]
+
+    margin = min([cost for cost, _ in tried[1:]], default=np.inf) / best
+
+    # places by the body in all its frames, then both together, from where they were before
+    fit = find_person(model, tracks, _best_places(model, fit, tracks))
+    for i in range(ROUNDS):
+        fit = find_person(model, tracks, replace(fit.layout, loose=()), CLOSER)
+        tell(STARTS + TRIED + i + 1, total)
+    # markers of a usual set are where it has them, as far as the tracks allow
+    usual, labels = name_markers(model, fit.layout)
+    for _ in range(NAMED if usual else 0):
+        snapped = find_person(model, tracks, _snap(fit.layout, labels, usual), CLOSER)
+        if _cost(snapped) > WORSE * _cost(fit):
+            break
+        fit = snapped
+        usual, labels = name_markers(model, fit.layout)
+    return _collect(model, tracks, fit, margin)
+
+
+def name_markers(model: BodyModel, layout: MarkerLayout) -> tuple[MarkerLayout | None, dict[str, str]]:
+    """The usual set that explains most markers of a layout, none if it is below `SHARE`, and label -> label in it."""
+    places = layout.skin_points(model.template.vertices)
+    best: tuple[float, MarkerLayout | None, dict[str, str]] = (SHARE * len(layout.labels), None, {})
+    for name in layout_names():
+        try:
+            usual, _ = choose_layout(model, name, ())
+        except ValueError:                                              # not known on this model's triangles
+            return None, {}
+        apart = np.linalg.norm(places[:, None] - usual.skin_points(model.template.vertices), axis=2)
+        rows, columns = linear_sum_assignment(np.minimum(apart, LIKE)**2)
+        near = apart[rows, columns] < LIKE
+        # a nearer set counts more, a larger one only as far as it is worn
+        score = float((1 - (apart[rows, columns][near] / LIKE)**2 / 2).sum()) - 0.1 * (len(usual.labels) - near.sum())
+        if near.sum() >= SHARE * len(layout.labels) and score > best[0] * (best[1] is not None):
+            best = score, usual, {layout.labels[r]: usual.labels[c]
+                                  for r, c in zip(rows[near], columns[near], strict=True)}
+    return best[1], best[2]
+
+
+def _snap(layout: MarkerLayout, labels: dict[str, str], usual: MarkerLayout) -> MarkerLayout:
+    """A layout with the markers that have a label of a usual set where that has them."""
+    rest = [label for label in layout.labels if label not in labels]
+    order = [usual.labels.index(labels[label]) for label in layout.labels if label in labels]
+    vertices, weights = usual.skin
+    moved = MarkerLayout(tuple(label for label in layout.labels if label in labels), vertices[order],
+                         np.asarray(usual.distances)[order], weights=weights[order])
+    return moved.joined(layout.select(rest)) if rest else moved
+
+
+def long_tracks(points: MarkerSequence) -> MarkerSequence:
+    """The tracks of a recording that are seen long enough: its columns, or pieces that its points were joined to."""
+    if not has_tracks(points.positions, points.rate):
+        number = link_points(points.positions, points.rate)
+        frames, columns = np.nonzero(number >= 0)
+        which = number[frames, columns]
+        counts = np.bincount(which, minlength=number.max() + 1)
+        kept = np.flatnonzero(counts >= LONG * len(number))
+        if len(kept) < FEWEST:
+            raise ValueError(f"points: expected at least {FEWEST} tracks that are seen in {100 * LONG:.0f}% of the "
+                             f"frames, found {len(kept)}; without tracks a layout has to be given")
+        series = np.full((len(number), len(kept), 3), np.nan)
+        place = np.full(number.max() + 1, -1)
+        place[kept] = np.arange(len(kept))
+        mine = place[which] >= 0
+        series[frames[mine], place[which[mine]]] = points.positions[frames[mine], columns[mine]]
+        return MarkerSequence(series, tuple(f"track{k}" for k in kept), points.rate)
+    long = points.seen.mean(axis=0) >= LONG
+    if long.sum() < FEWEST:
+        raise ValueError(f"points: expected at least {FEWEST} tracks that are seen in {100 * LONG:.0f}% of the frames, "
+                         f"found {int(long.sum())}")
+    return points.select([label for label, is_long in zip(points.labels, long, strict=True) if is_long])
+
+
+def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int], None]
+                 ) -> list[tuple[int, Placement]]:
+    """Frames, and bodies whose skin passes below the points there, the best first."""
+    vertices = farthest_points(model.template.vertices, SKIN)
+    skin = MarkerLayout(tuple(f"skin{v}" for v in vertices), vertices)
+    subject = model.subject()
+    search = BodySearch(mean_person(subject, skin), subject)
+    full = np.flatnonzero(tracks.seen.sum(axis=1) >= 0.9 * tracks.seen.sum(axis=1).max())
+    frames = full[spread_frames(tracks.positions[full], STARTS)]
+    found = []
+    for i, t in enumerate(frames):
+        visible = tracks.positions[t, tracks.seen[t]]
+        for axis in (*UPS, *OTHERS[:2]):
+            placement = search.find(visible, (axis,))
+            # what counts is how far the points are from the skin, not which skin has points
+            matches, _ = match_points(search.body.positions(placement.x), visible, OUTLIER)
+            at = search.body.positions(placement.x)[matches >= 0]
+            off = np.linalg.norm(at - visible[matches[matches >= 0]], axis=1)
+            cost = float(np.minimum(off, OUTLIER).sum() + OUTLIER * (len(visible) - len(off))) / len(visible)
+            found.append((cost, int(t), placement))
+        tell(i + 1)
+    found.sort(key=lambda one: one[0])
+    return [(t, placement) for _, t, placement in found[:TRIED]]
+
+
+def _layout_below(model: BodyModel, tracks: MarkerSequence, t: int, placement: Placement) -> MarkerLayout:
+    """The layout of the tracks that are seen in a frame, each where the skin of a body is nearest there."""
+    subject = model.subject()
+    n = 3 * len(subject.skeleton.parents)
+    posed = subject.vertices(placement.x[None, :n].reshape(1, -1, 3), placement.x[None, n:n + 3])[0]
+    seen = np.flatnonzero(tracks.seen[t])
+    found = Surface(model.template.with_vertices(posed)).closest(tracks.positions[t, seen])
+    labels = tuple(tracks.labels[i] for i in seen)
+    nearest = model.template.faces[found.faces][np.arange(len(seen)), found.bary.argmax(axis=1)]
+    return MarkerLayout(labels, nearest, loose=labels)
+
+
+def _best_places(model: BodyModel, fit: PersonFit, tracks: MarkerSequence) -> MarkerLayout:
+    """The layout of all tracks, each where it keeps its place best on the skin of a person in the frames of its fit."""
+    subject, frames = model.subject(fit.betas), fit.frames[:, 1]
+    vertices = subject.vertices(fit.poses, fit.trans)
+    normals = np.stack([model.template.with_vertices(v).vertex_normals for v in vertices])
+    places, distances = [], []
+    for column in range(len(tracks.labels)):
+        targets = tracks.positions[frames, column]
+        seen = np.isfinite(targets[:, 0])
+        if not seen.any():
+            places.append(-1)
+            distances.append(DISTANCE)
+            continue
+        off, lift = stand_off(targets[seen], vertices[seen], normals[seen], *REACH)
+        best = int(np.minimum(off**2, OUTLIER**2).mean(axis=0).argmin())
+        places.append(best)
+        distances.append(float(lift[best]))
+    there = np.array(places) >= 0
+    labels = tuple(label for label, is_there in zip(tracks.labels, there, strict=True) if is_there)
+    return MarkerLayout(labels, np.array(places)[there], np.array(distances)[there], loose=labels)
+
+
+def _cost(fit: PersonFit) -> float:
+    """What a fit leaves: the mean distance of markers, metres, at most `OUTLIER` each."""
+    return float(np.nanmean(np.minimum(fit.residuals, OUTLIER)))
+
+
+def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: float) -> FoundLayout:
+    """The result: tracks that are no markers left out, those that are one marker joined."""
+    left_out, kept = {}, []
+    for row, label in enumerate(fit.layout.labels):
+        off = float(np.nanmedian(fit.residuals[:, row]))
+        if off > LEFT_OUT:
+            left_out[label] = f"{1000 * off:.0f} mm from the body"
+        else:
+            kept.append(label)
+    left_out |= {label: "not seen with the others" for label in tracks.labels if label not in fit.layout.labels}
+    layout = fit.layout.select(kept)
+    places = layout.skin_points(model.subject(fit.betas).template.vertices)
+    seen = tracks.select(kept).seen
+    groups: dict[str, list[str]] = {}
+    for row, label in enumerate(kept):
+        other = next((first for first in groups if np.linalg.norm(
+            places[kept.index(first)] - places[row]) < SAME and not (seen[:, kept.index(first)] & seen[:, row]).any()),
+            None)
+        groups.setdefault(label if other is None else other, []).append(label)
+    layout = replace(layout.select(list(groups)), loose=())
+    rows = [fit.layout.labels.index(label) for label in layout.labels]
+    spread = np.sqrt(np.nanmean(fit.residuals[:, rows]**2, axis=0))
+    _, usual = name_markers(model, layout)
+    uncertainty = np.where([label in usual for label in layout.labels], *UNCERTAIN) + spread
+    names = suggest_names(model, layout, usual)
+    return FoundLayout(replace(layout, labels=names), dict(zip(names, map(tuple, groups.values()), strict=True)),
+                       uncertainty, left_out, fit, margin)
+
+
+def suggest_names(model: BodyModel, layout: MarkerLayout, usual: dict[str, str]) -> tuple[str, ...]:
+    """Names of markers by anatomy: those of a usual set, label -> label, else the part and a number."""
+    parts = model.skeleton.part_of_vertex(model.template)[layout.nearest]
+    names, counts = list[str](), dict[int, int]()
+    for label, part in zip(layout.labels, parts.tolist(), strict=True):
+        counts[part] = counts.get(part, 0) + (label not in usual)
+        names.append(usual.get(label, f"{model.skeleton.names[part]}{counts[part]}"))
+    return tuple(names)
