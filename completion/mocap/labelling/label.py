@@ -29,6 +29,9 @@ from .tracks import link_points
 UNKNOWN, GHOST = -1, -2              # in labels that are known: nothing is, and: this point is no marker
 FEWEST = 10                          # points in a frame, of which no body can be told otherwise
 STARTS = 5                           # frames in which the body is sought
+LYING = 2                            # of them, in which it is sought lying or upside down, if it stands nowhere
+# metres that half of a frame's points are from their middle at least and at most: 0.4 to 0.6 of one person
+SPREAD = 0.1, 5.0
 FOUND = 0.3                          # misfit of a frame above which no body was found; right ones had at most 0.18
 # metres from its place that a marker lies at least, in each direction, of the three passes at last
 DEVIATIONS = (0.03, 0.02, 0.012)
@@ -278,8 +281,8 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
         frames, groups = separate_people(points[full], len(searches))
         frames = full[frames]
     tried = list[tuple[int, list[Placement]]]()
-    for axes in (UPS, OTHERS):
-        for i, (t, group) in enumerate(zip(frames, groups, strict=True)):
+    for axes, count in ((UPS, len(frames)), (OTHERS, LYING)):
+        for i, (t, group) in enumerate(zip(frames[:count], groups[:count], strict=True)):
             tried.append((int(t), [search.find(some, axes) for search, some in zip(searches, group, strict=True)]))
             tell(i + 1)
         best = min(tried, key=lambda one: max(placement.misfit for placement in one[1]))
@@ -287,8 +290,8 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
         if worst < FOUND:
             return best
     raise ValueError(f"points: no body with these markers was found in frames {', '.join(map(str, frames))}: the best "
-                     f"leaves {worst:.2f}, expected below {FOUND}; another layout, several people, or metres "
-                     "taken for millimetres?")
+                     f"leaves {worst:.2f}, expected below {FOUND}; another layout, or several "
+                     "people?")
 
 
 def _checked(known: np.ndarray | None, points: MarkerSequence, count: int) -> np.ndarray:
@@ -301,6 +304,11 @@ def _checked(known: np.ndarray | None, points: MarkerSequence, count: int) -> np
     if known.shape != shape or known.max(initial=-1) >= count or known.min(initial=-1) < GHOST:
         raise ValueError(f"known: expected {shape} rows of the layout below {count}, {UNKNOWN} or {GHOST}, got "
                          f"{known.shape} from {known.min(initial=-1)} to {known.max(initial=-1)}")
+    spread = points.positions - np.nanmedian(points.positions, axis=1, keepdims=True)
+    half = float(np.nanmedian(np.linalg.norm(spread, axis=2)))
+    if not SPREAD[0] < half < SPREAD[1]:
+        raise ValueError(f"points: expected those of a person, half of them within {SPREAD[1]:g} m and not within "
+                         f"{SPREAD[0]:g} m of their middle, found {half:.3g} m; metres taken for millimetres?")
     return known
 
 

@@ -25,14 +25,15 @@ from .tracks import has_tracks, link_points
 
 SKIN = 250                           # points of the skin among which a body is sought: 9 cm apart
 STARTS = 5                           # frames in which it is sought
+BELOW = 0.025                        # metres from the skin, mean of the points, at which no other axis is tried
 TRIED = 4                            # of what was found there, that are followed through other frames
 # of the person and the places together: more frames than usual and poses hardly held, since the motions of a recording
 # are not the prior's: of 88 simulated markers 60% were within 15 mm, 48% with twelve frames and usual weights
 CLOSER = PersonConfig(frames=24, pose=0.02)
 ROUNDS = 5                           # each holds the places to those of the one before; 2 left 4 mm more
-NAMED = 2                            # rounds in which markers that a usual set has are held to its places
+NAMED = 4                            # rounds in which markers that a usual set has are held to its places
 WORSE = 1.15                         # ratio of what is left above which a usual set is not the one that is worn
-LIKE = 0.06                          # metres from the place of a usual set within which a marker may be its
+LIKE = 0.10                          # metres from the place of a usual set within which a marker may be its
 SHARE = 0.75                         # of the markers that a usual set has to explain
 LONG = 0.3                           # share of the frames that a track has to have
 FEWEST = 10                          # tracks
@@ -42,7 +43,7 @@ LEFT_OUT = 0.035                     # metres, median distance from its place on
 SAME = 0.025                         # metres between the places of two tracks, never seen together, that are one marker
 LIKE_NEXT = 1.15                     # ratio of what the next best body leaves, below which they cannot be told apart
 # metres that a place is uncertain by, beside what its residuals tell: of a marker of a usual set, and of another
-UNCERTAIN = 0.006, 0.020
+UNCERTAIN = 0.009, 0.025
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +128,7 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
     tried.sort(key=lambda one: one[0])
     best, fit = tried[0]
 
-    margin = min([cost for cost, _ in tried[1:]], default=np.inf) / best
+    margin = min([cost for cost, other in tried[1:] if _differs(model, fit, other)], default=np.inf) / best
 
     # places by the body in all its frames, then both together, from where they were before
     fit = find_person(model, tracks, _best_places(model, fit, tracks))
@@ -135,14 +136,16 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
         fit = find_person(model, tracks, replace(fit.layout, loose=()), CLOSER)
         tell(STARTS + TRIED + i + 1, total)
     # markers of a usual set are where it has them, as far as the tracks allow
-    usual, labels = name_markers(model, fit.layout)
-    for _ in range(NAMED if usual else 0):
-        snapped = find_person(model, tracks, _snap(fit.layout, labels, usual), CLOSER)
-        if _cost(snapped) > WORSE * _cost(fit):
-            break
-        fit = snapped
+    named, free = dict[str, str](), fit
+    for _ in range(NAMED):
         usual, labels = name_markers(model, fit.layout)
-    return _collect(model, tracks, fit, margin)
+        if usual is None:
+            break
+        snapped = find_person(model, tracks, _snap(fit.layout, labels, usual), CLOSER)
+        if _cost(snapped) > WORSE * _cost(free):
+            break
+        fit, named = snapped, labels
+    return _collect(model, tracks, fit, margin, named)
 
 
 def name_markers(model: BodyModel, layout: MarkerLayout) -> tuple[MarkerLayout | None, dict[str, str]]:
@@ -158,7 +161,7 @@ def name_markers(model: BodyModel, layout: MarkerLayout) -> tuple[MarkerLayout |
         rows, columns = linear_sum_assignment(np.minimum(apart, LIKE)**2)
         near = apart[rows, columns] < LIKE
         # a nearer set counts more, a larger one only as far as it is worn
-        score = float((1 - (apart[rows, columns][near] / LIKE)**2 / 2).sum()) - 0.1 * (len(usual.labels) - near.sum())
+        score = float((1 - (apart[rows, columns][near] / LIKE)**2 / 2).sum()) - 0.3 * (len(usual.labels) - near.sum())
         if near.sum() >= SHARE * len(layout.labels) and score > best[0] * (best[1] is not None):
             best = score, usual, {layout.labels[r]: usual.labels[c]
                                   for r, c in zip(rows[near], columns[near], strict=True)}
@@ -219,6 +222,8 @@ def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int],
             off = np.linalg.norm(at - visible[matches[matches >= 0]], axis=1)
             cost = float(np.minimum(off, OUTLIER).sum() + OUTLIER * (len(visible) - len(off))) / len(visible)
             found.append((cost, int(t), placement))
+            if cost < BELOW:
+                break
         tell(i + 1)
     found.sort(key=lambda one: one[0])
     return [(t, placement) for _, t, placement in found[:TRIED]]
@@ -263,7 +268,15 @@ def _cost(fit: PersonFit) -> float:
     return float(np.nanmean(np.minimum(fit.residuals, OUTLIER)))
 
 
-def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: float) -> FoundLayout:
+def _differs(model: BodyModel, one: PersonFit, other: PersonFit) -> bool:
+    """Whether two fits have the tracks at other places of the body."""
+    both = [label for label in one.layout.labels if label in other.layout.labels]
+    places = [fit.layout.select(both).skin_points(model.template.vertices) for fit in (one, other)]
+    return bool(np.median(np.linalg.norm(places[0] - places[1], axis=1)) > LIKE)
+
+
+def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: float, usual: dict[str, str]
+             ) -> FoundLayout:
     """The result: tracks that are no markers left out, those that are one marker joined."""
     left_out, kept = {}, []
     for row, label in enumerate(fit.layout.labels):
@@ -285,7 +298,6 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
     layout = replace(layout.select(list(groups)), loose=())
     rows = [fit.layout.labels.index(label) for label in layout.labels]
     spread = np.sqrt(np.nanmean(fit.residuals[:, rows]**2, axis=0))
-    _, usual = name_markers(model, layout)
     uncertainty = np.where([label in usual for label in layout.labels], *UNCERTAIN) + spread
     names = suggest_names(model, layout, usual)
     return FoundLayout(replace(layout, labels=names), dict(zip(names, map(tuple, groups.values()), strict=True)),

@@ -83,7 +83,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     if model is not None and body is not None:
         raise UsageError("--model and --body: expected one of them")
     shown, skeleton, kept, name = _body(model, body, unit)
-    found = read_layout(layout, shown, kept)
+    found = read_layout(layout, shown, kept, skeleton)
     figures = _figures(found, shown)
     picture = picture_layout(shown, found)
     output.mkdir(parents=True, exist_ok=True)

@@ -16,9 +16,11 @@ from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import size
+from scanprep.skeleton.tree import Skeleton
 
 from ..files.text import MarkerFileError
 from .layout import MarkerLayout
+from .opensim import opensim_places
 
 FEWEST = 3                           # labels by which a marker set is known
 FOLDER = Path(__file__).parent / "layouts"
@@ -116,11 +118,14 @@ def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[s
     of_people = None if kept is None else np.array(kept)
     if given is None:
         return fitting_layout(labels, model.template, of_people)
-    return read_layout(given, model.template, of_people).spelled(labels), str(given)
+    return read_layout(given, model.template, of_people, model.skeleton).spelled(labels), str(given)
 
 
-def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None, skeleton: Skeleton | None = None
+                ) -> MarkerLayout:
     """The layout for a body that is named, or in a file: a layout, or places that were clicked on the template.
+
+    With the skeleton of the template also a marker set of OpenSim (.xml), or a model with one (.osim).
 
     Such as `scape pick` saves; MarkerFileError for places that are not on the template.
 
@@ -129,6 +134,8 @@ def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = Non
     named = layout_or_file(given)
     if isinstance(named, str):
         return named_layout(named, template, kept)
+    if named.suffix.lower() in (".xml", ".osim") and skeleton is not None:
+        return layout_on(template, opensim_places(named, template, skeleton))[0]
     clicked = named.suffix.lower() != ".json" or named.name.endswith(".mrk.json")
     if not clicked:                      # landmarks are JSON as well
         tree = storage.read_json(named, "a marker layout", MarkerFileError)

@@ -2,18 +2,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
 from model.export.names import names_of
+from scanprep.geometry import storage
+from scanprep.geometry.format_common import MeshFileError
+from scanprep.geometry.landmark_reading import read_marker_set
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import stance
 from scanprep.skeleton.tree import Skeleton
 
 from ..files.text import MarkerFileError
 from .layout import MarkerLayout
-from .named import layout_on
 from .symmetry import label_pairs
 
 _LIMBS = {"humerus": "ulna", "ulna": "hand", "femur": "tibia", "tibia": "calcn"}      # y of each points back from these
@@ -61,10 +62,11 @@ def opensim_markers(layout: MarkerLayout, body: Mesh, skeleton: Skeleton) -> dic
     return found
 
 
-def opensim_layout(path: Path, body: Mesh, skeleton: Skeleton) -> MarkerLayout:
-    """The layout of a marker set or model of OpenSim (.xml, .osim) on a body at rest, as near as its frames are known.
+def opensim_places(path: Path, body: Mesh, skeleton: Skeleton) -> dict[str, np.ndarray]:
+    """Name -> place (3,), metres, of the markers of a marker set or model of OpenSim (.xml, .osim) on a body at rest.
 
-    What is left, some centimetres, `find_person` finds; the limbs' markers are laid along the limb as its length says.
+    As near as the frames are known: limbs are as long as ours, the trunk as high. What is left, some centimetres,
+    `find_person` finds.
 
     Parameters
     ----------
@@ -76,31 +78,27 @@ def opensim_layout(path: Path, body: Mesh, skeleton: Skeleton) -> MarkerLayout:
     Raises
     ------
     MarkerFileError
-        Not XML, no markers, a marker on a body that is not known.
+        No marker set, no markers, a marker on a body that is not known.
     """
     try:
-        tree = ElementTree.parse(path)
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise MarkerFileError(f"{path}: expected XML of OpenSim ({error})") from None
+        markers = read_marker_set(path, storage.read_bytes(path, "a marker set of OpenSim", MarkerFileError))
+    except MeshFileError as error:
+        raise MarkerFileError(str(error)) from None
+    if not markers:
+        raise MarkerFileError(f"{path}: expected markers of OpenSim, found none")
     joints = {name: skeleton.joints[skeleton.names.index(part)] for part, name in names_of(skeleton, "opensim").items()
               if name not in _WITH}
     vertical, ahead = stance(body)
     frames = _frames(joints, vertical, ahead)
     scale = float(np.linalg.norm(joints["femur_l"] - joints["femur_r"])) / 0.167
     places = {}
-    for marker in tree.iter("Marker"):
-        name, text = marker.get("name", ""), (marker.findtext("location") or "").split()
-        frame = (marker.findtext("socket_parent_frame") or marker.findtext("body") or "").rpartition("/")[2]
+    for name, (frame, place) in markers.items():
         kind, _, side = frame.partition("_")
         kind, begin = _SAME.get(kind, (kind, (0.0, 0.0, 0.0)))
         carrier = f"{kind}_{side}" if side else kind
-        if carrier not in frames or len(text) != 3:
-            raise MarkerFileError(f"{path}: marker '{name}': expected a location of three numbers on one of "
-                                  f"{', '.join(sorted(frames))}, found '{' '.join(text)}' on '{frame}'")
-        try:
-            place = np.array([float(word) for word in text])
-        except ValueError:
-            raise MarkerFileError(f"{path}: marker '{name}': expected numbers, found '{' '.join(text)}'") from None
+        if carrier not in frames:
+            raise MarkerFileError(f"{path}: marker '{name}': expected one on {', '.join(sorted(frames))}, found it on "
+                                  f"'{frame}'")
         # z is right in all bodies of OpenSim
         place = scale * (place + begin * np.array([1.0, 1.0, -1.0 if side == "l" else 1.0]))
         below = f"{_LIMBS.get(kind)}_{side}"
@@ -111,9 +109,7 @@ def opensim_layout(path: Path, body: Mesh, skeleton: Skeleton) -> MarkerLayout:
             place[1] *= float(vertical @ (shoulders - frames["torso"][0])) / (_TORSO * scale)
         origin, axes = frames[carrier]
         places[name] = origin + axes @ place
-    if not places:
-        raise MarkerFileError(f"{path}: expected markers of OpenSim, found none")
-    return layout_on(body, places)[0]
+    return places
 
 
 def _frames(joints: dict[str, np.ndarray], vertical: np.ndarray, ahead: np.ndarray
