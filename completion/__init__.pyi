@@ -12,6 +12,12 @@ from .mocap.files.markers import (
 )
 from .mocap.files.motion_files import joint_angles as joint_angles
 from .mocap.files.motion_files import joint_centres as joint_centres
+from .mocap.labelling.label import LabelledMarkers as LabelledMarkers
+from .mocap.labelling.label import label_markers as label_markers
+from .mocap.labelling.label import label_people as label_people
+from .mocap.labelling.stream import LabelStream as LabelStream
+from .mocap.labelling.unknown_layout import FoundLayout as FoundLayout
+from .mocap.labelling.unknown_layout import find_layout as find_layout
 from .mocap.marker_selection.candidates import candidate_layout as candidate_layout
 from .mocap.marker_selection.design import MarkerDesign as MarkerDesign
 from .mocap.marker_selection.design import design_markers as design_markers

@@ -3,6 +3,7 @@ import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 from urllib.parse import quote
@@ -10,7 +11,7 @@ from urllib.request import urlopen
 
 import numpy as np
 
-from completion import Motion
+from completion import Motion, read_markers, write_markers
 from completion.__main__ import main
 from model import load_model, write_body_npz
 from scanprep import RegisteredSet, write_mesh
@@ -78,6 +79,8 @@ def user_folder(demo, folder):
                            ("half_view/half_view.landmarks.json", "half_view.landmarks.json"),
                            ("markers/layout.json", "layout.json")):
         shutil.copy(demo / source, folder / target)
+    walk = read_markers(folder / "walk.c3d")
+    write_markers(folder / "raw.c3d", replace(walk, labels=tuple(f"*{i}" for i in range(len(walk.labels)))))
     shutil.copy(demo / "scans" / f"{mine[0].split(',')[0]}.ply", folder / "standing.ply")
     shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
     cameras = {}

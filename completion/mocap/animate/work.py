@@ -90,8 +90,8 @@ class Work:
         """The motion of the markers of a file."""
         labelling = Judgement()
         if self.unlabelled:
-            worn, _ = choose_layout(self.model, self.layout, ())
-            file = label_first(room, "", path, self.subject or self.model, worn, self.unit, self.rate)
+            usual, _ = choose_layout(self.model, self.layout, ())
+            file = label_first(room, "", path, self.subject or self.model, usual, self.unit, self.rate)
             sequence, labelling = named_only(read_markers(file.path, file.unit, None, file.rate)), file.judgement
         else:
             sequence = read_markers(path, self.unit, self.who, self.rate)

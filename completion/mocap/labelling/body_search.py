@@ -97,7 +97,9 @@ class BodySearch:
 
     def __init__(self, body: MarkedBody, subject: Subject) -> None:
         self.body = body
-        typical = typical_poses(subject.pose_mean, subject.pose_covariance, axes=6)
+        fixed = body.body
+        assert fixed.pose_mean is not None and fixed.pose_covariance is not None, "a marked body has a pose prior"
+        typical = typical_poses(fixed.pose_mean, fixed.pose_covariance, axes=6)
         people = human_poses(subject.template, subject.skeleton, POSES, np.random.default_rng(0))
         self.poses = typical if people is None else np.concatenate([typical, people])
         self.limbs = limb_trees(subject.skeleton)

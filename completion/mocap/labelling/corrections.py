@@ -94,9 +94,9 @@ def read_corrections(path: Path, tracks: np.ndarray, names: Sequence[str]) -> np
                                f"recording of {len(tracks)} frames has none there; was the table made from another?")
         known[here] = names.index(label) if label else GHOST
     # one label twice in a frame cannot be
-    for row in range(len(names)):
-        twice = np.flatnonzero((known == row).sum(axis=1) > 1)
+    for marker, name in enumerate(names):
+        twice = np.flatnonzero((known == marker).sum(axis=1) > 1)
         if len(twice):
-            raise StorageError(f"{path}: expected each label once in a frame, {names[row]} is fixed for two points in "
+            raise StorageError(f"{path}: expected each label once in a frame, {name} is fixed for two points in "
                                f"frame {twice[0]}")
     return known

@@ -134,20 +134,20 @@ def solve_again(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], found:
     All key frames are solved together; limbs are sought anew where the body fits worse than it usually does.
     """
     solver = _KeyFrameSolver(searches, OWN_PERSON)
-    some = [i for i, solutions in enumerate(found) if solutions is not None]
-    before = [tuple(replace(one, off=np.zeros_like(one.off)) for one in found[i]) for i in some]
+    solved = {i: solutions for i, solutions in enumerate(found) if solutions is not None}
+    some = list(solved)
+    before = [tuple(replace(one, off=np.zeros_like(one.off)) for one in solved[i]) for i in some]
     held = [[{int(track): int(labels[track]) - first for track in keys[i].tracks if first <= labels[track] < end}
              for first, end in solver.rows] for i in some]
-    again: list[Solutions | None] = [None for _ in keys]
-    for i, solutions in zip(some, solver.carry(before, held, [keys[i] for i in some]), strict=True):
-        again[i] = solutions
+    now = dict(zip(some, solver.carry(before, held, [keys[i] for i in some]), strict=True))
     for k in range(len(searches)):
-        usual, last = float(np.median([again[i][k].strain for i in some])) if some else 0.0, -np.inf
+        usual, last = float(np.median([now[i][k].strain for i in some])) if some else 0.0, -np.inf
         for i in some:
-            taken = sum(int((one.matches >= 0).sum()) for one in again[i])
-            lone = min((again[i][k].matches < 0).sum(), len(keys[i].points) - taken)
-            if again[i][k].strain > usual + BETTER or (lone >= LONE and (i - last) * EVERY >= WAIT):
-                again[i], last = solver.start_anew(again[i], k, keys[i]), i
+            taken = sum(np.count_nonzero(one.matches >= 0) for one in now[i])
+            lone = min(np.count_nonzero(now[i][k].matches < 0), len(keys[i].points) - taken)
+            if now[i][k].strain > usual + BETTER or (lone >= LONE and (i - last) * EVERY >= WAIT):
+                now[i], last = solver.start_anew(now[i], k, keys[i]), i
+    again = [now.get(i) for i in range(len(keys))]
     solver.reconcile(keys, again)
     return again
 

@@ -157,7 +157,6 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     tracks = link_points(at, rate)
 
     # key frames, from one in which the bodies are found: mean people, or those who are known
-    unknown = [isinstance(model, BodyModel) for model, _ in people]
     bodies = [_Person.start(model, layout) for model, layout in people]
     searches = [BodySearch(body.marked, body.subject) for body in bodies]
     first, placements = find_start(searches, at, lambda done: tell(done, 4 * T))
@@ -169,8 +168,8 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     columns, found = _in_order(bodies, columns, keys, found)
 
     # the same by the people themselves
-    bodies = [_found(body, model, at, mine, rate) if is_unknown else body for body, (model, _), is_unknown, mine
-              in zip(bodies, people, unknown, _of_each(bodies, columns), strict=True)]
+    bodies = [body if isinstance(model, Subject) else _found(body, model, at, mine, rate)
+              for body, (model, _), mine in zip(bodies, people, _of_each(bodies, columns), strict=True)]
     searches = [BodySearch(body.marked, body.subject) for body in bodies]
     labels = label_of_track(columns, tracks)
     found = solve_again(searches, keys, found, labels)
@@ -183,11 +182,12 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
         changed = (columns != told).mean() > SAME
         told = columns
         for k, mine in enumerate(_of_each(bodies, columns)):
-            if unknown[k] and changed:
-                bodies[k] = _found(bodies[k], people[k][0], at, mine, rate)
-            bodies[k] = bodies[k].follow(at, mine, rate)
-        places = np.concatenate([body.places for body in bodies], axis=1)
-        turns = np.concatenate([body.turns for body in bodies], axis=1)
+            model = people[k][0]
+            if changed and not isinstance(model, Subject):
+                bodies[k] = _found(bodies[k], model, at, mine, rate)
+        moving = [body.follow(at, mine, rate) for body, mine in zip(bodies, _of_each(bodies, columns), strict=True)]
+        places = np.concatenate([one.places for one in moving], axis=1)
+        turns = np.concatenate([one.turns for one in moving], axis=1)
         # markers keep their places on these parts, wherever the fitted layout has them
         part = np.concatenate([body.part + 1000 * k for k, body in enumerate(bodies)])
         offsets, deviations = mean_offsets(at, columns, places, turns)
@@ -199,24 +199,21 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     unlabelled = points.seen.copy()
     frames, rows = np.nonzero(columns >= 0)
     unlabelled[frames, columns[frames, rows]] = False
-    return [LabelledMarkers(_sequence(at, mine, body.layout, rate), mine, certain, unlabelled, tracks, body.motion,
+    return [LabelledMarkers(_sequence(at, mine, body.layout, rate), mine, certain, unlabelled, tracks, one.motion,
                             body.subject, body.layout, body.fit)
-            for body, mine, certain in zip(bodies, _of_each(bodies, columns), _of_each(bodies, sure), strict=True)]
+            for body, one, mine, certain
+            in zip(bodies, moving, _of_each(bodies, columns), _of_each(bodies, sure), strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
 class _Person:
-    """A person, and what is known of it: markers on its body, its motion, places (T, L, 3) of markers in it, and the
-    rotations (T, L, 3, 3) of the parts that carry them."""
+    """A person, the usual layout, and markers on the body as far as they are known."""
 
     subject: Subject
     layout: MarkerLayout
     usual: MarkerLayout
     marked: MarkedBody
     fit: PersonFit | None = None
-    motion: Motion | None = None
-    places: np.ndarray | None = None
-    turns: np.ndarray | None = None
 
     @property
     def part(self) -> np.ndarray:
@@ -231,12 +228,21 @@ class _Person:
         subject = model.subject()
         return _Person(subject, layout, layout, mean_person(subject, layout))
 
-    def follow(self, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:
-        """With the motion by the labels that columns (T, L) give."""
+    def follow(self, points: np.ndarray, columns: np.ndarray, rate: float) -> _Moving:
+        """The motion by the labels that columns (T, L) give."""
         motion = animate(self.subject, _sequence(points, columns, self.layout, rate), self.layout, POSES)
         x = self.marked.body.join(motion.poses, motion.trans)
         turns = self.marked.shapes.rotations(np.swapaxes(motion.poses, 0, 1))[self.part]
-        return replace(self, motion=motion, places=self.marked.positions(x), turns=np.swapaxes(turns, 0, 1))
+        return _Moving(motion, self.marked.positions(x), np.swapaxes(turns, 0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Moving:
+    """A motion, places (T, L, 3) of markers in it, metres, and rotations (T, L, 3, 3) of the parts that carry them."""
+
+    motion: Motion
+    places: np.ndarray
+    turns: np.ndarray
 
 
 def _found(person: _Person, model: BodyModel, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:

@@ -95,7 +95,7 @@ class LabelledRecording:
         """The figures of the closing table."""
         there = self.columns >= 0
         points, sure = int(self.points.seen.sum()), self.confidence[there]
-        missing = [name for name, has in zip(self.names, there.any(axis=0), strict=True) if not has]
+        missing = [name for name, count in zip(self.names, there.sum(axis=0), strict=True) if not count]
         tracks = self.people[0].tracks
         return [judgement_row(self.judgement), Metric("points with a label", 100 * there.sum() / max(points, 1), "%"),
                 Metric("labels that are doubtful", 100 * float((sure < 0.9).mean()) if len(sure) else 100.0, "%"),

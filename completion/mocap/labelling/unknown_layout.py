@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from model.body import BodyModel
+from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import Judgement
@@ -41,6 +42,7 @@ REACH = (0.0, 0.04)                  # metres that a marker may be off the skin
 OUTLIER = 0.06                       # metres beyond which it does not matter how far a track is from a place
 LEFT_OUT = 0.035                     # metres, median distance from its place on which a track is no marker
 SAME = 0.025                         # metres between the places of two tracks, never seen together, that are one marker
+STILL = 0.25                         # radians that a joint turns at most in the frames of the fit, if it is still
 LIKE_NEXT = 1.15                     # ratio of what the next best body leaves, below which they cannot be told apart
 # metres that a place is uncertain by, beside what its residuals tell: of a marker of a usual set, and of another
 UNCERTAIN = 0.009, 0.025
@@ -82,8 +84,12 @@ class FoundLayout:
         if self.margin < LIKE_NEXT:
             check.append("another pose explains the tracks nearly as well: left and right, or front and back, may be "
                          "exchanged")
+        turns = rotations.exp(self.person.poses[:, 1:])
+        range_of_joint = np.linalg.norm(rotations.log(np.swapaxes(turns[:1], -1, -2) @ turns), axis=-1).max(axis=0)
+        if (range_of_joint < STILL).mean() > 0.5:
+            check.append("the person hardly moves: where markers sit on their limb is not told")
         if (self.uncertainty > 0.03).mean() > 0.2:
-            check.append("the person hardly moves in the recording: places are uncertain by more than 3 cm")
+            check.append("many places are uncertain by more than 3 cm: markers of no usual set, or a poor fit")
         if self.left_out:
             check.append(f"{len(self.left_out)} tracks are no markers of this body: {', '.join(self.left_out)}")
         return Judgement.of(bad, check)
