@@ -49,7 +49,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             tidy_up()
             outcome, report = call.carry_out(start, notes)
         except KeyboardInterrupt:
-            goes_on = call is not None and call.arguments.wants_space
+            goes_on = call is not None and call.keeps_steps
             say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if goes_on else
                                             "nothing was written"))
             return 130
@@ -151,7 +151,9 @@ class Arguments:
         hints = typing.get_type_hints(function, include_extras=True)
         parameters = inspect.signature(function).parameters.values()
         self.wants_space = any(p.name == SPACE for p in parameters)
-        self.beside = self.wants_space and typing.get_origin(hints[SPACE]) is not None      # Annotated: FileWorkspace
+        # what is kept lies beside an output that is a file (FileWorkspace), or that has an ending (AnyWorkspace)
+        kinds = typing.get_args(hints[SPACE])[1:] if self.wants_space else ()
+        self.beside, self.either = bool(kinds), len(kinds) > 1
         self.settings = _Settings({p.name: p.default for p in parameters if isinstance(p.default, ranges.Settings)},
                                   argv)
         self.text, told = sentences(function)
@@ -195,6 +197,18 @@ class _Call:
         self.output: Path | None = self.given.get(self.arguments.output_name)
         self._staged: Path | None = None
 
+    @property
+    def in_folder(self) -> bool:
+        """Whether the function works in its output, which is a folder."""
+        asked = self.arguments
+        either = asked.either and self.output is not None and not self.output.suffix
+        return asked.wants_space and (not asked.beside or either)
+
+    @property
+    def keeps_steps(self) -> bool:
+        """Whether the same command goes on where it was interrupted."""
+        return self.in_folder or (self.arguments.beside and not self.arguments.either)
+
     def real(self, text: str) -> str:
         """A message with the path of the output for that of the folder in which it was made."""
         staged, output = self._staged, self.output
@@ -223,7 +237,7 @@ class _Call:
 
         if self.output is None:
             return call(), None
-        if asked.wants_space and not asked.beside:
+        if self.in_folder:
             with workspace(self.output, self.force) as space:
                 outcome = call(space=space)
                 if outcome.failures and space.all_failed and space.is_new:

@@ -123,7 +123,7 @@ def test_labels_that_are_there_are_believed_unless_told_otherwise(place):
 
 @pytest.mark.parametrize(("words", "said"), [
     (("label", "raw.c3d", "-o", "x.c3d"), "--layout: expected one, the recording has no labels of a marker set"),
-    (("label", "raw.c3d", "--layout", "cmu41", "-o", "x.txt"), "--output: expected a file ending in .c3d, .trc, .csv"),
+    (("label", "raw.c3d", "--layout", "cmu41", "-o", "x.txt"), "--output: expected a file ending in .c3d, .trc, .csv, or a folder"),
     (("label", "raw.c3d", "--layout", "cmu41", "--people", "0", "-o", "x.c3d"), "--people: expected one at least"),
     (("label", "few.c3d", "--layout", "cmu41", "-o", "x.c3d"), "at least 10 points, the best has 9"),
     (("label", "raw.c3d", "--layout", "cmu41", "--unit", "m", "-o", "x.c3d"), "metres taken for millimetres"),
@@ -150,17 +150,6 @@ def test_animate_labels_first(place):
     assert (place / "moving" / "labels.csv").stat().st_mtime_ns == first                    # not labelled anew
     motion = np.load(place / "moving" / "motion.npz")
     assert np.isfinite(motion["poses"]).all()
-
-
-def test_mosh_labels_first(place):
-    quick = place / "quick.toml"
-    quick.write_text("soft_tissue = false\nrepair = false\n[person]\nframes = 4\nannealing = [10.0, 1.0]\n")
-    assert run(place, "mosh", "raw.c3d", "--unlabelled", "--layout", "cmu41", "--config", "quick.toml", "-o", "m") == 0
-    person = place / "m" / "raw"
-    assert {"labelled.c3d", "labels.csv", "labels.html", "motion.npz", "virtual.c3d"} <= {
-        path.name for path in (person / "raw").iterdir()}
-    told = json.loads((person / "subject.json").read_text())
-    assert told["recordings"] == ["raw.c3d"] and told["layout"] == "cmu41"
 
 
 @pytest.mark.parametrize("scale", [-1.0, 0.1])

@@ -15,6 +15,7 @@ from .ownership import HOME, ForeignFileError, refusal, refuse_any, written_of
 from .workspace import NothingMadeError, Workspace
 
 FileWorkspace = Annotated[Workspace, "steps of a command whose output is a file; they are kept beside it"]
+AnyWorkspace = Annotated[FileWorkspace, "as a FileWorkspace where the output has an ending; else a folder"]
 _open: dict[Path, Workspace] = {}
 
 

@@ -31,8 +31,7 @@ from ...motion_pictures import (
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion
 from ..files.opensim import believed
-from ..labelling.labelled_file import label_first
-from ..labelling.recording import named_only
+from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import find_coverage
@@ -92,7 +91,7 @@ class Work:
         if self.unlabelled:
             usual, _ = choose_layout(self.model, self.layout, ())
             file = label_first(room, "", path, self.subject or self.model, usual, self.unit, self.rate)
-            sequence, labelling = named_only(read_markers(file.path, file.unit, None, file.rate)), file.judgement
+            sequence, labelling = file.markers, file.judgement
         else:
             sequence = read_markers(path, self.unit, self.who, self.rate)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
@@ -123,7 +122,10 @@ class Work:
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *figures(motion)]
         write_motion(output, motion, body, believed(motion, sequence), covered.told)
         metrics += write_glb(output / "animation.glb", motion, body)
-        return metrics, motion, body, motion_page(motion, body, sequence, path.name, metrics)
+        page = motion_page(motion, body, sequence, path.name, metrics)
+        if self.unlabelled:
+            show_labels(page)
+        return metrics, motion, body, page
 
     def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: Room
                 ) -> tuple[MarkerSequence, PersonFit, Worn]:

@@ -139,20 +139,49 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
     path = Path(path)
     metres_of(unit)                      # another word is refused before the file is read
     raw = _read_raw(path)
-    own_unit = unit or unit_named(raw.unit)
-    if own_unit is None:
-        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{raw.unit}'; say unit=")
-    notes = list(raw.notes)
-    if rate is None and raw.rate is None:
-        if usual_rate is None:
-            raise MarkerFileError(f"{path}: expected the frames per second, it does not say them; say rate=")
-        notes.append(f"it does not say its frames per second, {usual_rate:g} are assumed")
     columns, labels = subject_columns(path, raw.labels, subject_prefix)
-    together = people_of(raw.labels)
+    together, notes = people_of(raw.labels), list(raw.notes)
     if subject_prefix is None and together and len(together[0]) > 1:
         most = Counter(label.rpartition(":")[0] for label in raw.labels if ":" in label).most_common(1)[0][0]
         notes.append(f"the labels of {', '.join(together[0])} are taken as those of one person; those of one only are "
                      f"taken with subject_prefix={most}")
+    return _in_metres(path, raw, columns, labels, unit, rate, usual_rate, notes)
+
+
+def read_points(path: str | Path, unit: str | None = None, rate: float | None = None) -> MarkerSequence:
+    """Read all points of a file, whoever's they are: labels as they stand there, with what is before a colon.
+
+    Parameters
+    ----------
+    path, unit, rate
+        As of `read_markers`.
+
+    Raises
+    ------
+    MarkerFileError
+        Missing, truncated or of another format; no rate.
+
+    Examples
+    --------
+    >>> read_points("two_people.c3d").labels[:2]
+    ('Ann:LFHD', 'Ann:RFHD')
+    """
+    path = Path(path)
+    metres_of(unit)
+    raw = _read_raw(path)
+    return _in_metres(path, raw, range(len(raw.labels)), raw.labels, unit, rate, None, list(raw.notes))
+
+
+def _in_metres(path: Path, raw: RawMarkers, columns: Sequence[int], labels: tuple[str, ...], unit: str | None,
+               rate: float | None, usual_rate: float | None, notes: list[str]) -> MarkerSequence:
+    """Some columns of a file as a sequence; what was done about what it says wrongly is told."""
+    own_unit = unit or unit_named(raw.unit)
+    if own_unit is None:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{raw.unit}'; say unit=")
+    if rate is None and raw.rate is None:
+        if usual_rate is None:
+            raise MarkerFileError(f"{path}: expected the frames per second, it does not say them; say rate=")
+        notes.append(f"it does not say its frames per second, {usual_rate:g} are assumed")
     # not seen: 0 0 0, or one number three times, as 9999999, that lies beyond all places
     places = raw.positions[:, columns]
     places = np.where((places == 0).all(axis=2, keepdims=True), np.nan, places)
@@ -164,7 +193,7 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
         notes.append(f"{number_of(int(fill.sum()), 'position')} of {values} three times taken as missing")
         places = np.where(fill[..., None], np.nan, places)
     for note in notes:
-        warnings.warn(f"{path}: {note}", stacklevel=2)
+        warnings.warn(f"{path}: {note}", stacklevel=3)
     positions = UNITS[own_unit] * places
     if (np.abs(positions) > FARTHEST).any():
         raise MarkerFileError(f"{path}: expected positions that are finite and below {FARTHEST:g} m, found "

@@ -86,13 +86,18 @@ def read_corrections(path: Path, tracks: np.ndarray, names: Sequence[str]) -> np
         if label and label not in names:
             raise StorageError(f"{path}: line {line}: expected a label of the layout or nothing, found '{label}'; it "
                                f"has {', '.join(names)}")
-        here = np.zeros(tracks.shape, dtype=bool)
-        if 0 <= begin <= end < len(tracks):
-            here[begin:end + 1] = tracks[begin:end + 1] == track
-        if not here.any():
-            raise StorageError(f"{path}: line {line}: expected frames of track {track} in {begin} to {end}, this "
-                               f"recording of {len(tracks)} frames has none there; was the table made from another?")
-        known[here] = names.index(label) if label else GHOST
+        here = tracks == track
+        frames = np.flatnonzero(here.any(axis=1))
+        if not {begin, end} <= set(frames.tolist()) or begin > end:
+            there = f"has it in {frames[0]} to {frames[-1]}" if len(frames) else "has no such track"
+            raise StorageError(f"{path}: line {line}: expected frames of track {track} in {begin} to {end}; this "
+                               f"recording {there}: was the table made from another?")
+        here[:begin], here[end + 1:] = False, False
+        meant = names.index(label) if label else GHOST
+        if not np.isin(known[here], (UNKNOWN, meant)).all():
+            raise StorageError(f"{path}: line {line}: expected one label for track {track} in {begin} to {end}, an "
+                               "earlier line has fixed another")
+        known[here] = meant
     # one label twice in a frame cannot be
     for marker, name in enumerate(names):
         twice = np.flatnonzero((known == marker).sum(axis=1) > 1)

@@ -8,21 +8,23 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.judgement import Judgement
+from scanprep.pictures.page import Page
 
+from ..files.markers import MarkerSequence, read_markers, read_points
 from ..marker_sets.layout import MarkerLayout
 from .page import label_page
-from .recording import label_recording, read_unlabelled
+from .recording import label_recording, named_only
 
-LABELLED = "labelled.c3d"
+LABELLED, TABLE, PAGE = "labelled.c3d", "labels.csv", "labels.html"
 
 
 @dataclass(frozen=True)
 class LabelledFile:
-    """A labelled recording that was written, how it is to be read, and what its labels are worth."""
+    """A labelled recording that was written, the unit by which it is read, and what its labels are worth."""
 
     path: Path
+    markers: MarkerSequence
     unit: str | None
-    rate: float | None
     judgement: Judgement
 
 
@@ -33,18 +35,33 @@ def label_first(room: Room, name: str, path: Path, model: BodyModel | Subject, l
     Beside it come labels.csv and labels.html. A step that is kept: what is done is not done again.
     """
     def make(folder: Path) -> str:
-        found = label_recording(path, read_unlabelled(path, unit, rate), model, layout, progress=room.tell)
+        found = label_recording(path, read_points(path, unit, rate), model, layout, progress=room.tell)
         place = folder / name
         place.mkdir(parents=True, exist_ok=True)
         found.write(place / LABELLED)
-        found.write_table(place / "labels.csv")
-        label_page(found, found.metrics(), "labels.csv").write(place / "labels.html")
+        found.write_table(place / TABLE)
+        again = f"run `scape label {path.name} --labels {TABLE}`, with the same layout, and go on with what it writes"
+        label_page(found, found.metrics(), TABLE, again).write(place / PAGE)
         return str(found.judgement)
 
     told = Judgement.read(room.files(f"labels {name}", (path, model, layout, unit, rate), make))
-    where = room.folder / name / LABELLED
     if told.problems:
-        raise ValueError(f"{path}: no labels that could be used: {told.why}; look at {where.with_name('labels.html')}")
-    # a C3D of a C3D says of itself what that one said, rightly or wrongly
-    kept = path.suffix.lower() == ".c3d"
-    return LabelledFile(where, unit if kept else None, rate if kept else None, told)
+        raise ValueError(f"{path}: no labels that could be used: {told.why}; `scape label` shows them")
+    labelled = room.folder / name / LABELLED
+    return LabelledFile(labelled, read_labelled(labelled, path, unit, rate), _own_unit(path, unit), told)
+
+
+def read_labelled(labelled: Path, source: Path, unit: str | None, rate: float | None) -> MarkerSequence:
+    """The markers of a labelled C3D that was made of a source, without the points that are none."""
+    return named_only(read_markers(labelled, _own_unit(source, unit), None, rate))
+
+
+def show_labels(page: Page) -> None:
+    """The way from a page to that of the labels, in the same folder."""
+    page.section("Labels", "The markers had no names. Which point is which marker was found first:")
+    page.markup(f'<p><a href="{PAGE}">the labels, and where they are unsure</a></p>')
+
+
+def _own_unit(source: Path, unit: str | None) -> str | None:
+    """The unit by which a labelled C3D is read: a copy of a C3D says what that one said, rightly or wrongly."""
+    return unit if source.suffix.lower() == ".c3d" else None

@@ -2,97 +2,122 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.pictures.page import Page
 
-from ...motion_pictures import chart, frame_panes, frames_apart
-from .label import SURE
-from .recording import LabelledRecording
+from ...motion_pictures import chart_states, frame_panes, frames_apart
+from .label import SURE, LabelledMarkers
+from .recording import NAMELESS, LabelledRecording, pack_tracks
 
 SHOWN = 30                           # stretches that are listed
-STEPS = 700                          # columns of the chart, at most
-GAP = 0.97                           # brightness of a gap
+HARDLY = 0.5                         # confidence below which another label is the likelier one
+MOST_LOOSE = 15                      # rows of points without a label in the chart, at most
+# what the chart tells of a marker in a frame; where frames fall together the last of these is shown
+STATES = (("#a9c0d4", "labelled"), ("#54789a", "another track"), ("#f4f4f4", "no point"),
+          ("#e39b3b", "doubtful"), ("#a8323e", "hardly believed"), ("#b7a3cc", "point without a label"))
+LABELLED, CHANGED, GAP, DOUBTFUL, UNLIKELY, LOOSE = range(len(STATES))
 
 
-def label_page(recording: LabelledRecording, metrics: Sequence[Metric], table: str) -> Page:
-    """The page; `table` is the name of the table of labels."""
+def label_page(recording: LabelledRecording, metrics: Sequence[Metric], table: str, again: str) -> Page:
+    """The page; `table` is the name of the table of labels, `again` what to do when it is corrected."""
     several = len(recording.people) > 1
     page = Page(f"{recording.path.name}, labelled", "Which point is which marker, and how sure that is.")
-    page.verdict(recording.judgement)
-    page.section("Where it is unsure", f"To correct: open `{table}`, change the label (empty: no marker), write `yes` "
-                 f"into the column fixed, and run again with `--labels {table}`. Or correct the written recording in "
-                 "any program for C3D.")
+    page.section("Where it is unsure", f"To correct: open `{table}`, find the track, change its label (empty: no "
+                 f"marker), write `yes` into the column fixed, and {again}. Frames are counted from 0.")
     rows = unsure_stretches(recording)
     if rows:
-        page.table(rows[:SHOWN], ("from (s)", "to (s)", "frames", "label", "point", "confidence"))
+        page.table(rows[:SHOWN], ("frames", "time (s)", "track", "label", "off (mm)", "next marker", "from it (mm)",
+                                  "confidence"))
         if len(rows) > SHOWN:
             page.text(f"And {len(rows) - SHOWN} more; the table of labels has all, the least certain first.")
     else:
-        page.text(f"Nowhere: all labels have a confidence of {SURE:g} at least.")
+        page.text(f"Nowhere: all labels have a confidence of at least {SURE:g}.")
     for k, one in enumerate(recording.people, start=1):
-        worst = frames_apart(_least_sure(one.confidence, one.columns), 3, 0.3 * one.motion.rate)
+        worst = frames_apart(_least_sure(one), 3, 0.3 * one.motion.rate)
         page.bodies(frame_panes(one.motion, one.subject, one.markers.positions, worst),
                     (f"person {k}: " if several else "") + "the body with its labelled points, in the frames that are "
                     "least sure", 320)
-    page.section("Markers over time", "A row for each marker: dark where its label is sure, pale where it is not, "
-                 "white where it has no point. The colour changes where another track goes on. Below: how many points "
-                 "have no label.")
-    for k, one in enumerate(recording.people, start=1):
-        page.chart(chart_labels(one.columns, one.confidence, one.tracks, one.unlabelled, one.markers.labels,
-                                one.markers.rate), f"person {k}" if several else "")
+    page.section("Markers over time", "A row for each marker, and below the points that are none, as they are called "
+                 "in the written recording.")
+    page.chart(chart_labels(recording))
     return page.section("Figures").figures(metrics)
 
 
-def unsure_stretches(recording: LabelledRecording) -> list[tuple[str, str, int, str, str, float]]:
-    """Begin and end, frames, label, point and mean confidence of stretches that are unsure, the least sure first."""
-    columns, confidence, rate = recording.columns, recording.confidence, recording.points.rate
-    doubted = (columns >= 0) & (confidence < SURE)
-    rows = []
-    for marker in np.flatnonzero(doubted.any(axis=0)):
+@dataclass(frozen=True)
+class _Stretch:
+    """Frames `begin` up to `end` in which the label of a marker is unsure, most of all in `frame`."""
+
+    marker: int
+    begin: int
+    end: int
+    frame: int
+    confidence: float                    # mean
+
+
+def unsure_stretches(recording: LabelledRecording) -> list[tuple[str, str, str, str, float, str, float, float]]:
+    """The rows of the table of stretches in which a label is unsure, the least sure first.
+
+    Frames, seconds, track, label, how far the point is from where the body has that marker, the other marker that the
+    body has nearest to the point, its distance, and the mean confidence. Distances are of the least sure frame.
+    """
+    rows, first = list[tuple[str, str, str, str, float, str, float, float]](), 0
+    for one in recording.people:
+        found, names = _unsure(one), recording.names[first:first + len(one.layout.labels)]
+        bodies = one.motion.vertices(one.subject, np.array([each.frame for each in found[:SHOWN]], dtype=int))
+        for i, each in enumerate(found):
+            columns = one.columns[each.begin:each.end, each.marker]
+            tracks = list(dict.fromkeys(one.tracks[np.arange(each.begin, each.end), columns].tolist()))
+            # where the body has all its markers, of the stretches that are listed
+            off, other = np.full(len(names), np.nan), each.marker
+            if i < SHOWN:
+                places = one.layout.place(one.subject.template.with_vertices(bodies[i]))
+                point = recording.points.positions[each.frame, one.columns[each.frame, each.marker]]
+                off = MM * np.linalg.norm(places - point, axis=1)
+                other = int(np.where(np.arange(len(off)) == each.marker, np.inf, off).argmin())
+            last = f"–{each.end - 1}" if each.end - 1 > each.begin else ""
+            rows.append((f"{each.begin}{last}", f"{each.begin / one.motion.rate:.2f}",
+                         f"{tracks[0]}" + (f" and {len(tracks) - 1} more" if len(tracks) > 1 else ""),
+                         names[each.marker], float(off[each.marker]), names[other], float(off[other]),
+                         each.confidence))
+        first += len(names)
+    return sorted(rows, key=lambda row: row[-1])
+
+
+def _unsure(one: LabelledMarkers) -> list[_Stretch]:
+    """The stretches of a person, the least sure first."""
+    doubted, found = (one.columns >= 0) & (one.confidence < SURE), list[_Stretch]()
+    for marker in np.flatnonzero(doubted.any(axis=0)).tolist():
         edges = np.flatnonzero(np.diff(np.r_[False, doubted[:, marker], False].astype(int))).reshape(-1, 2)
-        for begin, end in edges:
-            point = recording.points.labels[columns[begin, marker]]
-            rows.append((f"{begin / rate:.2f}", f"{(end - 1) / rate:.2f}", int(end - begin), recording.names[marker],
-                         point, float(confidence[begin:end, marker].mean())))
-    return sorted(rows, key=lambda row: (row[5], -row[2]))
+        for begin, end in edges.tolist():
+            sure = one.confidence[begin:end, marker]
+            found.append(_Stretch(marker, begin, end, begin + int(sure.argmin()), float(sure.mean())))
+    return sorted(found, key=lambda each: (each.confidence, each.begin - each.end))
 
 
-def _least_sure(confidence: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def _least_sure(one: LabelledMarkers) -> np.ndarray:
     """Frames, those with the least sure labels first."""
-    return np.argsort(np.where(columns >= 0, confidence, 1.0).min(axis=1), kind="stable")
+    return np.argsort(np.where(one.columns >= 0, one.confidence, 1.0).min(axis=1), kind="stable")
 
 
-def chart_labels(columns: np.ndarray, confidence: np.ndarray, tracks: np.ndarray, unlabelled: np.ndarray,
-                 labels: Sequence[str], rate: float) -> Any:
-    """A matplotlib figure: every marker over time, by track and confidence, and how many points have no label."""
-    from matplotlib import colormaps
-
-    T, L = columns.shape
+def chart_labels(recording: LabelledRecording) -> Any:
+    """A matplotlib figure: every marker over time, and below it the points without a label."""
+    columns, tracks = recording.columns, recording.people[0].tracks
     number = np.where(columns >= 0, np.take_along_axis(tracks, np.maximum(columns, 0), axis=1), -1)
-    steps = np.array_split(np.arange(T), min(T, STEPS))
-    # of the frames that fall together the least sure one is shown
-    least = np.where(columns >= 0, confidence, 2.0)
-    image = np.full((L, len(steps), 3), GAP)
-    palette = colormaps["tab20"](np.arange(20))[:, :3]
-    for i, part in enumerate(steps):
-        frame = part[least[part].argmin(axis=0)]
-        for row in range(L):
-            if number[frame[row], row] >= 0:
-                color = palette[2 * (number[frame[row], row] % 10)]
-                share = np.clip((confidence[frame[row], row] - 0.5) / 0.5, 0.0, 1.0)
-                image[row, i] = color + (1 - share) * 0.7 * (1 - color)
-    figure, axes = chart(7.5, 1.5 + 0.13 * L)
-    axes.imshow(image, aspect="auto", interpolation="nearest", extent=(0, T / rate, L - 0.5, -0.5))
-    axes.set_yticks(range(L), labels, fontsize=6)
-    axes.tick_params(labelbottom=False)
-    below = axes.inset_axes((0, -1.0 / (1.5 + 0.13 * L), 1, 0.8 / (1.5 + 0.13 * L)))
-    counts = np.array([unlabelled[part].sum(axis=1).max() for part in steps])
-    below.fill_between(np.array([part[0] for part in steps]) / rate, counts, step="post", color="#8c2f39", linewidth=0)
-    below.set(xlim=(0, T / rate), ylim=(0, max(1, counts.max(initial=0))), xlabel="time (s)", ylabel="no label")
-    below.yaxis.label.set_fontsize(7)
-    below.tick_params(labelsize=7)
-    return figure
+    # another track than that of the frame before it that had one
+    last = np.maximum.accumulate(np.where(columns >= 0, np.arange(len(columns))[:, None], -1), axis=0)
+    before = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
+    changed = (before >= 0) & (np.take_along_axis(number, np.maximum(before, 0), axis=0) != number)
+    sure = recording.confidence
+    state = np.select([columns < 0, sure < HARDLY, sure < SURE, changed], [GAP, UNLIKELY, DOUBTFUL, CHANGED], LABELLED)
+    # points that are no marker, those first that are there longest
+    loose = pack_tracks(tracks, recording.people[0].unlabelled) >= 0
+    longest = np.argsort(-loose.sum(axis=0), kind="stable")[:MOST_LOOSE]
+    state = np.concatenate([state, np.where(loose[:, longest], LOOSE, GAP)], axis=1)
+    names = [*recording.names, *(f"{NAMELESS}{i + 1}" for i in longest)]
+    return chart_states(state, names, recording.points.rate, *zip(*STATES, strict=True))

@@ -1,7 +1,7 @@
 """A recording without labels: read, labelled, and written again with all that was in it."""
 from __future__ import annotations
 
-import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +15,13 @@ from scanprep.judgement import Judgement
 
 from ...motion import Progress
 from ..files.c3d_points import rename_points
-from ..files.markers import MarkerSequence, read_markers, write_markers
+from ..files.markers import MarkerSequence, people_of, write_markers
 from ..marker_sets.layout import MarkerLayout
 from .corrections import read_corrections, write_labels
-from .label import UNKNOWN, LabelledMarkers, label_people
+from .label import SURE, UNKNOWN, LabelledMarkers, label_people
 from .tracks import link_points
 
+LABELLED_SHARE, DOUBTFUL = "points with a label", "labels that are doubtful"
 NAMELESS = "*"                       # what labels of points that are no marker begin with
 
 
@@ -36,7 +37,8 @@ class LabelledRecording:
         As it was.
     people : list of LabelledMarkers
     names : strings
-        Labels of all people, `Person1:LKNE` where there are several.
+        Labels of all people, `Person1:LKNE` where there are several, or as the recording calls them, if it has labels
+        of as many.
     known : (T, C) int
         What was known of the labels: by the file, or by a table of corrections.
     """
@@ -95,10 +97,10 @@ class LabelledRecording:
         """The figures of the closing table."""
         there = self.columns >= 0
         points, sure = int(self.points.seen.sum()), self.confidence[there]
-        missing = [name for name, count in zip(self.names, there.sum(axis=0), strict=True) if not count]
+        missing = [self.names[i] for i in np.flatnonzero(~there.any(axis=0))]
         tracks = self.people[0].tracks
-        return [judgement_row(self.judgement), Metric("points with a label", 100 * there.sum() / max(points, 1), "%"),
-                Metric("labels that are doubtful", 100 * float((sure < 0.9).mean()) if len(sure) else 100.0, "%"),
+        return [judgement_row(self.judgement), Metric(LABELLED_SHARE, 100 * there.sum() / max(points, 1), "%"),
+                Metric(DOUBTFUL, 100 * float((sure < SURE).mean()) if len(sure) else 100.0, "%"),
                 Metric("markers found in a frame, mean", float(there.sum(axis=1).mean())),
                 *([Metric("markers of the layout without any point", ", ".join(missing))] if missing else []),
                 *details([Metric("people", len(self.people)), Metric("frames", len(there)),
@@ -109,32 +111,48 @@ class LabelledRecording:
 def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subject, layout: MarkerLayout,
                     people: int = 1, corrections: Path | None = None, relabel: bool = False,
                     progress: Progress | None = None) -> LabelledRecording:
-    """Label a recording that was read.
+    """Label the points of a recording, as `read_points` gives them.
 
     Labels of the recording that are the layout's are known, unless `relabel`; so are those of the table `corrections`,
     which go before. Arguments else as of `label_people`.
     """
-    names = layout.labels if people == 1 else tuple(f"Person{k}:{label}" for k in range(1, people + 1)
-                                                    for label in layout.labels)
+    who = people_of(points.labels)
+    prefixes = [f"{prefix[0]}:" for prefix in who] if people > 1 and len(who) == people else \
+        [f"Person{k}:" for k in range(1, people + 1)] if people > 1 else [""]
+    names = tuple(prefix + label for prefix in prefixes for label in layout.labels)
     known = np.full(points.positions.shape[:2], UNKNOWN)
-    if not relabel and people == 1:
-        known = known_columns(points, layout)
+    if not relabel:
+        known = known_columns(points, layout, prefixes)
     if corrections is not None:
         said = read_corrections(corrections, link_points(points.positions, points.rate), names)
         for row in np.unique(said[said >= 0]):                         # the file's own label gives way in these frames
             known[(known == row) & (said == row).any(axis=1, keepdims=True)] = UNKNOWN
         known = np.where(said == UNKNOWN, known, said)
-    found = label_people([(model, layout)] * people, points, known, progress)
+    try:
+        found = label_people([(model, layout)] * people, points, known, progress)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     return LabelledRecording(path, points, found, names, known)
 
 
-def known_columns(points: MarkerSequence, layout: MarkerLayout) -> np.ndarray:
-    """The rows of a layout (T, C) that the labels of a recording tell, `UNKNOWN` for others."""
-    known = np.full(points.positions.shape[:2], UNKNOWN)
-    spelled = layout.spelled(points.labels)
-    for row, label in enumerate(spelled.labels):
-        if label in points.labels:
-            column = points.labels.index(label)
+def known_columns(points: MarkerSequence, layout: MarkerLayout, prefixes: Sequence[str] = ("",)) -> np.ndarray:
+    """The rows (T, C) that the labels of a recording tell, `UNKNOWN` for others.
+
+    Rows are those of the layout, counted on from person to person; `prefixes` are what their labels begin with, with
+    the colon. Of one person the only prefix of the recording, or none, will do.
+    """
+    spelled = layout.spelled([label.rpartition(":")[2] for label in points.labels])
+    rows = {label: i for i, label in enumerate(layout.labels)}
+    rows |= {alias: rows[label] for alias, label in spelled.aliases.items() if label in rows}
+    only = len(prefixes) == 1 and len(people_of(points.labels)) < 2     # whatever the file calls that person
+    known, taken = np.full(points.positions.shape[:2], UNKNOWN), set[int]()
+    for column, label in enumerate(points.labels):
+        who, colon, bare = label.rpartition(":")
+        if bare not in rows or not (only or who + colon in prefixes):
+            continue
+        row = rows[bare] + (0 if only else list(prefixes).index(who + colon) * len(layout.labels))
+        if row not in taken:                                            # of two spellings the first
+            taken.add(row)
             known[points.seen[:, column], column] = row
     return known
 
@@ -168,12 +186,3 @@ def pack_tracks(tracks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         ends[free] = int(frames[piece[-1]])
         series[free][frames[piece]] = columns[piece]
     return np.stack(series, axis=1) if series else np.empty((len(tracks), 0), dtype=int)
-
-
-def read_unlabelled(path: Path, unit: str | None, rate: float | None) -> MarkerSequence:
-    """The points of a recording, whoever's labels they bear."""
-    with warnings.catch_warnings():
-        # labels that come twice, or of several people, do not matter here
-        warnings.filterwarnings("ignore", message=".*(comes? more often|taken as those of one person).*")
-        return read_markers(path, unit, None, rate)
-

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from scanprep.arguments import Alias, Called, Place
+from scanprep.arguments import Alias, Called, Place, UsageError
 from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
@@ -79,7 +79,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
         raise ValueError("MARKERS: expected at least one file or folder")
     held = tuple(label for words in hold_out for label in words.split(",") if label)
     if unlabelled and layout is None:
-        raise ValueError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
+        raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
     call = MoshCall(markers, model, layout, subject_prefix, held, retarget_to, unit, rate, unlabelled, config)
     with bar("people") as people, bar("one of them") as inside:
         return carry_out(call, space, workers, f"scape mosh {' '.join(sys.argv[2:])}", people, inside)

@@ -20,7 +20,7 @@ from scanprep.pictures.shading import Bones, Dots, Heat, Solid
 from ...motion import Motion
 from ...motion_pictures import facing, mean_over, upwards, worst_frames
 from ..files.markers import MarkerSequence, read_markers
-from ..labelling.labelled_file import LABELLED
+from ..labelling.labelled_file import LABELLED, read_labelled
 from ..marker_sets.layout import MarkerLayout
 from .call import Models
 from .pictures import standing
@@ -92,10 +92,12 @@ class Found:
     @cached_property
     def markers(self) -> list[MarkerSequence]:
         """As they were measured."""
-        made = [self.folder / one.name / LABELLED for one in self.recordings]
-        return [read_markers(labelled if labelled.exists() else one.path, self.unit,
-                             None if labelled.exists() else one.who, self.rate)
-                for one, labelled in zip(self.recordings, made, strict=True)]
+        found = list[MarkerSequence]()
+        for one in self.recordings:
+            labelled = self.folder / one.name / LABELLED
+            found.append(read_labelled(labelled, one.path, self.unit, self.rate) if labelled.exists()
+                         else read_markers(one.path, self.unit, one.who, self.rate))
+        return found
 
     @cached_property
     def labels(self) -> list[str]:

@@ -29,7 +29,7 @@ from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
 from ..files.opensim import centre_sequence, known_centres
-from ..labelling.labelled_file import label_first
+from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import Coverage, find_coverage
@@ -153,19 +153,21 @@ class _Found:
 
 def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     recordings, sequences, failures = list[Recording](), list[MarkerSequence](), list[str]()
-    labelling = list[Judgement]()
+    labelling, units = list[Judgement](), list[str | None]()
     for recording in actor.recordings:
         try:
             if work.unlabelled:
                 assert work.layout is not None, "the command asks for one"
                 file = label_first(room, recording.name, recording.path, work.model, work.layout[0], work.unit,
-                                     work.rate)
+                                   work.rate)
                 labelling.append(Judgement.of(
                     check=[f"labels of {recording.name}: {why}" for why in file.judgement.reasons]))
-                recording = replace(recording, path=file.path)
-                sequences.append(read_markers(file.path, file.unit, None, file.rate))
+                recording, unit = replace(recording, path=file.path, who=None), file.unit
+                sequences.append(file.markers)
             else:
+                unit = work.unit
                 sequences.append(read_markers(recording.path, work.unit, recording.who, work.rate))
+            units.append(unit)
             recordings.append(recording)
         except ValueError as error:
             failures.append(" ".join(str(error).split()))
@@ -190,10 +192,10 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
         result = mosh(model, sequences, layout, work.config, progress, room.step)
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []
-    for i, (source, markers) in enumerate(zip(recordings, sequences, strict=True)):
+    for i, (source, unit, markers) in enumerate(zip(recordings, units, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
-        takes.append(Take(source, work.unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
+        takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
                           held, light))
     return _Found(model, guess, result, takes, usual, layout_name, Judgement().joined(*labelling)), failures
 
@@ -215,6 +217,8 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
         if shown:
             page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
+        if work.unlabelled:
+            show_labels(page)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, picture)
         judgement = found.judgement([take])

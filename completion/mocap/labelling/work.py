@@ -1,0 +1,62 @@
+"""A recording from the file without labels to the files with them: the labelled points, the table, the page."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from model.body import BodyModel
+from model.linear import Subject
+from scanprep.batch.room import Room
+from scanprep.console import Metric
+
+from ..files.markers import read_points
+from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import choose_layout, layout_names
+from .labelled_file import LABELLED, TABLE
+from .page import label_page
+from .recording import DOUBTFUL, LABELLED_SHARE, label_recording
+
+PAGE = "report.html"
+__all__ = ["DOUBTFUL", "LABELLED_SHARE", "LabelWork"]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelWork:
+    """What is the same for all recordings of a call of `scape label`."""
+
+    model: BodyModel
+    name: str                            # of the model, for the output
+    subject: Subject | None              # None: to be found from the points
+    layout: str | Path | None            # a named one, or a file; None: the one that labels of the recording tell
+    people: int
+    labels: Path | None                  # table of corrections
+    relabel: bool
+    unit: str | None
+    rate: float | None
+
+    def __call__(self, path: Path, room: Room) -> list[Metric]:
+        """Label a recording into the folder of a room; the figures, the first says what the labels are worth."""
+        return self.write(path, room, LABELLED, TABLE, PAGE)
+
+    def write(self, path: Path, room: Room, recording: str, table: str, page: str) -> list[Metric]:
+        """The same under other names of the three files."""
+        points = read_points(path, self.unit, self.rate)
+        layout, name = self._layout(points.labels)
+        found = label_recording(path, points, self.subject or self.model, layout, self.people, self.labels,
+                                self.relabel, room.tell)
+        metrics = [*found.metrics(), Metric("model", self.name), Metric("layout", name)]
+        found.write(room.folder / recording)
+        found.write_table(room.folder / table)
+        label_page(found, metrics, table, f"run the same command with `--labels {table}`").write(room.folder / page)
+        return metrics
+
+    def _layout(self, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:
+        """The layout that is named, or the one that some labels of a recording tell, and its name."""
+        if self.layout is not None:
+            return choose_layout(self.model, self.layout, ())
+        bare = [label.rpartition(":")[2] for label in labels]
+        try:
+            return choose_layout(self.model, None, list(dict.fromkeys(bare)))
+        except ValueError:
+            raise ValueError(f"layout: expected one, the recording has no labels of a marker set; one of "
+                             f"{', '.join(layout_names())} (scape layout list), or a file") from None
