@@ -123,7 +123,7 @@ def test_labels_that_are_there_are_believed_unless_told_otherwise(place):
 
 @pytest.mark.parametrize(("words", "said"), [
     (("label", "raw.c3d", "-o", "x.c3d"), "--layout: expected one, the recording has no labels of a marker set"),
-    (("label", "raw.c3d", "--layout", "cmu41", "-o", "x.txt"), "expected a file ending in .c3d, .trc, .csv, or a folder"),
+    (("label", "raw.c3d", "--layout", "cmu41", "-o", "x.txt"), "a file ending in .c3d, .trc, .csv, or a folder"),
     (("label", "raw.c3d", "--layout", "cmu41", "--people", "0", "-o", "x.c3d"), "--people: expected one at least"),
     (("label", "few.c3d", "--layout", "cmu41", "-o", "x.c3d"), "at least 10 points, the best has 9"),
     (("label", "raw.c3d", "--layout", "cmu41", "--unit", "m", "-o", "x.c3d"), "metres taken for millimetres"),
