@@ -14,7 +14,8 @@ SEEN_SD = 0.004                      # metres that a point strays from its offse
 ALONE = 9.0
 SHIFT = 16.0                         # half squared deviations by which markers side by side may be off together
 SHIFTED_SD = 0.02                    # metres, how well they lie on points after they were moved together
-GROUP = 0.15                         # metres within which markers are side by side: those of a foot, a hand, a head
+GROUP = 0.25                         # metres within which markers are side by side: those of a foot, a hand, a head
+TRIED = 8                            # shifts, the likeliest first
 GAIN = 1.0                           # cost that this has to save
 
 
@@ -94,8 +95,8 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
     """Matches (L,) where markers side by side may all have been taken for their neighbours.
 
     A foot that is faster than expected has its heel where the ankle was to be, and so on: each label is likely by
-    itself, one marker and one point are left over. Groups are moved so that these two meet, and matched anew; they
-    stay so where all deviations together, with their common cause, are less.
+    itself, one marker and one point are left over. Groups with such a marker are moved so that one of them gets the
+    point, and matched anew; they stay so where all deviations together, with their common cause, are less.
 
     Parameters
     ----------
@@ -110,15 +111,17 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
     chosen : (L,) int
         Matches of each by itself.
     """
-    lone, free = np.flatnonzero(chosen < 0), left_over(len(points), chosen)
+    free = left_over(len(points), chosen)
     best, most = chosen, GAIN
-    if not len(lone) or not len(free):
+    if (chosen >= 0).all() or not len(free):
         return chosen
-    off = Expected(expected.places[lone], expected.precision[lone]).half_squares(points[free])
-    for i, j in np.argwhere(off < SHIFT):
-        marker = lone[i]
+    off = expected.half_squares(points[free])
+    order = np.argsort(off, axis=None)[:TRIED]
+    for marker, j in zip(*np.unravel_index(order[off.ravel()[order] < SHIFT], off.shape), strict=True):
         shift = points[free[j]] - expected.places[marker]
         group = np.flatnonzero(((expected.places - expected.places[marker])**2).sum(axis=1) < GROUP**2)
+        if (chosen[group] >= 0).all():
+            continue
         # points that no other marker has, after the shift
         pool = left_over(len(points), np.delete(chosen, group))
         apart = expected.places[group][:, None] + shift - points[pool]

@@ -29,6 +29,7 @@ EARNED = 0.5                         # seconds in which a label that was in doub
 LABELS, GONE = 4, 0.5                # labels, and seconds with fewer after which the body is sought anew
 STRAINED, LOST = 0.2, 0.5            # mean strain above which another body is sought, and above which there is none
 PATIENCE, LONGEST = 0.5, 8.0         # seconds from a search that found nothing to the next, doubled up to the longest
+SETTLED = 10                         # steps of a body that was found
 BETTER = 1.0                         # markers of misfit that another body has to gain
 
 
@@ -43,10 +44,10 @@ class LabelledFrame:
     confidence : (L,) float
         Of each label, 0 to 1; 0 without a point.
     pose : (J, 3) float, radians
-        NaN as long as no body was found; the last one where it is not followed.
+        NaN where no body is followed.
     trans : (3,) float, metres
     found : bool
-        The body is followed. Where it is not, there are no labels.
+        A body is followed; for half a second also where it has no points. Without one there are no labels.
     """
 
     columns: np.ndarray
@@ -87,9 +88,9 @@ class LabelStream:
 
     def __init__(self, subject: Subject, layout: MarkerLayout, rate: float) -> None:
         if not (np.isfinite(rate) and rate > 0):
-            raise ValueError(f"rate: expected a number of frames per second above 0, got {rate}")
+            raise ValueError(f"rate: expected a number above 0, frames per second, got {rate}")
         if len(layout.labels) < FEWEST:
-            raise ValueError(f"layout: expected at least {FEWEST} markers to tell a body by, got {len(layout.labels)}")
+            raise ValueError(f"layout: expected at least {FEWEST} markers, got {len(layout.labels)}")
         self.config, self.rate = AnimateConfig(), float(rate)
         self.body = MarkedBody(subject, layout, self.config.prior_weight, self.config.prior_shrinkage)
         self.search = BodySearch(self.body, subject)
@@ -232,7 +233,12 @@ class LabelStream:
     def _find(self, points: np.ndarray) -> Placement:
         """The best body in a frame of points (N, 3), from nothing else."""
         found = self.search.judge(self.search.find(points).x, points, OWN_PERSON.judged)
-        return self.search.restart_limbs(found, points, OWN_PERSON.judged)
+        found = self.search.restart_limbs(found, points, OWN_PERSON.judged)
+        # as near to its points as it will be followed
+        targets = _taken(points, found.matches)
+        weights, _ = marker_weights(self.body.positions(found.x), targets, self.config.marker_sd, self.config.outlier)
+        x = self.body.solve(found.x[None], targets, weights, SETTLED, 1e-4).x[0]
+        return min(found, self.search.judge(x, points, OWN_PERSON.judged), key=lambda one: one.misfit)
 
     def _go_on_from(self, placement: Placement) -> None:
         """Continue from a body that was found, at rest."""
@@ -252,7 +258,7 @@ class LabelStream:
         there = chosen >= 0
         columns = np.full(self.body.count, -1)
         columns[there] = seen[chosen[there]]
-        pose, trans, _ = self.body.body.split(self.x)
+        pose, trans, _ = self.body.body.split(self.x if self.found else np.full_like(self.x, np.nan))
         return LabelledFrame(columns, np.where(there, self.belief, 0.0), pose.copy(), trans.copy(), self.found)
 
 
