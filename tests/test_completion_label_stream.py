@@ -27,7 +27,7 @@ def layout():
 
 @pytest.fixture(scope="module")
 def motion(subject, layout):
-    """Poses (T, J, 3), places (T, 3) and markers (T, L, 3) of a person who goes from pose to pose and walks meanwhile."""
+    """Poses (T, J, 3), places (T, 3) and markers (T, L, 3) of a person who walks from pose to pose."""
     keys = human_poses(subject.template, subject.skeleton, 6, np.random.default_rng(3))[[1, 2, 4]]
     keys[:, 0] = [0.3, 0.0, 0.1], [0.3, 0.1, 0.5], [0.3, 0.0, 0.8]
     t = np.linspace(0, len(keys) - 1.001, FRAMES)
@@ -86,7 +86,7 @@ def test_shuffled_points_get_their_labels_and_the_body_its_pose(subject, motion,
 
 
 def test_the_order_of_points_does_not_matter_and_no_later_frame_is_looked_at(subject, layout, motion, clean):
-    frames, points, names = clean
+    frames, _, names = clean
     other = motion[2][:40].copy()
     other[30:] += 5.0
     again = pushed(LabelStream(subject, layout, RATE), other)
@@ -108,7 +108,8 @@ def test_missing_points_and_ghosts_do_little(subject, layout, motion):
     points = np.concatenate([points, np.tile([1.0, 0.3, 1.0], (FRAMES, 1, 1))], axis=1)           # a reflection at rest
     names = np.concatenate([names, np.full((FRAMES, 1), -1)], axis=1)
     frames = pushed(LabelStream(subject, layout, RATE), points)
-    assert share_right(frames, points, names) > 0.995
+    assert share_right(frames, points, names) > 0.99                                              # a foot at first
+    assert share_right(frames[30:], points[30:], names[30:]) > 0.998
     ghosts = labels(frames, names) == -1
     assert ghosts.sum() < 0.001 * ghosts.size
     assert not (ghosts[:-2] & ghosts[1:-1] & ghosts[2:]).any()                                    # none for long
@@ -119,7 +120,7 @@ def test_who_leaves_is_found_again_elsewhere_turned_and_in_another_pose(subject,
     markers = motion[2]
     R = rotations.exp(np.array([0, 0, 2.5]))
     back = (markers[100:150] - markers[100].mean(axis=0)) @ R.T + [3.0, -2.0, 0.9]
-    first, names = shuffled(markers[:20], 2)
+    first, _ = shuffled(markers[:20], 2)
     second, names_2 = shuffled(back, 3)
     ghosts = np.random.default_rng(4).random((100, 5, 3)) * 2
     stream = LabelStream(subject, layout, RATE)
