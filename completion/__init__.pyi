@@ -15,6 +15,7 @@ from .mocap.files.motion_files import joint_centres as joint_centres
 from .mocap.labelling.label import LabelledMarkers as LabelledMarkers
 from .mocap.labelling.label import label_markers as label_markers
 from .mocap.labelling.label import label_people as label_people
+from .mocap.labelling.stream import LabelledFrame as LabelledFrame
 from .mocap.labelling.stream import LabelStream as LabelStream
 from .mocap.labelling.unknown_layout import FoundLayout as FoundLayout
 from .mocap.labelling.unknown_layout import find_layout as find_layout

@@ -284,6 +284,12 @@ BENCHMARKS = (
               "mosh_c3d.py C3D -m MEN --preset published --soft", mocap.recordings,
               "No marker is an outlier, nothing is repaired; its prior of poses is that of 71 scans here.",
               quick=""),
+    Benchmark("label_stream", "Labels while the points come in", "label_stream.py C3D", mocap.label_stream,
+              "Person and marker places from the labels of the first half, then points alone, shuffled in every frame. "
+              "Returns: five seconds away, back elsewhere, turned. Where we lose: a search stops the stream for about "
+              "half a second; a hand or head that was found turned about, with a fifth of the points gone, may stay so "
+              "for a second.",
+              quick="label_stream.py C3D --files basketball --rates 120"),
     Benchmark("peer_markers", "Marker tracking by pymomentum on the same recordings", "peer_markers.py C3D -m MEN",
               mocap.peer_markers,
               "35 of 41 markers; the person or the calibration is in the time. pymomentum has the joints of our mean "

@@ -160,3 +160,22 @@ def peer_markers(report: dict) -> str:
                          sum(r["frames"] for r in done) / sum(r["cpu_s"] for r in done)))
     return table(("file", "tool", "markers (mm)", "p95 (mm)", "held out, calibrated (mm)", "p95 (mm)",
                   "acceleration of joints, RMS (rad/s²)", "time (s CPU)", "frames/s CPU"), rows)
+
+
+def label_stream(report: dict) -> str:
+    """Labels frame by frame, and people who leave and return."""
+    rows: Rows = [(r["file"], r["markers"], r["rate"], "20% gone, 5 ghosts" if r["disturbed"] else "", r["frames"],
+                   r["right"], r["wrong"], r["ghosts"], r["wrong_doubted"], r["right_doubted"], r["per_cpu_s"],
+                   r["per_cpu_s_all"], r["slow"], r["slowest_s"]) for r in report["rows"]]
+    back: Rows = []
+    for r in report["returns"]:
+        each = r["returns"]
+        back.append((r["file"], "20% gone, 5 ghosts" if r["disturbed"] else "", len(each),
+                     sum(one["frames"] == 0 for one in each), max(one["frames"] for one in each),
+                     float(np.median([one["right"] for one in each])), min(one["right"] for one in each),
+                     sum(one["labels_away"] for one in each), max(one["search_s"] for one in each)))
+    return table(("file", "markers", "rate (Hz)", "disturbed", "frames", "right (%)", "wrong (% of labels)",
+                  "ghosts (% of labels)", "doubted of wrong (%)", "of right (%)", "frames/s CPU, median", "all",
+                  "frames with a search", "longest (s)"), rows) + "\n\n" + table(
+        ("file", "disturbed", "returns", "found in the first frame", "latest found (frames)",
+         "right in the second after (%), median", "least", "labels while away", "longest (s)"), back)

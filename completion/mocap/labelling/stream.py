@@ -1,4 +1,4 @@
-"""Labels while the points come in: one frame without names in, labels and a pose out."""
+"""Labels while the points come in: one frame of points without names, and the labels and the pose are there."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -8,23 +8,29 @@ import numpy as np
 from model.linear import Subject
 
 from ..marker_sets.layout import MarkerLayout
-from ..pose.marked_body import AnimateConfig, MarkedBody
-from ..pose.stream import Tracker
-from .assignment import ALONE, AWAY
-from .body_search import BodySearch, Placement, assign
+from ..pose.marked_body import AnimateConfig, MarkedBody, marker_weights, point_system
+from ..pose.stream import KalmanPrediction
+from .body_search import ALONE, JUDGED, BodySearch, Placement
 from .follow_points import OWN_PERSON
 from .label import FEWEST, FOUND
+from .limb_watch import LimbWatch
+from .live_matching import SEEN_SD, Expected, certainty, intersect, match, shift_groups
+from .tracks import ACCELERATION, BRIDGE
 
-STEPS = 2                            # of the solution of a frame, which begins where it is expected; 3 label alike
-PLACE_SD = 0.025                     # metres that a point lies from where the body is expected to have its marker
-TRACK_SD = 0.008                     # metres, and from where constant velocity has its point; 0.6 mm at 120 Hz, 7 at 30
-ACCELERATION = 15.0                  # m/s² that the latter may miss besides, half of it over the squared frame time
-MEMORY = 0.1                         # seconds for which constant velocity is believed
-GONE = 0.5                           # seconds with hardly a point after which the body is sought anew
-PATIENCE, LONGEST = 0.5, 8.0         # seconds from a search to the next, doubled while nothing better is found
-FEW = 0.85                           # share of markers, or points if those are fewer, below which it is sought anew
-OFF = 0.02                           # metres, median distance from the body above which it is sought anew
-BETTER = 0.3                         # markers of misfit that what is found has to gain
+WORN_SD = 0.025                      # metres from its place on the body that a point lies, whose offset is not known
+FORGOTTEN = 0.25                     # seconds out of sight after which an offset is no longer known
+SMOOTHED = 0.015                     # seconds over which offsets are averaged
+TRACK_SD = 0.004                     # metres that constant velocity misses; 0.6 mm at the median at 120 Hz
+ROUNDS = 3                           # of matching and solving, where the first leaves doubts
+CLEAR = 0.99                         # confidence of every label from which one round is enough
+SMALL = 0.01                         # metres that a round may move markers for that
+BODY_SD = 0.02                       # metres, scale at which the body alone tells a label
+EARNED = 0.5                         # seconds in which a label that was in doubt is believed again
+LABELS, GONE = 4, 0.5                # labels, and seconds with fewer after which the body is sought anew
+STRAINED, LOST = 0.2, 0.5            # mean strain above which another body is sought, and above which there is none
+PATIENCE, LONGEST = 0.5, 8.0         # seconds from a search that found nothing to the next, doubled up to the longest
+SETTLED = 10                         # steps of a body that was found
+BETTER = 1.0                         # markers of misfit that another body has to gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +44,10 @@ class LabelledFrame:
     confidence : (L,) float
         Of each label, 0 to 1; 0 without a point.
     pose : (J, 3) float, radians
-        NaN as long as no body was found.
+        NaN where no body is followed.
     trans : (3,) float, metres
     found : bool
-        The body is where the points are; without it there are no labels.
+        A body is followed; for half a second also where it has no points. Without one there are no labels.
     """
 
     columns: np.ndarray
@@ -52,24 +58,24 @@ class LabelledFrame:
 
 
 class LabelStream:
-    """Labels of a person of known shape, frame by frame as the points arrive.
+    """Labels and motion of a person of known shape, frame by frame as points without names arrive.
 
-    Where the body is expected, and where constant velocity has the points of the last frame, tell which point is which
-    marker. A body that was not found yet, has left or fits badly is sought in the points of a frame; that takes about
-    half a second, once, then after ever longer pauses.
+    The motion so far says where each marker is expected and how well that is known; points are matched with markers
+    within that. A body that was not found yet, or has left, is sought in the points of one frame: that takes about half
+    a second, then there are pauses. A limb that fits worse than usual is sought anew in 30 ms.
 
     Parameters
     ----------
     subject : Subject
-        The person, as of `label_markers(...).subject`.
+        The person, as of `label_markers(...).subject` or `mosh(...)`.
     layout : MarkerLayout
-        Where the markers sit on it, as of `label_markers(...).layout`.
+        Where the markers sit on this person, as of `label_markers(...).layout`.
     rate : float, frames per second
 
     Raises
     ------
     ValueError
-        Fewer than ten markers in the layout, a rate that is not above zero.
+        Fewer than ten markers in the layout, a layout of another body, a rate that is not above zero.
 
     Examples
     --------
@@ -81,18 +87,19 @@ class LabelStream:
     """
 
     def __init__(self, subject: Subject, layout: MarkerLayout, rate: float) -> None:
-        if not rate > 0:
-            raise ValueError(f"rate: expected a number above 0, got {rate}")
+        if not (np.isfinite(rate) and rate > 0):
+            raise ValueError(f"rate: expected a number above 0, frames per second, got {rate}")
         if len(layout.labels) < FEWEST:
             raise ValueError(f"layout: expected at least {FEWEST} markers, got {len(layout.labels)}")
-        config = AnimateConfig()
-        self.body = MarkedBody(subject, layout, config.prior_weight, config.prior_shrinkage)
-        self.search, self.rate = BodySearch(self.body, subject), rate
-        self.tracker = Tracker(self.body, config, rate, STEPS)
-        L = self.body.count
-        self.last, self.velocity = np.full((L, 3), np.nan), np.zeros((L, 3))
-        self.age = np.full(L, np.inf)                                   # frames since each marker had a point
-        self.empty, self.quiet, self.patience = 0, 0.0, PATIENCE
+        self.config, self.rate = AnimateConfig(), float(rate)
+        self.body = MarkedBody(subject, layout, self.config.prior_weight, self.config.prior_shrinkage)
+        self.search = BodySearch(self.body, subject)
+        self.watch = LimbWatch(self.search)
+        self.prediction = KalmanPrediction(self.body, self.config, self.rate)
+        self.memory = _Memory(self.body.count, self.rate)
+        self.x, self.found = np.full(self.body.n_unknowns, np.nan), False
+        self.belief = np.full(self.body.count, np.nan)                  # NaN of labels of which nothing is known yet
+        self.empty, self.quiet, self.patience = 0.0, 0.0, PATIENCE      # seconds
 
     def push(self, points: np.ndarray) -> LabelledFrame:
         """The next frame.
@@ -100,111 +107,204 @@ class LabelStream:
         Parameters
         ----------
         points : (N, 3) float, metres
-            In any order; NaN where one is out of sight.
+            In any order, as many as there are; NaN where one is out of sight.
+
+        Raises
+        ------
+        ValueError
+            Points of another shape.
         """
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        points = np.asarray(points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points: expected shape (N, 3), metres, got {points.shape}; pass one frame at a time")
+        # points that are there
         seen = np.flatnonzero((np.abs(points) < 1e6).all(axis=1))
-        visible, L = points[seen], self.body.count
-        self.quiet -= 1 / self.rate
-        self.age += 1
-        self.empty = self.empty + 1 if len(seen) < FEWEST else 0
-        if self.empty > GONE * self.rate:
-            self.tracker.started = False
-        if not self.tracker.started and not self._begin(visible):
-            return self._frame(np.full(L, -1), np.zeros(L), seen, False)
+        visible, dt = points[seen], 1 / self.rate
+        self.quiet -= dt
+        self.memory.unseen += dt
+        if not self.found and not self._begin(visible):
+            return self._frame(np.full(self.body.count, -1), seen)
 
-        # labels by where markers are expected, then the body by its labelled points
-        expected, _ = self.tracker.prediction.expect()
-        chosen, sure = self._label(visible, self.body.positions(expected))
-        self.tracker.wait = 1                                           # its own search knows labels only
-        x, _ = self.tracker.push(_taken(visible, chosen))
-        places = self.body.positions(x)
-        again, sure = self._label(visible, places)
-        if (again != chosen).any():                                     # the next frame begins from these
-            chosen = again
-        off = np.linalg.norm(_taken(visible, chosen) - places, axis=1)
-        self._remember(_taken(visible, chosen))
-        self._look_again(visible, x, chosen, off)
-        return self._frame(chosen, sure, seen, True)
+        # labels and pose, and what they are worth
+        chosen, sure, places = self._follow(visible)
+        self.memory.update(visible, chosen, places)
+        self.watch.update(visible, chosen, places, dt)
+        self._believe(visible, chosen, places, sure)
+        frame = self._frame(chosen, seen)
 
-    def _label(self, points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The point (L,) of each marker near its place (L, 3) and its track, -1 without one, and how sure that is."""
-        cost = _half_squares(places, points, PLACE_SD)
-        dt = self.age / self.rate
-        followed = dt < max(MEMORY, 1.5 / self.rate)
-        ahead = self.last + self.velocity * np.where(followed, dt, 0.0)[:, None]
-        sd = TRACK_SD + 0.5 * ACCELERATION * np.where(followed, dt, 0.0)**2
-        track = _half_squares(np.where(followed[:, None], ahead, 1e3), points, sd[:, None])
-        cost = np.where(followed[:, None], 0.5 * (cost + track), cost)
-        chosen, _ = assign(cost, ALONE)
-        rows, sure = np.flatnonzero(chosen >= 0), np.zeros(len(places))
-        if len(rows):
-            here, others = cost[rows, chosen[rows]], cost.copy()
-            others[rows, chosen[rows]] = np.inf
-            rival = np.minimum(np.minimum(others[:, chosen[rows]].min(axis=0), others[rows].min(axis=1)), ALONE)
-            sure[rows] = 1 / (1 + np.exp(np.maximum(here - rival, -50.0)))
-        return chosen, sure
+        # for the next frame: another limb, another body, or none
+        self.empty = self.empty + dt if (chosen >= 0).sum() < LABELS else 0.0
+        if self.empty > GONE:
+            self.found = False
+        elif len(visible) >= self._enough and not self._replace_body(visible):
+            self._replace_limb(visible)
+        return frame
 
-    def _remember(self, targets: np.ndarray) -> None:
-        """Where the points (L, 3) of the markers are now, and how fast they went."""
-        there = np.isfinite(targets[:, 0])
-        fresh = there & (self.age * 1.0 / self.rate > MEMORY + 1.0 / self.rate)
-        step = (targets - self.last) / np.maximum(self.age, 1)[:, None] * self.rate
-        self.velocity[there] = np.where(fresh[there, None] | np.isnan(step[there]), 0.0, step[there])
-        self.last[there], self.age[there] = targets[there], 0
+    @property
+    def _enough(self) -> float:
+        """Points in which a body is sought."""
+        return max(FEWEST, 0.5 * self.body.count)
+
+    def _follow(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The point (L,) of each marker, how sure that is (L,), and where the body has the markers now (L, 3)."""
+        body, prediction = self.body, self.prediction
+        expected, information = prediction.expect()
+        x, C, spread = expected, prediction.covariance, self.memory.spread()
+        for i in range(ROUNDS):
+            # where the markers are expected: on the body at x, uncertain by C, each with its offset, and on its track
+            pose, trans, _ = body.body.split(x[None])
+            y, columns = body.shapes.columns(pose, trans)
+            places, slopes = y[0].T, columns[0].transpose(2, 0, 1).copy()                        # (L, 3), (L, P, 3)
+            S = np.swapaxes(slopes, 1, 2) @ (C @ slopes) + spread[:, None, None] * np.eye(3)
+            on_body = Expected(places + self.memory.offsets(), np.linalg.inv(S))
+            chosen, sure = match(self.memory.with_tracks(on_body), points, len(points) < FEWEST)
+            shifted = shift_groups(on_body, slopes, C, spread, points, chosen)
+            doubt = bool((shifted != chosen).any())
+            chosen, sure = shifted, np.where(shifted != chosen, 0.5, sure)
+            if not (chosen >= 0).any():
+                break
+            # one Gauss-Newton step; markers in doubt follow the others at first
+            targets = _taken(points, chosen)
+            weights, _ = marker_weights(on_body.places, targets, self.config.marker_sd, self.config.outlier)
+            if i == 0 and not doubt:
+                weights = weights * np.maximum(2 * sure - 1, 0.0)
+            equations = body.with_prior(point_system(y, columns, targets[None], weights[None]), pose)
+            H = equations.hessian[0] + information
+            pull = information @ body.step_to(expected, x) if i else 0.0                         # none at the start
+            step = -np.linalg.solve(H, equations.gradient[0] + pull)
+            x, moved = body.retract(x, step), step @ slopes
+            places = places + moved
+            if not doubt and (sure[chosen >= 0] > CLEAR).all() and np.abs(moved).max() < SMALL:
+                break
+            if i < ROUNDS - 1:
+                C = np.linalg.inv(H)
+        measured = H - information if (chosen >= 0).any() else np.zeros_like(information)
+        prediction.update(x, measured)
+        self.x = x
+        return chosen, sure, places
+
+    def _believe(self, points: np.ndarray, chosen: np.ndarray, places: np.ndarray, sure: np.ndarray) -> None:
+        """Confidence: what the match was sure of, and over time what the body alone says."""
+        there = chosen >= 0
+        apart = ((points - places[:, None])**2).sum(axis=-1) / (2 * BODY_SD**2)
+        alone = certainty(apart, chosen) * np.where(self.watch.doubtful(), 0.5, 1.0)
+        earned = self.belief + (alone - self.belief) * min(1.0, 1 / (EARNED * self.rate))
+        earned = np.where(np.isnan(earned), alone, earned)
+        self.belief = np.where(there, np.minimum(earned, sure), self.belief)
 
     def _begin(self, points: np.ndarray) -> bool:
-        """Seek the body in the points of a frame; whether it was found."""
-        if len(points) < max(FEWEST, 0.5 * self.body.count) or self.quiet > 0:
+        """Seek the body in the points (N, 3) of a frame; whether it was found."""
+        if len(points) < self._enough or self.quiet > 0:
             return False
-        placement = self.search.find(points)
-        if placement.misfit > FOUND:
-            self.quiet, self.patience = self.patience, min(2 * self.patience, LONGEST)
+        found = self._find(points)
+        # markers for which there are no points cost the right body as much as any other
+        hidden = ALONE * max(0, self.body.count - len(points)) / self.body.count
+        if self.search.judge(found.x, points, JUDGED).misfit - hidden > FOUND:
+            self._wait()
             return False
-        self._go_on_from(placement)
+        self._go_on_from(found)
         return True
 
-    def _look_again(self, points: np.ndarray, x: np.ndarray, chosen: np.ndarray, off: np.ndarray) -> None:
-        """Seek the body, or a limb of it, anew where the labelled points are few or far from it."""
-        few = (chosen >= 0).sum() < FEW * min(self.body.count, len(points))
-        far = not (np.nanmedian(off) < OFF) if (chosen >= 0).any() else True
-        if not (few or far) or self.quiet > 0 or len(points) < max(FEWEST, 0.5 * self.body.count):
-            return
-        scale = OWN_PERSON.judged
-        now = self.search.judge(x, points, scale)
-        found = self.search.restart_limbs(now, points, scale)
-        if far:
-            anew = self.search.judge(self.search.find(points).x, points, scale)
-            found = min(found, anew, key=lambda one: one.misfit)
+    def _replace_body(self, points: np.ndarray) -> bool:
+        """Seek the body anew where it has fitted badly for a while; whether it is elsewhere, or nowhere."""
+        if self.watch.mean_strain < STRAINED or self.quiet > 0:
+            return False
+        now, found = self.search.judge(self.x, points, OWN_PERSON.judged), self._find(points)
         if (now.misfit - found.misfit) * self.body.count > BETTER:
             self._go_on_from(found)
-        else:
-            self.quiet, self.patience = self.patience, min(2 * self.patience, LONGEST)
+            return True
+        self._wait()
+        self.found = self.watch.mean_strain < LOST
+        return not self.found
+
+    def _replace_limb(self, points: np.ndarray) -> None:
+        """Go on with another pose of a limb where that fits better."""
+        found = self.watch.seek(self.x, points)
+        if found is None:
+            return
+        placement, rows, joints = found
+        velocity = self.prediction.velocity.copy()
+        velocity[[3 * joint + axis for joint in joints for axis in range(3)]] = 0.0
+        self.prediction.begin(placement.x)
+        self.prediction.velocity, self.x = velocity, placement.x
+        self.memory.forget(rows)
+        self.belief[rows] = np.nan
+
+    def _find(self, points: np.ndarray) -> Placement:
+        """The best body in a frame of points (N, 3), from nothing else."""
+        found = self.search.judge(self.search.find(points).x, points, OWN_PERSON.judged)
+        found = self.search.restart_limbs(found, points, OWN_PERSON.judged)
+        # as near to its points as it will be followed
+        targets = _taken(points, found.matches)
+        weights, _ = marker_weights(self.body.positions(found.x), targets, self.config.marker_sd, self.config.outlier)
+        x = self.body.solve(found.x[None], targets, weights, SETTLED, 1e-4).x[0]
+        return min(found, self.search.judge(x, points, OWN_PERSON.judged), key=lambda one: one.misfit)
 
     def _go_on_from(self, placement: Placement) -> None:
         """Continue from a body that was found, at rest."""
-        self.tracker.begin(placement.x)
-        self.age[:] = np.inf
+        self.prediction.begin(placement.x)
+        self.x, self.found, self.empty = placement.x, True, 0.0
+        self.memory.forget(np.arange(self.body.count))
+        self.watch.begin()
+        self.belief[:] = np.nan
         self.quiet = self.patience = PATIENCE
 
-    def _frame(self, chosen: np.ndarray, sure: np.ndarray, seen: np.ndarray, found: bool) -> LabelledFrame:
+    def _wait(self) -> None:
+        """Seek nothing for a while, twice as long every time."""
+        self.quiet, self.patience = self.patience, min(2 * self.patience, LONGEST)
+
+    def _frame(self, chosen: np.ndarray, seen: np.ndarray) -> LabelledFrame:
         """The result, in columns of the points as they were given."""
-        columns = np.where(chosen >= 0, seen[np.maximum(chosen, 0)] if len(seen) else -1, -1)
-        if not found:
-            return LabelledFrame(columns, sure, np.full((self.body.body.n_angles // 3, 3), np.nan), np.full(3, np.nan),
-                                 False)
-        pose, trans, _ = self.body.body.split(self.tracker.prediction.x)
-        return LabelledFrame(columns, sure, pose, trans, True)
+        there = chosen >= 0
+        columns = np.full(self.body.count, -1)
+        columns[there] = seen[chosen[there]]
+        pose, trans, _ = self.body.body.split(self.x if self.found else np.full_like(self.x, np.nan))
+        return LabelledFrame(columns, np.where(there, self.belief, 0.0), pose.copy(), trans.copy(), self.found)
 
 
-def _half_squares(places: np.ndarray, points: np.ndarray, sd: float | np.ndarray) -> np.ndarray:
-    """Half the squared deviations (L, N) of points (N, 3) from places (L, 3), at most `AWAY`."""
-    squared = ((places[:, None] - points)**2).sum(axis=-1)
-    return np.minimum(squared / (2 * sd**2), AWAY)
+class _Memory:
+    """What is remembered of the points of each marker."""
+
+    def __init__(self, count: int, rate: float) -> None:
+        self.bridge = max(BRIDGE, 1.5 / rate)                           # seconds that constant velocity is believed
+        self.unseen = np.full(count, np.inf)                            # seconds
+        self.last, self.velocity, self.off = (np.zeros((count, 3)) for _ in range(3))
+        self.moving = np.zeros(count, dtype=bool)                       # the velocity is known
+
+    def forget(self, rows: np.ndarray) -> None:
+        self.unseen[rows], self.moving[rows] = np.inf, False
+
+    def offsets(self) -> np.ndarray:
+        """(L, 3) metres from the place of each marker to its point, ever less while it is out of sight."""
+        return np.exp(-self.unseen / FORGOTTEN)[:, None] * self.off
+
+    def spread(self) -> np.ndarray:
+        """(L,) m², variance of each point about its place and offset."""
+        return np.minimum(SEEN_SD**2 + WORN_SD**2 * self.unseen / FORGOTTEN, WORN_SD**2)
+
+    def with_tracks(self, expected: Expected) -> Expected:
+        """Where markers are expected, by constant velocity besides where they were seen of late."""
+        rows = np.flatnonzero(self.moving & (self.unseen < self.bridge))
+        if not len(rows):
+            return expected
+        dt = self.unseen[rows]
+        sd = TRACK_SD + 0.5 * ACCELERATION * dt**2
+        ahead = self.last[rows] + self.velocity[rows] * dt[:, None]
+        return intersect(expected, Expected(ahead, np.eye(3) / sd[:, None, None]**2), rows)
+
+    def update(self, points: np.ndarray, chosen: np.ndarray, places: np.ndarray) -> None:
+        """The next frame: points (N, 3), the one of each marker (L,), and where the body has its markers (L, 3)."""
+        rows = np.flatnonzero(chosen >= 0)
+        at, dt = points[chosen[rows]], self.unseen[rows]
+        share = np.where(dt < FORGOTTEN, 1 - np.exp(-dt / SMOOTHED), 1.0)[:, None]
+        self.off[rows] += share * (at - places[rows] - self.off[rows])
+        self.moving[rows] = dt < self.bridge
+        self.velocity[rows] = (at - self.last[rows]) / dt[:, None]
+        self.last[rows], self.unseen[rows] = at, 0.0
 
 
 def _taken(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """The points (L, 3) that were chosen, NaN where none was."""
-    if not len(points):
-        return np.full((len(chosen), 3), np.nan)
-    return np.where(chosen[:, None] >= 0, points[np.maximum(chosen, 0)], np.nan)
+    targets = np.full((len(chosen), 3), np.nan)
+    targets[chosen >= 0] = points[chosen[chosen >= 0]]
+    return targets

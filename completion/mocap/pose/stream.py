@@ -124,7 +124,7 @@ class KalmanPrediction:
         cross, speed = m * self.cross + kept, kept
         for block, share in ((place, 0.25), (cross, 0.5), (speed, 1.0)):  # after one frame of constant acceleration
             block[np.diag_indices(len(block))] += share * self.noise
-        self._ahead = cross, speed
+        self._ahead, self.covariance = (cross, speed), place            # (P, P) of what is expected
         self._expected = self.body.retract(self.x, m * self.velocity)
         information = np.linalg.inv(place)
         self._information = 0.5 * (information + information.T)

@@ -1,0 +1,113 @@
+"""Limbs that do not fit their points any more: noticed by what they usually leave, and sought anew."""
+from __future__ import annotations
+
+import numpy as np
+
+from .body_search import ALONE, LIMB_ROUNDS, BodySearch, Placement
+from .follow_points import OWN_PERSON
+from .live_matching import left_over
+
+WINDOW, LONG = 0.1, 2.0              # seconds over which strains are averaged, and what is usual
+RISE = 0.5                           # most markers by which a strain may lift what is usual
+BEGIN = 0.5                          # markers, what is usual at first
+# markers of strain above the usual at which a limb is sought: a foot turned about had 1.3 to 1.9, a right one below 0.8
+WORSE = 0.8
+BETTER = 0.6                         # markers of misfit that a search has to gain; a foot turned about gained 2.5 to 4
+NEAR = 0.2                           # metres from its place within which a free point may be a marker's
+POSES = 8                            # of the limb that are tried, half of them with what follows the second joint alone
+PATIENCE, LONGEST = 0.25, 4.0        # seconds from a search that found nothing to the next, doubled up to the longest
+
+
+class LimbWatch:
+    """Watches the limbs of a body that is followed through points.
+
+    Parameters
+    ----------
+    search : BodySearch
+    """
+
+    def __init__(self, search: BodySearch) -> None:
+        self.search = search
+        self.rows = [rows_of_limb(search, limb) for limb in search.limbs]
+        # all poses take their turn
+        self.order, self.tries = search.poses[np.random.default_rng(0).permutation(len(search.poses))], 0
+        self.usual = np.full(len(self.rows), BEGIN)
+        self.patience = np.full(len(self.rows), PATIENCE)
+        self.begin()
+
+    def begin(self) -> None:
+        """A body that was just found."""
+        # of each marker, 0 to 1: of the last frame, and on average
+        self.cost, self.strain = np.zeros(self.search.body.count), np.zeros(self.search.body.count)
+        self.quiet = np.zeros(len(self.rows))
+
+    @property
+    def mean_strain(self) -> float:
+        """Of all markers, 0 to 1."""
+        return float(self.strain.mean())
+
+    def update(self, points: np.ndarray, chosen: np.ndarray, places: np.ndarray, dt: float) -> None:
+        """The next frame: points (N, 3), the one of each marker (L,), and where the body has its markers (L, 3)."""
+        there = chosen >= 0
+        cost = np.zeros(len(chosen))
+        squared = ((points[chosen[there]] - places[there])**2).sum(axis=1)
+        cost[there] = squared / (squared + OWN_PERSON.judged**2)
+        # a marker without a point is a fault where a free point is near
+        free = left_over(len(points), chosen)
+        if len(free) and not there.all():
+            apart = ((points[free] - places[~there][:, None])**2).sum(axis=-1).min(axis=1)
+            cost[~there] = np.where(apart < NEAR**2, ALONE, 0.0)
+        self.cost = cost
+        self.strain += (cost - self.strain) * min(1.0, dt / WINDOW)
+        strain = self._of_limbs(self.strain)
+        self.usual += (np.minimum(strain, self.usual + RISE) - self.usual) * min(1.0, dt / LONG)
+        self.quiet -= dt
+
+    def doubtful(self) -> np.ndarray:
+        """Whether each marker (L,) is on a limb that fits worse than usual."""
+        doubted = np.zeros(len(self.strain), dtype=bool)
+        for rows, worse in zip(self.rows, self._of_limbs(self.strain) - self.usual, strict=True):
+            doubted[rows] = worse > WORSE
+        return doubted
+
+    def seek(self, x: np.ndarray, points: np.ndarray) -> tuple[Placement, np.ndarray, list[int]] | None:
+        """A body that fits the points (N, 3) better with one limb from another pose, its markers and joints, or None.
+
+        At most one limb is sought in a frame, which takes about 30 ms: the one that fits worst, if that is due.
+        """
+        # in a frame that shows the fault: markers may be hidden in others
+        strain, shown = self._of_limbs(self.strain), self._of_limbs(self.cost)
+        worse = np.where((self.quiet > 0) | (shown < strain), -np.inf, strain - self.usual)
+        limb = int(worse.argmax())
+        if worse[limb] < WORSE:
+            return None
+        now = self.search.judge(x, points, OWN_PERSON.judged)
+        found = self.search.refine(self._starts(x, limb), points, LIMB_ROUNDS, OWN_PERSON.judged)
+        if (now.misfit - found.misfit) * self.search.body.count > BETTER:
+            self.strain[self.rows[limb]] = 0.0
+            self.quiet[limb] = self.patience[limb] = PATIENCE
+            return found, self.rows[limb], self.search.limbs[limb]
+        self.quiet[limb], self.patience[limb] = self.patience[limb], min(2 * self.patience[limb], LONGEST)
+        return None
+
+    def _starts(self, x: np.ndarray, limb: int) -> np.ndarray:
+        """Unknowns (n, P) with other poses of a limb, and of its end alone."""
+        poses = np.roll(self.order, -POSES * self.tries, axis=0)[:POSES]
+        self.tries += 1
+        starts = np.repeat(x[None], len(poses), axis=0)
+        for depth, joint in enumerate(self.search.limbs[limb]):
+            some = slice(0, None, 1 if depth > 1 else 2)
+            starts[some, 3 * joint:3 * joint + 3] = poses[some, joint]
+        return starts
+
+    def _of_limbs(self, values: np.ndarray) -> np.ndarray:
+        return np.array([values[rows].sum() for rows in self.rows])
+
+
+def rows_of_limb(search: BodySearch, limb: list[int]) -> np.ndarray:
+    """The markers (n,) that the first joint of a limb moves."""
+    body = search.body
+    x = np.zeros((2, body.n_unknowns))
+    x[1, 3 * limb[0]:3 * limb[0] + 3] = 0.3                             # radians, so that centimetres tell
+    still, bent = body.positions(x)
+    return np.flatnonzero(np.linalg.norm(bent - still, axis=1) > 0.01)
