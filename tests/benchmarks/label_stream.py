@@ -102,7 +102,7 @@ def push_all(take: Take, points: np.ndarray) -> tuple[list[LabelledFrame], np.nd
 
 
 def score(frames: list[LabelledFrame], names: np.ndarray) -> dict[str, float]:
-    """Per cent of the markers under their own label, of the labels wrong and on ghosts, and of both that are doubted."""
+    """Per cent of the markers under their own label, of labels wrong and on ghosts, and of both that are doubted."""
     columns = np.stack([frame.columns for frame in frames])
     labels = np.where(columns >= 0, np.take_along_axis(names, np.maximum(columns, 0), axis=1), -2)
     right = labels == np.arange(labels.shape[1])
