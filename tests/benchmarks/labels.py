@@ -145,7 +145,9 @@ def main() -> None:
         if not arguments.files or path.stem in arguments.files:
             markers = read_markers(path)
             rows, layout = choose_layout(model, "cmu41", markers.labels)[0].worn(markers.labels)
-            recordings[path.stem] = layout, markers.positions[:arguments.frames, rows], markers.rate
+            order = np.argsort(layout.labels)                           # the same in all files
+            layout = layout.select([layout.labels[i] for i in order])
+            recordings[path.stem] = layout, markers.positions[:arguments.frames, rows[order]], markers.rate
     out = []
     for i, (name, (layout, places, rate)) in enumerate(recordings.items()):
         for stage in arguments.stages:
