@@ -13,11 +13,12 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
+from .condensed import Condensation, Condensed, ShapedCondensed, slices
 from .features import PoseFeatures
 from .gradients import edges
 from .linear import Subject, check_points
 from .pose_space import PoseSpace
-from .products import Products, ShapedProducts, Terms
+from .products import ShapedProducts, Terms
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
@@ -107,22 +108,45 @@ class BlendedTemplate:
         return Terms(features, np.repeat([block.rotation for block in self.blocks], [len(e) for e in each]),
                      np.concatenate(each))
 
-    def operator(self, space: PoseSpace, S: np.ndarray) -> Products:
-        """All vertices of one body with shape deformation S (F, 3, 3): T (M, N, 3), metres, of every term.
+    @cached_property
+    def condensation(self) -> Condensation:
+        """The stitching system, condensed onto the borders of the parts."""
+        return Condensation(self.stitching, self.skeleton)
+
+    def operator(self, space: PoseSpace, S: np.ndarray) -> Condensed:
+        """All vertices of one body with shape deformation S (F, 3, 3).
 
         [SCAPE] Eq. 9
         """
-        G, n = self.stitching.edge_operator, len(self.template.vertices)
-        columns = []
-        for block in self.blocks:
+        tables = tuple(self._tables(space, S[None], p)[0] for p in range(len(self.skeleton.parents)))
+        return Condensed(self.condensation, self.terms(space.features), tables, self.skeleton.joints[0])
+
+    def shaped(self, space: PoseSpace, shapes: ShapeSpace) -> ShapedCondensed:
+        """All vertices as a function of pose and betas.
+
+        [SCAPE] Eq. 9
+        """
+        own, mean = (self.operator(space, S) for S in (shapes.gradients(None), shapes.mean))
+        flat = np.empty((shapes.count, sum(table.size for table in mean.tables)))
+        for p, some in enumerate(slices([table.size for table in mean.tables])):
+            flat[:, some] = self._tables(space, shapes.components, p).reshape(shapes.count, -1)
+        return ShapedCondensed(own, mean, flat)
+
+    def _tables(self, space: PoseSpace, S: np.ndarray, p: int) -> np.ndarray:
+        """(K, M_p, 3, i_p + loads_p) metres: what the products of part p contribute for shapes S (K, F, 3, 3)."""
+        part, blocks = self.condensation.parts[p], [block for block in self.blocks if block.part == p]
+        rows, counts = len(part.inside) + len(part.loads), [len(space.coefficients[p])] * len(blocks)
+        out = np.empty((len(S), sum(counts), 3, rows))
+        for block, some in zip(blocks, slices(counts), strict=True):
             faces, a = _coefficients(space, block)
-            wanted = (self.v_hat[faces] * block.weights[:, None, None]) @ np.swapaxes(S[faces] @ a, -1, -2)
-            rows = (2 * faces[:, None] + np.arange(2)).ravel()                     # wanted: (n, f, 2, 3)
-            column = wanted.reshape(len(a), -1, 3).transpose(1, 0, 2).reshape(len(rows), -1)
-            columns.append((G[rows].T @ column).reshape(n, len(a), 3))
-        rhs = np.concatenate(columns, axis=1)
-        T = self.stitching.solve(rhs.reshape(n, -1)).reshape(rhs.shape).transpose(1, 0, 2)
-        return Products(self.terms(space.features), T, self.skeleton.joints[0])
+            posed = (self.v_hat[faces] * block.weights[:, None, None]) @ np.swapaxes(a, -1, -2)       # (n, f, 2, 3)
+            for start in range(0, len(S), 8):                       # as many columns as are solved for together
+                shapes = S[start:start + 8, faces]
+                wanted = np.zeros((len(part.faces), 2, len(shapes), len(a), 3))
+                wanted[block.chosen] = np.moveaxis(posed @ np.swapaxes(shapes[:, None], -1, -2), (2, 3), (0, 1))
+                found = part.table(wanted.reshape(2 * len(part.faces), -1))
+                out[start:start + 8, some] = np.moveaxis(found.reshape(rows, len(shapes), len(a), 3), 0, -1)
+        return out
 
     def subject(self, space: PoseSpace, S: np.ndarray | None = None) -> Subject:
         """A body with a pose space in the making, the template's own unless S (F, 3, 3) is given."""

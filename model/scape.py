@@ -15,19 +15,19 @@ from scanprep.skeleton.tree import Skeleton
 from .bilinear import ShapedPoints
 from .blending import BlendedTemplate, rigid_weights
 from .body import BodyModel, Progress, restored_variances
+from .condensed import Condensed, ShapedCondensed
 from .features import PoseFeatures
 from .gradients import GradientSystem, ShapeSolver, shape_gradients
 from .linear import Subject, check_pose
 from .pose_space import PoseSpace, faces_of_part
 from .priors import sample_poses
-from .products import Products, Terms
+from .products import Terms
 from .resolution.transfer import Follower, Piece, gradients_of
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
 NORMAL = 0.3                         # how much normals count beside edges: triangles thicken as they grow
 SHRINK = 1e-3                        # of the mean square: holds what the poses do not show
-AT_ONCE = 1000                       # triangles whose components are near the processor together
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,37 +98,21 @@ class ScapeModel(BodyModel):
         RS = self.parts.rotations(pose) @ self.shape_space.gradients(betas)
         return self.stitching.stitch(self.posed_edges(pose) @ np.swapaxes(RS, -1, -2))
 
-    @cached_property
-    def _posed_coefficients(self) -> list[np.ndarray]:
-        """For each part (n_p, F_p * 6): `Q v̂` of its triangles, one row a feature."""
-        return [(self.parts.v_hat[faces] @ np.swapaxes(a.astype(np.float64), -1, -2)).reshape(len(a), -1)
-                for a, faces in zip(self.pose_space.coefficients, self.pose_space.faces_of_part, strict=True)]
-
     def bodies_of(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
-        """All together, part by part.
-
-        [SCAPE] Eq. 6, Eq. 9
-        """
-        B, R = len(poses), self.skeleton.part_rotations(poses)
-        delta = self.pose_space.features.evaluate(poses)
-        edges = np.zeros((B, len(self.template.faces), 2, 3))
-        shaped = np.empty_like(edges)
-        for p, faces in enumerate(self.pose_space.faces_of_part):
-            posed = delta[:, self.pose_space.features.of_part(p)] @ self._posed_coefficients[p]
-            S = self.shape_space.some_gradients(betas, faces)
-            shaped[:, faces] = posed.reshape(B, -1, 2, 3) @ np.swapaxes(S, -1, -2)
-        for block in self.parts.blocks:
-            faces = self.pose_space.faces_of_part[block.part][block.chosen]
-            rotated = shaped[:, faces].reshape(B, -1, 3) @ np.swapaxes(R[:, block.rotation], -1, -2)
-            edges[:, faces] += block.weights[:, None, None] * rotated.reshape(B, -1, 2, 3)
-        return self.stitching.stitch(edges)
+        return self.everywhere.bodies(poses, betas)
 
     @property
     def features(self) -> PoseFeatures:                                                     # type: ignore[override]
         return self.pose_space.features
 
-    def operator(self, betas: np.ndarray | None = None) -> Products:
-        return self.parts.operator(self.pose_space, self.shape_space.gradients(betas))
+    @cached_property
+    def everywhere(self) -> ShapedCondensed:
+        return self.parts.shaped(self.pose_space, self.shape_space)
+
+    def operator(self, betas: np.ndarray | None = None) -> Condensed:
+        # the tables of all betas are made when they are first asked for
+        return self.parts.operator(self.pose_space, self.shape_space.gradients(None)) if betas is None else \
+            self.everywhere.operator(betas)
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedPoints:
@@ -136,17 +120,7 @@ class ScapeModel(BodyModel):
 
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         pose, _ = check_pose(self.skeleton, pose, None)
-        R, posed = self.parts.rotations(pose), self.posed_edges(pose)
-        K, F = self.n_betas, len(R)
-        if not K:
-            return np.zeros((self.template.vertices.shape[0] if vertex_ids is None else len(vertex_ids), 3, 0))
-        by_entry = (R[:, None, :, :, None] * posed[:, :, None, None, :]).reshape(F, 6, 9)
-        U, e = self.shape_space.components.reshape(K, F, 9), np.empty((F, 6, K))
-        for start in range(0, F, AT_ONCE):                                                  # R U_k Q v̂_j
-            some = slice(start, start + AT_ONCE)
-            e[some] = by_entry[some] @ np.ascontiguousarray(U[:, some].transpose(1, 2, 0), dtype=np.float64)
-        rhs = self.stitching.edge_operator.T @ e.reshape(2 * F, 3 * K)
-        y = self.stitching.solve(rhs).reshape(-1, 3, K)
+        y = self.everywhere.shape_jacobian(pose)
         return y if vertex_ids is None else y[vertex_ids]
 
     def pull_back(self, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -49,12 +49,6 @@ class ShapeSpace:
             S[start:start + AT_ONCE] += betas @ U[:, start:start + AT_ONCE].astype(np.float64)
         return S.reshape(self.mean.shape)
 
-    def some_gradients(self, betas: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """S (B, f, 3, 3) of some triangles (f,) for betas (B, k) of many people."""
-        self._check(betas, 2)
-        U = self.components[:betas.shape[1], faces].reshape(betas.shape[1], -1).astype(np.float64)
-        return (betas @ U + self.mean[faces].ravel()).reshape(len(betas), len(faces), 3, 3)
-
     def _check(self, betas: np.ndarray, dimensions: int) -> None:
         """ValueError for betas (..., k) that this space has not."""
         if betas.ndim != dimensions or betas.shape[-1] > self.count:

@@ -1,0 +1,329 @@
+"""A whole SCAPE body, part by part: the stitching system condensed onto the borders of the parts.
+
+Inside a part, triangles follow few rotations and few features. So the stitched inside is a small table, once the
+vertices on the part's border are known. With Eq. 2's normal matrix L = GᵀG, insides i of the parts and border b:
+
+    y_i = U_p + H_p y_b          U_p = L_ii⁻¹ G_iᵀ e_p,    H_p = -L_ii⁻¹ L_ib
+    y_b = A Σ_p (G_b + G_i H_p)ᵀ e_p                       A = S⁻¹ of the Schur complement S = L_bb + Σ_p L_bi H_p
+
+The edges e_p, so U_p and the loads on the border too, are linear in betas and in products of features and rotations.
+A body with new betas is one product of betas and tables: no system is solved again. A pose reads a third of the numbers
+that the products of all vertices hold (`Products`), which say the same.
+
+[SCAPE] Eq. 2, Eq. 9
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array, sparray
+
+from scanprep.geometry.sparse import Factored
+from scanprep.skeleton.tree import Skeleton
+
+from .bilinear import ShapedPoints
+from .linear import PointOperator, chosen_rows
+from .products import Products, ShapedProducts, Terms
+from .stitching import StitchingSystem
+
+AT_ONCE = 96                         # coordinates that are made together: more leave the cache, fewer waste products
+
+
+@dataclass(frozen=True, eq=False)
+class PartSystem:
+    """The triangles (f,) of one part, the vertices inside it (i,), and the `places` (b,) of its border among all.
+
+    `loads` are the same places, and of part 0 that of the root's joint after all others. `spread` is H (i, b);
+    `edge_operator` (2f, i + b) gives the edges of the triangles.
+    """
+
+    faces: np.ndarray
+    inside: np.ndarray
+    places: np.ndarray
+    loads: np.ndarray
+    spread: np.ndarray
+    edge_operator: csc_array
+    root_weights: np.ndarray
+    factored: Factored | None
+
+    def table(self, edges: np.ndarray) -> np.ndarray:
+        """(i + loads, k): U and the loads that wanted edges (2f, k) leave."""
+        load, i = self.edge_operator.T @ edges, len(self.inside)
+        U = load[:0] if self.factored is None else self.factored.solve(load[:i])
+        rows = [U, load[i:] + self.spread.T @ load[:i]]
+        if len(self.loads) > len(self.places):
+            rows.append((self.root_weights @ U)[None])
+        return np.concatenate(rows)
+
+
+class Condensation:
+    """The stitching system of a template, condensed once onto the n vertices `border` where parts meet."""
+
+    def __init__(self, stitching: StitchingSystem, skeleton: Skeleton) -> None:
+        self.n_vertices, J = stitching.n_vertices, len(skeleton.parents)
+        touches = np.zeros((self.n_vertices, J), dtype=bool)
+        touches[stitching.faces, skeleton.part_of_face[:, None]] = True
+        on_border = touches.sum(axis=1) > 1
+        on_border[0] |= not on_border.any()                     # one part alone is held at a vertex
+        self.border = np.flatnonzero(on_border)
+        n, G, root = len(self.border), stitching.edge_operator.tocsr(), stitching.root_weights
+
+        # the Schur complement, and how the root's joint follows the border, both part by part
+        S, follow = np.zeros((n, n)), root[self.border].copy()
+        self.parts: list[PartSystem] = []
+        for p in range(J):
+            faces = np.flatnonzero(skeleton.part_of_face == p)
+            inside, border = (np.flatnonzero(touches[:, p] & chosen) for chosen in (~on_border, on_border))
+            places, i = np.searchsorted(self.border, border), len(inside)
+            own = csc_array(G[(2 * faces[:, None] + np.arange(2)).ravel()][:, np.r_[inside, border]])
+            L = csc_array(own.T @ own)
+            factored = Factored(csc_array(L[:i, :i])) if i else None
+            spread = -factored.solve(L[:i, i:].toarray()) if factored is not None else np.zeros((0, len(border)))
+            S[np.ix_(places, places)] += L[i:, i:].toarray() + L[i:, :i] @ spread
+            follow[places] += spread.T @ root[inside]
+            loads = np.r_[places, n] if p == 0 else places
+            self.parts.append(PartSystem(faces, inside, places, loads, spread, own, root[inside], factored))
+
+        # loads sum to zero: one more entry fixes where the border stands and changes nothing else
+        S[0, 0] += 1
+        self.factored, self.follow = Factored(csc_array(S)), follow
+        self._spreads: dict[Any, list[np.ndarray]] = {}
+
+        # vertices in the order of the insides, one part after the other, then the border; and where each is in it
+        self.inside = slices([len(part.inside) for part in self.parts])
+        order = np.concatenate([*[part.inside for part in self.parts], self.border])
+        self.place_of = np.argsort(order)
+
+    @cached_property
+    def answer(self) -> np.ndarray:
+        """A (n, n + 1): the border that loads bring about, the root's joint in the origin; the last load is its own."""
+        A = self.factored.solve(np.eye(len(self.border)) - self.follow[:, None]).T
+        return np.concatenate([A, -np.ones((len(A), 1))], axis=1)
+
+    def spreads(self, dtype: Any) -> list[np.ndarray]:
+        """Hᵀ (b, i) of every part, contiguous, in a type."""
+        if dtype not in self._spreads:
+            self._spreads[dtype] = [np.ascontiguousarray(part.spread.T, dtype=dtype) for part in self.parts]
+        return self._spreads[dtype]
+
+
+@dataclass(frozen=True, eq=False)
+class Condensed(PointOperator):
+    """All vertices of a body of fixed shape.
+
+    Parameters
+    ----------
+    system : Condensation
+    terms : Terms
+        Products of features and rotations, in the order of the parts of the triangles that they shape.
+    tables : J arrays (M_p, 3, i_p + loads_p), metres
+        What each product of a part contributes to the vertices inside it and to the loads on its border.
+    origin : (3,) float, metres
+    """
+
+    system: Condensation
+    terms: Terms
+    tables: tuple[np.ndarray, ...]
+    origin: np.ndarray
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.terms.skeleton
+
+    @property
+    def count(self) -> int:
+        return self.system.n_vertices
+
+    @property
+    def load(self) -> int:
+        return self.terms.count + 4 * len(self.skeleton.parents)
+
+    def turned(self, pose: np.ndarray) -> np.ndarray:
+        dtype = self.tables[0].dtype
+        W = np.moveaxis(self.terms.weights(pose).astype(dtype, copy=False), -3, -2)        # (..., i, m, j)
+        W = W.reshape(-1, self.terms.count, 3)
+        y = np.empty((len(W), self.count), dtype=dtype)
+        for start in range(0, len(W), AT_ONCE):
+            some = W[start:start + AT_ONCE]
+            y[start:start + AT_ONCE] = place(self.system, [
+                times(some[:, mine].reshape(len(some), -1), table.reshape(-1, table.shape[2]))
+                for mine, table in zip(self.products_of_part, self.tables, strict=True)])
+        return y.reshape(*pose.shape[:-2], 3, self.count)
+
+    @cached_property
+    def products_of_part(self) -> list[slice]:
+        """Which products the tables are of."""
+        return slices([len(table) for table in self.tables])
+
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.products.columns(pose, trans)
+
+    @cached_property
+    def products(self) -> Products:
+        """The same body as products of all vertices: what derivatives by the pose are made of."""
+        return self.of_vertices(np.arange(self.count))
+
+    def of_vertices(self, ids: np.ndarray) -> Products:
+        """Some vertices (L,) as products."""
+        system, tables = self.system, [table.reshape(-1, table.shape[2]) for table in self.tables]
+        dtype, rows = tables[0].dtype, slices([len(table) for table in tables])
+        place, n = system.place_of[ids], len(system.border)
+        of_border = place - (system.n_vertices - n)                       # negative for vertices inside a part
+        of_part = [np.flatnonzero((place >= some.start) & (place < some.stop)) for some in system.inside]
+
+        # what all products do to the border vertices asked for, and to those around parts whose inside is asked for
+        needed = np.unique(np.concatenate([of_border[of_border >= 0], *[
+            part.places for part, chosen in zip(system.parts, of_part, strict=True) if len(chosen)]]))
+        around, answer = np.empty((rows[-1].stop, len(needed)), dtype=dtype), system.answer.T[:, needed].astype(dtype)
+        for some, part, table in zip(rows, system.parts, tables, strict=True):
+            around[some] = table[:, len(part.inside):] @ answer[part.loads]
+
+        T = np.empty((rows[-1].stop, len(ids)), dtype=dtype)
+        T[:, of_border >= 0] = around[:, np.searchsorted(needed, of_border[of_border >= 0])]
+        for p, (some, chosen) in enumerate(zip(rows, of_part, strict=True)):
+            if len(chosen):
+                at, places = place[chosen] - system.inside[p].start, np.searchsorted(needed, system.parts[p].places)
+                T[:, chosen] = around[:, places] @ system.spreads(dtype)[p][:, at]
+                T[some, chosen] += tables[p][:, at]
+        basis = np.swapaxes(T.reshape(self.terms.count, 3, len(ids)), 1, 2)
+        return Products(self.terms, np.ascontiguousarray(basis), self.origin)
+
+    def combined(self, weights: np.ndarray | sparray) -> Products:
+        rows = chosen_rows(weights)
+        if rows is not None:
+            return self.of_vertices(np.asarray(rows))
+        sparse = csr_array(weights)
+        used, place_of = np.unique(sparse.indices, return_inverse=True)
+        few = csr_array((sparse.data, place_of, sparse.indptr), shape=(sparse.shape[0], len(used)))
+        return self.of_vertices(used).combined(weights[:, used] if isinstance(weights, np.ndarray) else few)
+
+    def plus(self, factor: float, other: PointOperator) -> Condensed:
+        assert isinstance(other, Condensed), "of the same kind of model"
+        tables = tuple(a + a.dtype.type(factor) * b for a, b in zip(self.tables, other.tables, strict=True))
+        return replace(self, tables=tables, origin=self.origin + factor * other.origin)
+
+    def scaled(self, factor: float) -> Condensed:
+        return replace(self, tables=tuple((factor * table).astype(table.dtype) for table in self.tables))
+
+    def astype(self, dtype: Any) -> Condensed:
+        return replace(self, tables=tuple(table.astype(dtype, copy=False) for table in self.tables))
+
+
+def place(system: Condensation, local: list[np.ndarray]) -> np.ndarray:
+    """All vertices (k, N) of insides and loads (k, i_p + loads_p) of the parts, k coordinates at once.
+
+    [SCAPE] Eq. 2
+    """
+    k, dtype, n = len(local[0]), local[0].dtype, len(system.border)
+    loads = np.zeros((n + 1, k))
+    for part, rows in zip(system.parts, local, strict=True):
+        loads[part.loads] += rows[:, len(part.inside):].T
+    around = system.factored.solve(loads[:n]).T
+    around = np.ascontiguousarray(around - (around @ system.follow + loads[n])[:, None], dtype=dtype)
+    y = np.empty((k, system.n_vertices), dtype=dtype)
+    y[:, -n:] = around
+    for part, some, spread, rows in zip(system.parts, system.inside, system.spreads(dtype), local, strict=True):
+        np.add(times(around[:, part.places], spread), rows[:, :len(part.inside)], out=y[:, some])
+    return np.take(y, system.place_of, axis=1)
+
+
+def times(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """`rows @ matrix`; of few rows one by one, which BLAS does in two thirds of the time."""
+    return (rows[:, None] @ matrix)[:, 0] if len(rows) <= 3 else rows @ matrix
+
+
+def slices(lengths: list[int]) -> list[slice]:
+    """Where parts of these lengths stand one after the other."""
+    ends = np.cumsum(lengths).tolist()
+    return [slice(end - length, end) for end, length in zip(ends, lengths, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedCondensed(ShapedPoints):
+    """All vertices of a body of free shape: tables of the template's own body, of the mean person, and by each beta.
+
+    `flat` (K, n) are the changes of all tables by each beta, one after the other, as `mean` holds them.
+    """
+
+    own: Condensed
+    mean: Condensed
+    flat: np.ndarray
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.mean.skeleton
+
+    @property
+    def count(self) -> int:
+        return self.mean.count
+
+    @property
+    def n_betas(self) -> int:
+        return len(self.flat)
+
+    @property
+    def load(self) -> int:
+        return self.mean.load
+
+    def operator(self, betas: np.ndarray | None = None) -> Condensed:
+        if betas is None:
+            return self.own
+        betas = self._checked(betas)
+        flat = betas @ self.flat[:len(betas)]
+        tables = tuple(mean + flat[some].reshape(mean.shape) for some, mean in
+                       zip(self._slices, self.mean.tables, strict=True))
+        return replace(self.mean, tables=tables)
+
+    def bodies(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
+        """Vertices (B, N, 3), metres, of poses (B, J, 3) and betas (B, k), the template's root joint in the origin."""
+        mean, W = self.mean, np.moveaxis(self.mean.terms.weights(poses), -3, -2)                # (B, i, m, j)
+        out = np.empty((len(poses), self.count, 3))
+        for start in range(0, len(poses), AT_ONCE // 3):
+            some = slice(start, start + AT_ONCE // 3)
+            flat, local = betas[some] @ self.flat[:betas.shape[1]], []
+            for mine, chosen, table in zip(mean.products_of_part, self._slices, mean.tables, strict=True):
+                tables = (flat[:, chosen] + table.ravel()).reshape(len(flat), -1, table.shape[2])
+                rows = W[some][:, :, mine].reshape(len(flat), 3, -1) @ tables
+                local.append(rows.reshape(-1, table.shape[2]))
+            out[some] = np.swapaxes(place(mean.system, local).reshape(len(flat), 3, -1), 1, 2)
+        return out
+
+    @cached_property
+    def _slices(self) -> list[slice]:
+        return slices([table.size for table in self.mean.tables])
+
+    def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
+        pose = np.asarray(pose, dtype=np.float64)
+        K, terms = self.n_betas, self.mean.terms
+        W = np.moveaxis(terms.weights(pose), -3, -2).reshape(-1, terms.count, 3)
+        local = []
+        for some, flat, table in zip(self.mean.products_of_part, self._slices, self.mean.tables, strict=True):
+            change = self.flat[:, flat].reshape(K, -1, table.shape[2])
+            rows = W[:, some].reshape(len(W), 1, 1, -1) @ change                            # (B 3, K, 1, rows)
+            local.append(rows.reshape(-1, table.shape[2]))
+        y = place(self.mean.system, local).reshape(*pose.shape[:-2], 3, K, self.count)
+        return np.moveaxis(y, -1, -3)
+
+    def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
+        each = [self.own.combined(weights), self.mean.combined(weights)]
+        zero = replace(self.mean, tables=tuple(np.zeros_like(table) for table in self.mean.tables))
+        changes = []
+        for flat in self.flat:
+            tables = tuple(flat[some].reshape(table.shape) for some, table in
+                           zip(self._slices, self.mean.tables, strict=True))
+            changes.append(replace(zero, tables=tables).combined(weights).basis)
+        own, mean = (one.basis for one in each)
+        return ShapedProducts(self.mean.terms, own, mean, np.array(changes).reshape(self.n_betas, *mean.shape),
+                              self.mean.origin)
+
+    def joined(self, other: ShapedPoints) -> ShapedPoints:
+        raise NotImplementedError("a whole body is joined to nothing")
+
+    def along(self, directions: np.ndarray) -> ShapedCondensed:
+        return replace(self, flat=directions @ self.flat)
+
+    def first(self, n_betas: int) -> ShapedCondensed:
+        return replace(self, flat=self.flat[:n_betas])
