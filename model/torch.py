@@ -15,16 +15,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor, nn
 
 from .bilinear import ShapedPoints
 from .blended import Blended, ShapedBlended
 from .body import BodyModel
 from .condensed import Condensed, ShapedCondensed, slices
+from .features import PoseFeatures
 from .linear import PointOperator, Subject
 from .products import Products, ShapedProducts, Terms
 
@@ -178,7 +180,7 @@ class _ProductPoints(_Points):
 
         def rows(T: np.ndarray) -> np.ndarray:
             """(..., 3M, L): products, then coordinates, times points."""
-            return np.swapaxes(T, -1, -2).reshape(*T.shape[:-3], -1, T.shape[-2])
+            return np.swapaxes(T, -1, -2).reshape(*T.shape[:-3], 3 * T.shape[-3], T.shape[-2])
 
         self.keep("own", rows(own))
         self.keep("table", np.concatenate([rows(mean)[None], rows(change)]))
@@ -221,7 +223,7 @@ class _BlendedPoints(_Points):
         self.keep("bends", np.swapaxes(bends, -1, -2).reshape(bends.shape[0] * bends.shape[1], -1))
         self.mixed, self.held = own.mix is not None, own.middle is not None
         if self.mixed:
-            self.keep("mix", own.mix if isinstance(own.mix, np.ndarray) else own.mix.toarray())
+            self.keep("mix", own.mix if isinstance(own.mix, np.ndarray) else csr_array(own.mix).toarray())
         if self.held:
             assert own.middle is not None and mean.middle is not None, "both are held in the same way"
             self.middle = _ProductPoints(own.middle if shaped is None else ShapedProducts(
@@ -374,7 +376,7 @@ class BodyLayer(nn.Module):
             self.register_buffer("regressor", torch.from_numpy(regressor[:, ring].toarray()))
 
         self.register_buffer("mix", torch.from_numpy(features.mix.reshape(-1, features.count).copy()))
-        self.register_buffer("constant", torch.from_numpy(features.constant))
+        self.register_buffer("constant", torch.from_numpy(features.constant.copy()))
         self.register_buffer("faces", torch.from_numpy(np.array(body.template.faces)), persistent=False)
         self.n_betas = self.points.n_betas
         self.to(dtype)
@@ -424,12 +426,14 @@ class BodyLayer(nn.Module):
             raise ValueError(f"betas: expected at most {self.n_betas} numbers, got shape {tuple(betas.shape)}")
 
         batched = pose.ndim == 3 or any(x is not None and x.ndim == 2 for x in (betas, trans))
-        pose, betas, trans = (x if x is None or x.ndim == most else x[None]
-                              for x, most in ((pose, 3), (betas, 2), (trans, 2)))
-        sizes = {x.shape[0] for x in (pose, betas, trans) if x is not None} - {1}
-        if len(sizes) > 1:
-            raise ValueError(f"poses, betas and trans: expected one batch size, got {sorted(sizes)}")
-        B = sizes.pop() if sizes else 1
+        pose = pose if pose.ndim == 3 else pose[None]
+        betas, trans = (x if x is None or x.ndim == 2 else x[None] for x in (betas, trans))
+        B = pose.shape[0]
+        for name, value in (("betas", betas), ("trans", trans)):
+            if value is not None and value.shape[0] != 1:
+                if B not in (1, value.shape[0]):
+                    raise ValueError(f"{name}: expected one batch size, got {value.shape[0]} beside {B}")
+                B = value.shape[0]
         pose = pose.expand(B, self.n_joints, 3)
 
         # rotations, features, surface
@@ -477,12 +481,15 @@ class BodyLayer(nn.Module):
         return torch.cat([root, others], -1).unflatten(-1, (J, 3)), trans
 
 
-def _features_of(operator: PointOperator) -> Any:
+def _features_of(operator: PointOperator) -> PoseFeatures:
     """The pose features of a person's operator."""
-    return operator.features if isinstance(operator, Blended) else operator.terms.features       # type: ignore
+    if isinstance(operator, Blended):
+        return operator.features
+    assert isinstance(operator, Condensed | Products), "no other operator has a layer"
+    return operator.terms.features
 
 
-def _padded(regressor: Any) -> tuple[np.ndarray, np.ndarray]:
+def _padded(regressor: csr_array) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (J, k) and weights (J, k) of a regressor (J, N), rows filled up with weights of zero."""
     counts = np.diff(regressor.indptr)
     ids, weights = np.zeros((2, len(counts), counts.max()))
@@ -491,3 +498,29 @@ def _padded(regressor: Any) -> tuple[np.ndarray, np.ndarray]:
         weights[j, :count] = regressor.data[start:start + count]
         ids[j, count:] = ids[j, 0]
     return ids.astype(np.int64), weights
+
+
+def write_onnx(layer: BodyLayer, path: str | Path) -> None:
+    """Write a layer as an ONNX graph: inputs `poses` (B, J, 3), `betas` (B, K) and `trans` (B, 3), any B from 2 on.
+
+    Outputs are `vertices` (B, N, 3) and `joints` (B, J, 3), metres. A person of fixed shape has no `betas`.
+
+    Raises
+    ------
+    ValueError
+        The file is not called `.onnx`.
+    ImportError
+        `pip install "scapekit[onnx]"` brings what is missing.
+    """
+    path = Path(path)
+    if path.suffix != ".onnx":
+        raise ValueError(f"path: expected a file called .onnx, got {path}")
+    like = layer.mix
+    inputs = {"poses": like.new_zeros(2, layer.n_joints, 3), "betas": like.new_zeros(2, layer.n_betas),
+              "trans": like.new_zeros(2, 3)}
+    if not layer.n_betas:
+        del inputs["betas"]
+    count = torch.export.Dim("B")
+    torch.onnx.export(layer, (), str(path), kwargs=inputs, input_names=list(inputs), dynamo=True, verbose=False,
+                      external_data=False, output_names=["vertices", "joints"],
+                      dynamic_shapes={name: {0: count} for name in inputs})

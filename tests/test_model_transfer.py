@@ -80,7 +80,7 @@ def test_a_body_that_only_turned_is_turned_back():
     pose[0] = rotations.log(R)
     subject = own_body(model, body @ R.T, fit_of(pose)).subject
     plain = own_body(model, body, fit_of(np.zeros((4, 3)))).subject
-    np.testing.assert_allclose(subject.operator.basis, plain.operator.basis, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(subject.operator.products.basis, plain.operator.products.basis, rtol=0, atol=1e-9)
 
 
 def test_the_pose_is_found(model):
@@ -93,7 +93,7 @@ def test_the_pose_is_found(model):
     again = fit_pose(found.subject, body)
     np.testing.assert_allclose(again.pose, found.pose, atol=0.02)
     subject = subject_from_body(model, body)
-    np.testing.assert_array_equal(subject.operator.basis, found.subject.operator.basis)
+    np.testing.assert_array_equal(subject.operator.products.basis, found.subject.operator.products.basis)
     assert subject.pose_covariance is model.pose_covariance
 
 

@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 from tables_scans import Rows, table
 
+LAYER_COLUMNS = ("layer, forward", "layer, one person", "layer, gradients", "skinned, forward", "skinned, gradients",
+                 "NumPy, one person", "NumPy, one person, float64")
+
 
 def poses(report: dict) -> str:
     """Held-out poses of the real man, a row for every kind of model."""
@@ -119,3 +122,20 @@ def strangers(report: dict) -> str:
             float(np.mean([r["cpu_seconds"] for r in mine]))))
     return table(("model", "men", "whole scan (mm)", "worst man", "half view, unseen (mm)", "worst man",
                   "half view, seen (mm)", "worst man", "largest beta", "time (s CPU)"), rows)
+
+
+def body_layer(report: dict) -> str:
+    """Bodies a second by batch, and how far the layer is from the exact body."""
+    rows: Rows = []
+    for name, found in report["models"].items():
+        for batch, row in found["meshes a second"].items():
+            rows.append((name, batch, *(row[key] for key in LAYER_COLUMNS)))
+    for batch, row in report.get("anny", {}).items():
+        if isinstance(row, dict):
+            rows.append((f"anny, {row['vertices']} vertices, {row['bones']} bones", batch, row["forward"],
+                         *[""] * (len(LAYER_COLUMNS) - 1)))
+    errors: Rows = [(name, *(1000 * value for value in found["error, m"].values()))
+                    for name, found in report["models"].items()]
+    kinds = list(next(iter(report["models"].values()))["error, m"])
+    return table(("bodies a second of processor time", "batch", *LAYER_COLUMNS), rows) + "\n\n" + table(
+        ("largest error of a vertex (mm)", *kinds), errors)
