@@ -140,12 +140,13 @@ class BlendedTemplate:
         for block, some in zip(blocks, slices(counts), strict=True):
             faces, a = _coefficients(space, block)
             posed = (self.v_hat[faces] * block.weights[:, None, None]) @ np.swapaxes(a, -1, -2)       # (n, f, 2, 3)
+            posed = posed.transpose(1, 2, 0, 3).reshape(len(faces), -1, 3)                            # (f, 2n, 3)
             for start in range(0, len(S), 8):                       # as many columns as are solved for together
-                shapes = S[start:start + 8, faces]
-                wanted = np.zeros((len(part.faces), 2, len(shapes), len(a), 3))
-                wanted[block.chosen] = np.moveaxis(posed @ np.swapaxes(shapes[:, None], -1, -2), (2, 3), (0, 1))
-                found = part.table(wanted.reshape(2 * len(part.faces), -1))
-                out[start:start + 8, some] = np.moveaxis(found.reshape(rows, len(shapes), len(a), 3), 0, -1)
+                shapes = S[start:start + 8, faces].transpose(1, 3, 0, 2)                              # (f, 3, k, 3)
+                wanted = np.zeros((len(part.faces), 2 * len(a), 3 * shapes.shape[2]))
+                wanted[block.chosen] = posed @ shapes.reshape(len(faces), 3, -1)
+                found = part.table(wanted.reshape(2 * len(part.faces), -1)).reshape(rows, len(a), -1, 3)
+                out[start:start + 8, some] = found.transpose(2, 1, 3, 0)
         return out
 
     def subject(self, space: PoseSpace, S: np.ndarray | None = None) -> Subject:
