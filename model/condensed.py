@@ -174,25 +174,28 @@ class Condensed(PointOperator):
         of_border = place - (system.n_vertices - n)                       # negative for vertices inside a part
         of_part = [np.flatnonzero((place >= some.start) & (place < some.stop)) for some in system.inside]
 
-        # what all products do to the border vertices asked for, and to those around parts whose inside is asked for
-        needed = np.unique(np.concatenate([of_border[of_border >= 0], *[
-            part.places for part, chosen in zip(system.parts, of_part, strict=True) if len(chosen)]]))
-        around, answer = np.empty((rows[-1].stop, len(needed)), dtype=dtype), system.answer.T[:, needed].astype(dtype)
-        for some, part, table in zip(rows, system.parts, tables, strict=True):
-            around[some] = table[:, len(part.inside):] @ answer[part.loads]
-
+        around = self._around
         T = np.empty((rows[-1].stop, len(ids)), dtype=dtype)
-        T[:, of_border >= 0] = around[:, np.searchsorted(needed, of_border[of_border >= 0])]
+        T[:, of_border >= 0] = around[:, of_border[of_border >= 0]]
         for p, (some, chosen) in enumerate(zip(rows, of_part, strict=True)):
             if len(chosen):
-                at, places = place[chosen] - system.inside[p].start, np.searchsorted(needed, system.parts[p].places)
-                T[:, chosen] = around[:, places] @ system.spreads(dtype)[p][:, at]
+                at = place[chosen] - system.inside[p].start
+                T[:, chosen] = around[:, system.parts[p].places] @ system.spreads(dtype)[p][:, at]
                 T[some, chosen] += tables[p][:, at]
         basis = np.swapaxes(T.reshape(self.terms.count, 3, len(ids)), 1, 2)
         return Products(self.terms, np.ascontiguousarray(basis), self.origin)
 
+    @cached_property
+    def _around(self) -> np.ndarray:
+        """(3M, n) what every product does to the border vertices."""
+        answer = self.system.answer.T.astype(self.tables[0].dtype, copy=False)
+        return np.concatenate([table.reshape(-1, table.shape[2])[:, len(part.inside):] @ answer[part.loads]
+                               for part, table in zip(self.system.parts, self.tables, strict=True)])
+
     def combined(self, weights: np.ndarray | sparray) -> Products:
         rows = chosen_rows(weights)
+        if "products" in self.__dict__:                       # made already for derivatives
+            return self.products.combined(weights)
         if rows is not None:
             return self.of_vertices(np.asarray(rows))
         sparse = csr_array(weights)

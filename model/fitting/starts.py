@@ -21,6 +21,7 @@ CANDIDATES = 3                       # starts that are carried on from the landm
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
 STEPS = 2                            # for each matching of them: they are too few to settle with one
 PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
+THROUGH = 12                         # of many starts, those that go on after the first round
 FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
 # of a body's length: a scan that is shorter is of a part of it; half a man had 0.49
 HALF = 0.65
@@ -33,6 +34,7 @@ NORMALS = 0.1                        # metres that a difference of normals of un
 FACING = 0.15                        # cosine to the camera's direction from which a vertex counts as seen
 PROMISING, STANDING = 0.4, 0.15      # share of all placements, those least denied by the camera, that are compared
 AT_ONCE = 1000                       # points that are compared at a time
+FINE = 3000                          # placements that are compared on all points, after a first look on a third
 POOL = 200                           # best placements that are kept
 BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
 
@@ -112,8 +114,10 @@ def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
     ends, free = np.array(starts), fit.body.n_angles + 3
     if len(ends) > FINALISTS:
         held = fit.held(ends[0])
-        ends[:, :free] = [approach(held, x[:free], COARSE[:2]) for x in ends]
-        ends = ends[np.argsort([held.misfit(x[:free]) for x in ends], kind="stable")]
+        for reach, left in zip(COARSE[:2], (len(ends), THROUGH), strict=True):
+            ends = ends[:left]
+            ends[:, :free] = [approach(held, x[:free], (reach,)) for x in ends]
+            ends = ends[np.argsort([held.misfit(x[:free]) for x in ends], kind="stable")]
         ends = ends[distinct(places_of(fit, ends), FINALISTS, ELSEWHERE)]
         ends = np.array([approach(fit, x, COARSE[2:]) for x in ends])
     else:
@@ -172,32 +176,59 @@ def all_rotations(count: int) -> np.ndarray:
 
 def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
-    body, config = fit.body, fit.config
+    body = fit.body
     poses, (turns, lift, up) = starting_poses(fit), placed_turns(fit)
     scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.posed_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.data.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    table, rough = fit.data.outside, np.swapaxes(turns, 1, 2).astype(np.float32)
-    cost, shift = np.zeros((len(poses), len(turns))), np.empty((len(poses), len(turns), 3))
-    for a, (y, n) in enumerate(zip(places, normals, strict=True)):
-        shift[a] = _laid(y, n, turns, toward, scan.points) if up is None else \
-            _stood(y, n, turns, lift, toward, scan.points, up)
-        if table is not None:
-            out = table.at(y.astype(np.float32) @ rough + shift[a][:, None].astype(np.float32))
-            cost[a] = config.free_space_weight * (out**2).mean(axis=1)
+    shift = np.array([_laid(y, n, turns, toward, scan.points) if up is None else
+                      _stood(y, n, turns, lift, toward, scan.points, up)
+                      for y, n in zip(places, normals, strict=True)])
+
+    # at first on a third of the vertices and points: what the cameras deny least, then what lies nearest to the scan
+    few = (places[:, ::3], normals[:, ::3])
+    cost = free_space_cost(fit, few[0], turns, shift, np.ones(shift.shape[:2], dtype=bool))
     share = PROMISING if fit.upright is None else STANDING
-    unlikely = cost > (np.quantile(cost, share) if table is not None else np.inf)
-    for a, (y, n) in enumerate(zip(places, normals, strict=True)):
-        likely = ~unlikely[a]
-        cost[a, likely] += _distances(y, n, turns[likely], shift[a, likely], scan)
-    cost[unlikely] = np.inf
+    likely = cost <= (np.quantile(cost, share) if fit.data.outside is not None else np.inf)
+    cost[~likely] = np.inf
+    cost[likely] += distance_cost(*few, turns, shift, scan.some(np.arange(0, len(scan.points), 3)), likely)[likely]
+
+    # then the best of these on all
+    best = cost <= np.partition(cost, min(FINE, cost.size - 1), axis=None)[min(FINE, cost.size - 1)]
+    best &= np.isfinite(cost)
+    whole = free_space_cost(fit, places, turns, shift, best) + distance_cost(places, normals, turns, shift, scan, best)
+    cost = np.where(best, whole, np.inf)
     order = np.argsort(cost, axis=None, kind="stable")[:POOL]
     which, turn = np.unravel_index(order, cost.shape)
     x = np.array([body.join(_rotated(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
     stand = body.subject.origin
     x[:, body.n_angles:body.n_angles + 3] = (turns[turn] @ stand) + shift[which, turn] - stand
     return x, cost.ravel()[order]
+
+
+def free_space_cost(fit: ScanFit, places: np.ndarray, turns: np.ndarray, shift: np.ndarray, asked: np.ndarray
+                    ) -> np.ndarray:
+    """(A, T) how much cameras deny poses (A, L, 3) in turns (T, 3, 3) at shifts (A, T, 3), where it is asked."""
+    table, rough, cost = fit.data.outside, np.swapaxes(turns, 1, 2).astype(np.float32), np.zeros(asked.shape)
+    if table is not None:
+        for a, y in enumerate(places):
+            some = asked[a]
+            # one product for all turns: (L, 3) with (3, T 3)
+            turned = y.astype(np.float32) @ rough[some].swapaxes(0, 1).reshape(3, -1)
+            out = table.at(turned.reshape(len(y), -1, 3) + shift[a, some].astype(np.float32))
+            cost[a, some] = fit.config.free_space_weight * (out**2).mean(axis=0)
+    return cost
+
+
+def distance_cost(places: np.ndarray, normals: np.ndarray, turns: np.ndarray, shift: np.ndarray, scan: ScanPoints,
+                  asked: np.ndarray) -> np.ndarray:
+    """(A, T) mean squared distance of the scan to poses in turns at shifts, where it is asked."""
+    cost = np.zeros(asked.shape)
+    for a, (y, n) in enumerate(zip(places, normals, strict=True)):
+        if asked[a].any():
+            cost[a, asked[a]] = _distances(y, n, turns[asked[a]], shift[a, asked[a]], scan)
+    return cost
 
 
 def placed_turns(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

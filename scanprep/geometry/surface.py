@@ -115,7 +115,11 @@ class OrientedPoints:
               min_cosine: float = 0.5) -> Matches:
         """The best target of each query (n, 3) with normals (n, 3); ValueError for one that is not finite."""
         points, normals = checked_points(points), checked_points(normals, "normals")
-        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=search_threads(len(points)))
+        # what is farther away than this in six dimensions is too far, or faces away: the search may stop there
+        reach = np.hypot(max_distance, self.scale * np.sqrt(2 - 2 * min_cosine)) * (1 + 1e-9)
+        _, index = self._tree.query(np.hstack([points, self.scale * normals]), distance_upper_bound=reach,
+                                    workers=search_threads(len(points)))
+        index = np.minimum(index, len(self.points) - 1)            # nothing within reach: told apart below
         distances = np.linalg.norm(self.points[index] - points, axis=1)
         cosine = np.einsum("nd,nd->n", self.normals[index], normals)
         good = (distances <= max_distance) & (cosine >= min_cosine)

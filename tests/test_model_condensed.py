@@ -1,0 +1,79 @@
+"""The condensed body is the stitched one: product by product, for many people, and where parts have no inside."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conformance_bodies import blendscape_worm, scape_worm
+from model_bodies import random_poses
+
+from model.condensed import Condensed
+from model.pose_space import PoseSpace
+from model.scape import ScapeModel
+from model.shape_space import ShapeSpace
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+WORMS = pytest.mark.parametrize("model", [scape_worm(), blendscape_worm()], ids=["scape", "blendscape"])
+
+
+@WORMS
+def test_every_product_is_stitched(model):
+    """What one product does alone is the solve of its edges, for all vertices and for some in any order."""
+    betas = np.array([0.7, -1.2, 0.4])
+    condensed, S = model.operator(betas), model.shape_space.gradients(betas)
+    assert isinstance(condensed, Condensed)
+    m, basis = 0, condensed.products.basis
+    few = np.array([17, 3, 300, 3, 250, 0])
+    some = condensed.of_vertices(few).basis
+    for block in model.parts.blocks:
+        faces = model.pose_space.faces_of_part[block.part][block.chosen]
+        for a in model.pose_space.coefficients[block.part][:, block.chosen].astype(float):
+            edges = np.zeros((len(model.template.faces), 2, 3))
+            wanted = model.parts.v_hat[faces] @ np.swapaxes(S[faces] @ a, -1, -2)
+            edges[faces] = block.weights[:, None, None] * wanted
+            alone = model.stitching.stitch(edges)
+            np.testing.assert_allclose(basis[m], alone, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(some[m], alone[few], rtol=0, atol=1e-12)
+            m += 1
+    assert m == len(basis) == model.terms.count
+
+
+@WORMS
+def test_many_people_at_once(model):
+    rng = np.random.default_rng(0)
+    poses, betas = random_poses(model, 70, rng), rng.normal(size=(70, 2))
+    wanted = np.stack([model.vertices_of(p, b) for p, b in zip(poses, betas, strict=True)])
+    np.testing.assert_allclose(model.bodies_of(poses, betas), wanted, rtol=0, atol=1e-11)
+
+
+@WORMS
+def test_sums_sizes_and_types(model):
+    rng = np.random.default_rng(0)
+    pose, (one, other) = random_poses(model, 1, rng)[0], (model.operator(rng.normal(size=3)) for _ in range(2))
+    np.testing.assert_allclose(one.plus(-0.5, other).turned(pose), one.turned(pose) - 0.5 * other.turned(pose),
+                               rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.scaled(1.3).turned(pose), 1.3 * one.turned(pose), rtol=0, atol=1e-12)
+    half = one.astype(np.float32)
+    assert half.turned(pose).dtype == np.float32
+    np.testing.assert_allclose(half.turned(pose), one.turned(pose), rtol=0, atol=3e-6)
+    mixed = rng.dirichlet(np.ones(5), 4) @ np.eye(one.count)[rng.choice(one.count, 5)]
+    for asked in (one, replace(one)):                    # a second one without the products that the first has made
+        np.testing.assert_allclose(asked.combined(mixed).turned(pose), one.turned(pose) @ mixed.T, rtol=0, atol=1e-12)
+        assert one.products.count == one.count
+
+
+def test_parts_without_an_inside():
+    """A cube of four parts of three triangles each: every vertex is on a border."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+                      [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])
+    cube, part = Mesh(corners, faces), np.repeat(np.arange(4), 3)
+    skeleton = Skeleton(part, [-1, 0, 0, 0], np.tile(corners.mean(axis=0), (4, 1)))
+    joints = skeleton.joints.copy()
+    joints[0] = cube.vertices[skeleton.part_of_vertex(cube) == 0].mean(axis=0)
+    skeleton = Skeleton(part, skeleton.parents, joints)
+    model = ScapeModel(cube, skeleton, PoseSpace.identity(skeleton), ShapeSpace.empty(len(faces)), np.zeros((4, 3)),
+                       np.zeros((12, 12)))
+    assert all(len(one.inside) == 0 for one in model.parts.condensation.parts[1:])
+    pose = np.random.default_rng(0).normal(0, 0.5, (4, 3))
+    np.testing.assert_allclose(model.subject(None).vertices(pose), model.vertices(pose), rtol=0, atol=1e-12)
