@@ -111,7 +111,7 @@ class BlendedTemplate:
     @cached_property
     def condensation(self) -> Condensation:
         """The stitching system, condensed onto the borders of the parts."""
-        return Condensation(self.stitching, self.skeleton)
+        return Condensation(self.template.faces, self.skeleton.part_of_face, self.stitching.root_weights)
 
     def operator(self, space: PoseSpace, S: np.ndarray) -> Condensed:
         """All vertices of one body with shape deformation S (F, 3, 3).

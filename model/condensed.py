@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array, csr_array, sparray
 
-from scanprep.geometry.sparse import Factored
+from scanprep.geometry.sparse import Factored, gatherer
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
 from .linear import PointOperator, chosen_rows
 from .products import Products, ShapedProducts, Terms
-from .stitching import StitchingSystem
+from .stitching import edge_operator
 
 AT_ONCE = 96                         # coordinates that are made together: more leave the cache, fewer waste products
 
@@ -59,23 +59,36 @@ class PartSystem:
         return np.concatenate(rows)
 
 
+@dataclass(eq=False)
 class Condensation:
-    """The stitching system of a template, condensed once onto the n vertices `border` where parts meet."""
+    """The stitching system of a triangulation, condensed once onto the n vertices `border` where parts meet.
 
-    def __init__(self, stitching: StitchingSystem, skeleton: Skeleton) -> None:
-        self.n_vertices, J = stitching.n_vertices, len(skeleton.parents)
+    Parameters
+    ----------
+    faces : (F, 3) int
+    part_of_face : (F,) int
+    root_weights : (N,) float
+        Of the vertices whose mean is the root's joint.
+    """
+
+    faces: np.ndarray
+    part_of_face: np.ndarray
+    root_weights: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.n_vertices, J = len(self.root_weights), self.part_of_face.max() + 1
         touches = np.zeros((self.n_vertices, J), dtype=bool)
-        touches[stitching.faces, skeleton.part_of_face[:, None]] = True
+        touches[self.faces, self.part_of_face[:, None]] = True
         on_border = touches.sum(axis=1) > 1
         on_border[0] |= not on_border.any()                     # one part alone is held at a vertex
-        self.border = np.flatnonzero(on_border)
-        n, G, root = len(self.border), stitching.edge_operator.tocsr(), stitching.root_weights
+        self.border, root = np.flatnonzero(on_border), self.root_weights
+        n, G = len(self.border), edge_operator(self.faces, self.n_vertices).tocsr()
 
         # the Schur complement, and how the root's joint follows the border, both part by part
         S, follow = np.zeros((n, n)), root[self.border].copy()
         self.parts: list[PartSystem] = []
         for p in range(J):
-            faces = np.flatnonzero(skeleton.part_of_face == p)
+            faces = np.flatnonzero(self.part_of_face == p)
             inside, border = (np.flatnonzero(touches[:, p] & chosen) for chosen in (~on_border, on_border))
             places, i = np.searchsorted(self.border, border), len(inside)
             own = csc_array(G[(2 * faces[:, None] + np.arange(2)).ravel()][:, np.r_[inside, border]])
@@ -96,6 +109,14 @@ class Condensation:
         self.inside = slices([len(part.inside) for part in self.parts])
         order = np.concatenate([*[part.inside for part in self.parts], self.border])
         self.place_of = np.argsort(order)
+
+        # sums of all loads, and the border vertices around the parts, one part after the other
+        self.scatter = gatherer(np.concatenate([part.loads for part in self.parts]), n + 1)
+        self.all_places = np.concatenate([part.places for part in self.parts])
+        self.places_of = slices([len(part.places) for part in self.parts])
+
+    def __reduce__(self) -> tuple[type[Condensation], tuple[np.ndarray, ...]]:
+        return Condensation, (self.faces, self.part_of_face, self.root_weights)      # made again where it is read
 
     @cached_property
     def answer(self) -> np.ndarray:
@@ -221,15 +242,16 @@ def place(system: Condensation, local: list[np.ndarray]) -> np.ndarray:
     [SCAPE] Eq. 2
     """
     k, dtype, n = len(local[0]), local[0].dtype, len(system.border)
-    loads = np.zeros((n + 1, k))
-    for part, rows in zip(system.parts, local, strict=True):
-        loads[part.loads] += rows[:, len(part.inside):].T
+    left = np.concatenate([rows[:, some.stop - some.start:] for rows, some in zip(local, system.inside, strict=True)],
+                          axis=1)
+    loads = system.scatter @ left.T
     around = system.factored.solve(loads[:n]).T
     around = np.ascontiguousarray(around - (around @ system.follow + loads[n])[:, None], dtype=dtype)
-    y = np.empty((k, system.n_vertices), dtype=dtype)
+
+    y, by_part = np.empty((k, system.n_vertices), dtype=dtype), around[:, system.all_places]
     y[:, -n:] = around
-    for part, some, spread, rows in zip(system.parts, system.inside, system.spreads(dtype), local, strict=True):
-        np.add(times(around[:, part.places], spread), rows[:, :len(part.inside)], out=y[:, some])
+    for some, places, spread, rows in zip(system.inside, system.places_of, system.spreads(dtype), local, strict=True):
+        np.add(times(by_part[:, places], spread), rows[:, :some.stop - some.start], out=y[:, some])
     return np.take(y, system.place_of, axis=1)
 
 

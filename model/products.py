@@ -40,6 +40,14 @@ class Terms:
         """M, the number of products."""
         return len(self.part)
 
+    @cached_property
+    def groups(self) -> list[tuple[slice, np.ndarray]]:
+        """Runs of products with features of one part, and the joints that these change with."""
+        ends = np.flatnonzero(np.diff(self.features.part[self.feature], append=-1)) + 1
+        runs = [slice(start, end) for start, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)]
+        found = [(run, np.flatnonzero(self.features.uses[self.feature[run]].any(axis=0))) for run in runs]
+        return [(run, joints) for run, joints in found if len(joints)]
+
     def weights(self, pose: np.ndarray) -> np.ndarray:
         """(..., M, 3, 3) of δ R at poses (..., J, 3), radians."""
         R = self.skeleton.part_rotations(pose)[..., self.part, :, :]
@@ -80,13 +88,19 @@ class Products(PointOperator):
         J, M, L, leading = len(skeleton.parents), terms.count, self.count, pose.shape[:-2]
         R = skeleton.part_rotations(pose)
         turned = self.basis @ np.swapaxes(R[..., terms.part, :, :], -1, -2)   # (..., M, L, 3)
+        turned = turned.reshape(*leading, M, 3 * L)
         gather = np.zeros((*leading, J, M))                                   # C_p = Σ_m δ_m T_m R_pᵀ
         gather[..., terms.part, np.arange(M)] = terms.features.evaluate(pose)[..., terms.feature]
         below = skeleton.descends.T.astype(float) @ gather                    # all that hangs below each joint
-        sway = np.moveaxis(terms.features.derivative(pose)[..., terms.feature, :, :], -3, -1)   # (..., J, 3, M)
-        both = np.concatenate([below, sway.reshape(*leading, 3 * J, M)], axis=-2) @ turned.reshape(*leading, M, -1)
-        carried = both[..., :J, :].reshape(*leading, J, L, 3)
-        columns = both[..., J:, :].reshape(*leading, J, 3, L, 3)
+        carried = (below @ turned).reshape(*leading, J, L, 3)
+        # the features of a part change with its joints alone
+        slopes, columns = terms.features.derivative(pose), np.zeros((*leading, J, 3, 3 * L))
+        for some, joints in terms.groups:
+            slope = slopes[..., terms.feature[some][:, None], joints, :].reshape(*leading, -1, 3 * len(joints))
+            change = np.swapaxes(slope, -1, -2) @ turned[..., some, :]
+            for k, j in enumerate(joints):
+                columns[..., j, :, :] += change[..., 3 * k:3 * k + 3, :]
+        columns = columns.reshape(*leading, J, 3, L, 3)
         turn = R @ rotations.right_jacobian(pose)                             # world turn per parameter, in columns
         # ω × x = x @ hat(ω)ᵀ for every column ω of `turn`
         columns += carried[..., None, :, :] @ np.swapaxes(rotations.hat(np.swapaxes(turn, -1, -2)), -1, -2)

@@ -345,15 +345,11 @@ class BodyLayer(nn.Module):
         self.n_joints, N = len(skeleton.parents), len(body.template.vertices)
         whole: ShapedPoints | PointOperator = body.everywhere if isinstance(body, BodyModel) else body.operator
 
-        # parts by their depth below the root: rotations of one depth are multiplied together
-        depth = np.zeros(self.n_joints, dtype=np.int64)
-        for j in range(1, self.n_joints):
-            depth[j] = depth[skeleton.parents[j]] + 1
-        self.depths = [np.flatnonzero(depth == d).tolist() for d in range(depth.max() + 1)]
-        above = [[self.depths[d - 1].index(skeleton.parents[j]) for j in parts]
-                 for d, parts in enumerate(self.depths) if d]
-        self.above, order = above, [j for parts in self.depths for j in parts]
-        self.back = np.argsort(order).tolist()
+        # parts of one depth below the root are turned together
+        self.depths = [parts.tolist() for parts in skeleton.depths]
+        self.above = [[before.index(skeleton.parents[j]) for j in parts]
+                      for before, parts in zip(self.depths[:-1], self.depths[1:], strict=True)]
+        self.back = np.argsort(np.concatenate(skeleton.depths)).tolist()
 
         # points: all vertices, or those chosen and the joints after them
         self.n_points, regressor = N, body.joint_regressor

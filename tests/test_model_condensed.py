@@ -1,4 +1,5 @@
 """The condensed body is the stitched one: product by product, for many people, and where parts have no inside."""
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from model.condensed import Condensed
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
+from scanprep.batch.digests import Digests
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -77,3 +79,13 @@ def test_parts_without_an_inside():
     assert all(len(one.inside) == 0 for one in model.parts.condensation.parts[1:])
     pose = np.random.default_rng(0).normal(0, 0.5, (4, 3))
     np.testing.assert_allclose(model.subject(None).vertices(pose), model.vertices(pose), rtol=0, atol=1e-12)
+
+
+def test_a_person_goes_to_other_processes_and_has_a_digest():
+    model = scape_worm()
+    person, pose = model.subject(np.ones(3)), np.random.default_rng(0).normal(0, 0.5, (4, 3))
+    before = Digests().of(person)
+    person.operator.products                                     # what is worked out changes nothing
+    sent = pickle.loads(pickle.dumps(person))
+    np.testing.assert_array_equal(sent.vertices(pose), person.vertices(pose))
+    assert Digests().of(person) == Digests().of(sent) == before != Digests().of(model.subject(np.zeros(3)))

@@ -76,6 +76,12 @@ class Skeleton:
                      for p in range(len(self.parents)))
 
     @cached_property
+    def depths(self) -> list[np.ndarray]:
+        """The parts by how many others are above them: the root, those that hang on it, and so on."""
+        depth = self.descends.sum(axis=1) - 1
+        return [np.flatnonzero(depth == d) for d in range(depth.max() + 1)]
+
+    @cached_property
     def descends(self) -> np.ndarray:
         """(J, J) bool: [p, j] is true where part p is j or hangs below it."""
         J = len(self.parents)
@@ -128,11 +134,9 @@ class Skeleton:
 
         `R_j = R_parent(j) exp(pose_j)`, `R_0 = exp(pose_0)`.
         """
-        relative = rotations.exp(pose)
-        R = np.empty_like(relative)
-        R[..., 0, :, :] = relative[..., 0, :, :]
-        for j in range(1, len(self.parents)):
-            R[..., j, :, :] = R[..., self.parents[j], :, :] @ relative[..., j, :, :]
+        R = rotations.exp(pose)
+        for parts in self.depths[1:]:                    # all parts of one depth at once
+            R[..., parts, :, :] = R[..., self.parents[parts], :, :] @ R[..., parts, :, :]
         return R
 
     def pose_of(self, R: np.ndarray) -> np.ndarray:
