@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, sparray
+from scipy.sparse import csc_array, csr_array, eye_array, sparray
 
 from scanprep.geometry.sparse import Factored, gatherer
 from scanprep.skeleton.tree import Skeleton
@@ -169,8 +169,8 @@ class Condensed(PointOperator):
         y = np.empty((len(W), self.count), dtype=dtype)
         for start in range(0, len(W), AT_ONCE):
             some = W[start:start + AT_ONCE]
-            y[start:start + AT_ONCE] = place(self.system, [
-                times(some[:, mine].reshape(len(some), -1), table.reshape(-1, table.shape[2]))
+            y[start:start + AT_ONCE] = assemble_vertices(self.system, [
+                multiply_rows(some[:, mine].reshape(len(some), -1), table.reshape(-1, table.shape[2]))
                 for mine, table in zip(self.products_of_part, self.tables, strict=True)])
         return y.reshape(*pose.shape[:-2], 3, self.count)
 
@@ -191,6 +191,7 @@ class Condensed(PointOperator):
         """Some vertices (L,) as products."""
         system, tables = self.system, [table.reshape(-1, table.shape[2]) for table in self.tables]
         dtype, rows = tables[0].dtype, slices([len(table) for table in tables])
+        # where the vertices stand among insides and border
         place, n = system.place_of[ids], len(system.border)
         of_border = place - (system.n_vertices - n)                       # negative for vertices inside a part
         of_part = [np.flatnonzero((place >= some.start) & (place < some.stop)) for some in system.inside]
@@ -236,7 +237,7 @@ class Condensed(PointOperator):
         return replace(self, tables=tuple(table.astype(dtype, copy=False) for table in self.tables))
 
 
-def place(system: Condensation, local: list[np.ndarray]) -> np.ndarray:
+def assemble_vertices(system: Condensation, local: list[np.ndarray]) -> np.ndarray:
     """All vertices (k, N) of insides and loads (k, i_p + loads_p) of the parts, k coordinates at once.
 
     [SCAPE] Eq. 2
@@ -251,11 +252,11 @@ def place(system: Condensation, local: list[np.ndarray]) -> np.ndarray:
     y, by_part = np.empty((k, system.n_vertices), dtype=dtype), around[:, system.all_places]
     y[:, -n:] = around
     for some, places, spread, rows in zip(system.inside, system.places_of, system.spreads(dtype), local, strict=True):
-        np.add(times(by_part[:, places], spread), rows[:, :some.stop - some.start], out=y[:, some])
+        np.add(multiply_rows(by_part[:, places], spread), rows[:, :some.stop - some.start], out=y[:, some])
     return np.take(y, system.place_of, axis=1)
 
 
-def times(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+def multiply_rows(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """`rows @ matrix`; of few rows one by one, which BLAS does in two thirds of the time."""
     return (rows[:, None] @ matrix)[:, 0] if len(rows) <= 3 else rows @ matrix
 
@@ -313,7 +314,7 @@ class ShapedCondensed(ShapedPoints):
                 tables = (flat[:, chosen] + table.ravel()).reshape(len(flat), -1, table.shape[2])
                 rows = W[some][:, :, mine].reshape(len(flat), 3, -1) @ tables
                 local.append(rows.reshape(-1, table.shape[2]))
-            out[some] = np.swapaxes(place(mean.system, local).reshape(len(flat), 3, -1), 1, 2)
+            out[some] = np.swapaxes(assemble_vertices(mean.system, local).reshape(len(flat), 3, -1), 1, 2)
         return out
 
     @cached_property
@@ -329,23 +330,20 @@ class ShapedCondensed(ShapedPoints):
             change = self.flat[:, flat].reshape(K, -1, table.shape[2])
             rows = W[:, some].reshape(len(W), 1, 1, -1) @ change                            # (B 3, K, 1, rows)
             local.append(rows.reshape(-1, table.shape[2]))
-        y = place(self.mean.system, local).reshape(*pose.shape[:-2], 3, K, self.count)
+        y = assemble_vertices(self.mean.system, local).reshape(*pose.shape[:-2], 3, K, self.count)
         return np.moveaxis(y, -1, -3)
 
     def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
-        each = [self.own.combined(weights), self.mean.combined(weights)]
-        zero = replace(self.mean, tables=tuple(np.zeros_like(table) for table in self.mean.tables))
-        changes = []
-        for flat in self.flat:
-            tables = tuple(flat[some].reshape(table.shape) for some, table in
+        own, mean, changes = self.own.combined(weights).basis, self.mean.combined(weights).basis, []
+        for change in self.flat:
+            tables = tuple(change[some].reshape(table.shape) for some, table in
                            zip(self._slices, self.mean.tables, strict=True))
-            changes.append(replace(zero, tables=tables).combined(weights).basis)
-        own, mean = (one.basis for one in each)
+            changes.append(replace(self.mean, tables=tables).combined(weights).basis)
         return ShapedProducts(self.mean.terms, own, mean, np.array(changes).reshape(self.n_betas, *mean.shape),
                               self.mean.origin)
 
-    def joined(self, other: ShapedPoints) -> ShapedPoints:
-        raise NotImplementedError("a whole body is joined to nothing")
+    def joined(self, other: ShapedPoints) -> ShapedProducts:
+        return self.combined(eye_array(self.count, format="csr")).joined(other)
 
     def along(self, directions: np.ndarray) -> ShapedCondensed:
         return replace(self, flat=directions @ self.flat)

@@ -57,7 +57,7 @@ def _sine_ratio(square: Tensor) -> Tensor:
     return torch.where(small, series, angle.sin() / angle)
 
 
-def twists(pose: Tensor) -> Tensor:
+def wrap_twists(pose: Tensor) -> Tensor:
     """Twists (..., 3), at most π long, of rotation vectors (..., 3) of any length, radians.
 
     [SCAPE] §4.2
@@ -242,7 +242,7 @@ class _BlendedPoints(_Points):
             x = x + (lifted[:, 1:].flatten(1) @ self.bends).unflatten(-1, (-1, 3))
 
         # joints hang on those above them; what follows each part is then y_j - R j
-        y = hung(R, joints, self.parents)
+        y = chain_joints(R, joints, self.parents)
         t = y - (R @ joints[..., None])[..., 0]
         motion = self.weights @ torch.cat([R, t[..., None]], -1).flatten(2)                    # (B, n, 12)
         motion = motion.unflatten(-1, (3, 4))
@@ -254,7 +254,7 @@ class _BlendedPoints(_Points):
         return points + of("origin")[:, None]
 
 
-def hung(R: Tensor, joints: Tensor, parents: list[int]) -> Tensor:
+def chain_joints(R: Tensor, joints: Tensor, parents: list[int]) -> Tensor:
     """(B, J, 3) where joints at rest (B, J, 3) go with part rotations (B, J, 3, 3), the root's zero."""
     y = [torch.zeros_like(R[:, 0, 0])]
     for j in range(1, len(parents)):
@@ -263,7 +263,7 @@ def hung(R: Tensor, joints: Tensor, parents: list[int]) -> Tensor:
     return torch.stack(y, 1)
 
 
-class _HungJoints(_Points):
+class _ChainedJoints(_Points):
     """The joints that an imported model has of its own: they hang on each other, and no vertex says where they are."""
 
     def __init__(self, points: _BlendedPoints) -> None:
@@ -278,7 +278,7 @@ class _HungJoints(_Points):
             k = 1 + betas.shape[-1]
             joints = self.table_joints[0] + (betas @ self.table_joints[1:k].flatten(1)).unflatten(-1, (-1, 3))
             origin = self.table_origin[0] + betas @ self.table_origin[1:k]
-        return hung(R, joints, self.parents) + origin[:, None]
+        return chain_joints(R, joints, self.parents) + origin[:, None]
 
 
 def _points_layer(points: ShapedPoints | PointOperator, parents: np.ndarray) -> _Points:
@@ -363,7 +363,7 @@ class BodyLayer(nn.Module):
             self.points = _points_layer(body.points(ids), skeleton.parents)
         self.joints: _Points | None = None
         if isinstance(self.points, _BlendedPoints) and not self.points.held:
-            self.joints = _HungJoints(self.points)
+            self.joints = _ChainedJoints(self.points)
         elif vertices is not None:
             self.joints = _points_layer(body.points(*_padded(regressor)), skeleton.parents)
         else:
@@ -433,7 +433,7 @@ class BodyLayer(nn.Module):
         pose = pose.expand(B, self.n_joints, 3)
 
         # rotations, features, surface
-        R, lifted = self._rotations(pose), self.lift(twists(pose))
+        R, lifted = self._rotations(pose), self.lift(wrap_twists(pose))
         features = lifted.flatten(1) @ self.mix + self.constant
         y = self.points(R, features, lifted, betas)
         joints = self.regressor @ y.index_select(1, self.ring) if self.joints is None else \

@@ -8,7 +8,7 @@ from model_bodies import random_poses
 from model import files
 
 torch = pytest.importorskip("torch")
-from model.torch import BodyLayer, rotation_matrices, twists, write_onnx  # noqa: E402
+from model.torch import BodyLayer, rotation_matrices, wrap_twists, write_onnx  # noqa: E402
 from scanprep.geometry import rotations  # noqa: E402
 
 
@@ -78,7 +78,7 @@ def test_rotations_are_those_of_the_package(rng):
     t = np.concatenate([rng.normal(size=(50, 3)) * 3, np.zeros((1, 3)), 1e-2 * rng.normal(size=(5, 3)),
                         [[np.pi, 0, 0], [0, 2 * np.pi, 0], [3.2, 0, 0]]])
     np.testing.assert_allclose(rotation_matrices(torch.tensor(t)), rotations.exp(t), rtol=0, atol=1e-12)
-    wrapped = twists(torch.tensor(t)).numpy()
+    wrapped = wrap_twists(torch.tensor(t)).numpy()
     assert (np.linalg.norm(wrapped, axis=1) <= np.pi + 1e-12).all()
     np.testing.assert_allclose(rotations.exp(wrapped), rotations.exp(t), rtol=0, atol=1e-12)
     near = torch.tensor([[0.0, 0, 0], [0.03, 0.01, 0], [0.0316, 0, 0], [0.0317, 0, 0]], dtype=torch.float64,

@@ -58,8 +58,7 @@ BENCHMARKS = (
     Benchmark("body_layer", "The models as layers of PyTorch", "body_layer.py people FOLD_0", models.body_layer,
               "One core, float32. `forward`: other betas for each body; `one person`: the same betas for all. The "
               "skinned reference has as many vertices, joints, betas and pose directions, anny its own model. `half`: "
-              "large arrays in float16. Where we lose: batches of one, where most of the time goes into starting some "
-              "150 small operations; NumPy is faster there.",
+              "large arrays in float16. Where we lose: batches of one; NumPy is faster there.",
               quick="body_layer.py people --batches 1 64"),
     Benchmark("folder", "A folder of scans", "folder.py SCRATCH", scans.folders,
               "Ten landmarks a scan. The largest memory is that of the one process, and of the largest worker.",
