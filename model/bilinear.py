@@ -75,12 +75,12 @@ class PosedPoints:
         return self._operator(x).evaluate(x[:self.J3].reshape(-1, 3), x[self.J3:self.J3 + 3])
 
     def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        """Positions (L, 3) and their derivatives (P, 3, L)."""
         pose = x[:self.J3].reshape(-1, 3)
         y, by_pose = self._operator(x).columns(pose, x[self.J3:self.J3 + 3])
-        blocks = [by_pose, np.broadcast_to(np.eye(3)[:, None], (3, *y.shape))]
+        blocks = [by_pose, np.broadcast_to(np.eye(3)[..., None], (3, 3, len(y)))]
         if isinstance(self.source, ShapedPoints):
-            blocks.append(np.moveaxis(self.source.shape_jacobian(pose), -1, 0))
+            blocks.append(np.swapaxes(self.source.shape_jacobian(pose), 0, 2))
         return y, np.concatenate(blocks)
 
     def _operator(self, x: np.ndarray) -> PointOperator:

@@ -111,11 +111,11 @@ class Blended(PointOperator):
             for k in range(3):
                 columns[:, 1:] += G[..., k, :] * sway[..., k, None, :]
         y = np.swapaxes(_mixed(carried[:, 0], self.mix), -1, -2).reshape(*leading, self.count, 3)
-        columns = np.swapaxes(_mixed(columns, self.mix), -1, -2).reshape(*leading, 3 * J, self.count, 3)
+        columns = _mixed(columns, self.mix).reshape(*leading, 3 * J, 3, self.count)
         if self.middle is not None:
             held, by_pose = self.middle.columns(pose, np.zeros(3))
-            y, columns = y - held * self._share[:, None], columns - by_pose * self._share[:, None]
-        return y + (self.origin + trans)[..., None, :], np.ascontiguousarray(columns)
+            y, columns = y - held * self._share[:, None], columns - by_pose * self._share
+        return y + (self.origin + trans)[..., None, :], columns
 
     def _rigid(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rotations (B, J, 3, 3) of the parts, what follows them (B, J, 3), and where joints are; the root's is 0."""
@@ -201,7 +201,7 @@ def _mixed(y: np.ndarray, mix: Mix) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class ShapedBlended(ShapedPoints):
     """Points of a skinned body of free shape: the template's own body, the mean person, and by each beta the change of
-    rest vertices (K, n, 3), joints (K, J, 3), origin (K, 3) and the products of the middle (K, M, 1, 3), metres.
+    rest vertices (K, n, 3), joints (K, J, 3), origin (K, 3) and the products of the middle (K, M, 3, 1), metres.
     """
 
     own: Blended
@@ -255,7 +255,7 @@ class ShapedBlended(ShapedPoints):
     def _middles(self) -> Products:
         """The change of the middle by all betas, as if each were a point."""
         assert self.mean.middle is not None, "a body that is held by its middle"
-        return replace(self.mean.middle, basis=np.moveaxis(self.middle[:, :, 0], 0, 1))
+        return replace(self.mean.middle, basis=np.moveaxis(self.middle[..., 0], 0, -1))
 
     def combined(self, weights: np.ndarray | sparray) -> ShapedBlended:
         used, _ = _picked(self.mean.mix, weights)

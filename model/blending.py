@@ -170,11 +170,11 @@ class BlendedTemplate:
             posed = (self.v_hat[faces] * block.weights[:, None, None]) @ np.swapaxes(a, -1, -2)   # (n, f, 2, 3)
             posed = posed.transpose(1, 2, 0, 3).reshape(len(faces), -1, 3)                        # (f, 2n, 3)
             mine = np.ascontiguousarray(reach[(2 * faces[:, None] + np.arange(2)).ravel()].T)
-            found = np.empty((len(each), len(a), len(ids), 3))
+            found = np.empty((len(each), len(a), 3, len(ids)))
             for k, S in enumerate(each):
                 # one wide product a shape: a stack of products with three columns each takes four times as long
                 wanted = (posed @ np.swapaxes(S[faces], -1, -2)).reshape(2 * len(faces), -1)
-                found[k] = (mine @ wanted).reshape(len(ids), len(a), 3).transpose(1, 0, 2)
+                found[k] = (mine @ wanted).reshape(len(ids), len(a), 3).transpose(1, 2, 0)
             blocks.append(found)
         basis = np.concatenate(blocks, axis=1)
         return ShapedProducts(self.terms(space.features), basis[0], basis[1], basis[2:], self.skeleton.joints[0])

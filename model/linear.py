@@ -64,7 +64,7 @@ class PointOperator(Points):
 
     @abstractmethod
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `jacobian`, with the derivatives as (..., 3J, L, 3), contiguous for each parameter."""
+        """As `jacobian`, with the derivatives as (..., 3J, 3, L), contiguous for each parameter."""
 
     @abstractmethod
     def combined(self, weights: np.ndarray | sparray) -> PointOperator:
@@ -110,14 +110,14 @@ class PointOperator(Points):
         pose, trans = check_pose(self.skeleton, pose, trans)
         if pose.ndim == 2:
             y, columns = self.columns(pose, trans)
-            return y, np.moveaxis(columns, 0, -1)
+            return y, np.moveaxis(columns, (0, 1), (-1, -2))
         B, J, L = len(pose), len(self.skeleton.parents), self.count
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
         step = self._at_once(3 * L)
         for start in range(0, B, step):
             mine = slice(start, start + step)
             y[mine], columns = self.columns(pose[mine], trans[mine])
-            d_pose[mine] = np.moveaxis(columns, 1, -1)
+            d_pose[mine] = np.moveaxis(columns, (1, 2), (-1, -2))
         return y, d_pose
 
 

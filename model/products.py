@@ -56,7 +56,7 @@ class Terms:
 
 @dataclass(frozen=True, eq=False)
 class Products(PointOperator):
-    """Points whose places are a sum of products, T (M, L, 3), metres."""
+    """Points whose places are a sum of products, T (M, 3, L), metres: coordinates come before points."""
 
     terms: Terms
     basis: np.ndarray
@@ -68,7 +68,7 @@ class Products(PointOperator):
 
     @property
     def count(self) -> int:
-        return self.basis.shape[1]
+        return self.basis.shape[2]
 
     @property
     def load(self) -> int:
@@ -76,7 +76,7 @@ class Products(PointOperator):
 
     @cached_property
     def _flat(self) -> np.ndarray:
-        return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(3 * self.terms.count, self.count)
+        return self.basis.reshape(3 * self.terms.count, self.count)
 
     def turned(self, pose: np.ndarray) -> np.ndarray:
         W = np.moveaxis(self.terms.weights(pose), -3, -2)                     # (..., i, m, j)
@@ -87,12 +87,11 @@ class Products(PointOperator):
         terms, skeleton = self.terms, self.skeleton
         J, M, L, leading = len(skeleton.parents), terms.count, self.count, pose.shape[:-2]
         R = skeleton.part_rotations(pose)
-        turned = self.basis @ np.swapaxes(R[..., terms.part, :, :], -1, -2)   # (..., M, L, 3)
-        turned = turned.reshape(*leading, M, 3 * L)
+        turned = (R[..., terms.part, :, :] @ self.basis).reshape(*leading, M, 3 * L)
         gather = np.zeros((*leading, J, M))                                   # C_p = Σ_m δ_m T_m R_pᵀ
         gather[..., terms.part, np.arange(M)] = terms.features.evaluate(pose)[..., terms.feature]
         below = skeleton.descends.T.astype(float) @ gather                    # all that hangs below each joint
-        carried = (below @ turned).reshape(*leading, J, L, 3)
+        carried = (below @ turned).reshape(*leading, J, 3, L)
         # the features of a part change with its joints alone
         slopes, columns = terms.features.derivative(pose), np.zeros((*leading, J, 3, 3 * L))
         for some, joints in terms.groups:
@@ -100,12 +99,12 @@ class Products(PointOperator):
             change = np.swapaxes(slope, -1, -2) @ turned[..., some, :]
             for k, j in enumerate(joints):
                 columns[..., j, :, :] += change[..., 3 * k:3 * k + 3, :]
-        columns = columns.reshape(*leading, J, 3, L, 3)
+        columns = columns.reshape(*leading, J, 9, L)
         turn = R @ rotations.right_jacobian(pose)                             # world turn per parameter, in columns
-        # ω × x = x @ hat(ω)ᵀ for every column ω of `turn`
-        columns += carried[..., None, :, :] @ np.swapaxes(rotations.hat(np.swapaxes(turn, -1, -2)), -1, -2)
-        y = carried[..., 0, :, :] + (self.origin + trans)[..., None, :]
-        return y, columns.reshape(*leading, 3 * J, L, 3)
+        # ω × x = hat(ω) @ x for every column ω of `turn`
+        columns += rotations.hat(np.swapaxes(turn, -1, -2)).reshape(*leading, J, 9, 3) @ carried
+        y = np.swapaxes(carried[..., 0, :, :], -1, -2) + (self.origin + trans)[..., None, :]
+        return y, columns.reshape(*leading, 3 * J, 3, L)
 
     def combined(self, weights: np.ndarray | sparray) -> Products:
         return replace(self, basis=_combined(self.basis, weights))
@@ -123,23 +122,23 @@ class Products(PointOperator):
 
 
 def _combined(basis: np.ndarray, weights: np.ndarray | sparray) -> np.ndarray:
-    """T (..., L, 3) of combinations of points."""
+    """T (..., 3, L) of combinations of points."""
     rows = chosen_rows(weights)
     if rows is not None:
-        return np.ascontiguousarray(basis[..., rows, :])       # in one block; `take` would copy all of T first
+        return np.take(basis, rows, axis=-1)
     if isinstance(weights, np.ndarray):
-        return np.moveaxis(np.tensordot(basis, weights.astype(basis.dtype), axes=(-2, 1)), -1, -2)
+        return basis @ weights.T.astype(basis.dtype)
     sparse = csr_array(weights)
     used, place = np.unique(sparse.indices, return_inverse=True)
     few = csr_array((sparse.data, place, sparse.indptr), shape=(sparse.shape[0], len(used)))
-    some = np.moveaxis(basis[..., used, :], -2, 0)
-    return np.moveaxis((few @ some.reshape(len(used), -1)).reshape(-1, *some.shape[1:]), 0, -2)
+    some = np.take(basis, used, axis=-1).reshape(-1, len(used))
+    return np.ascontiguousarray((few @ some.T).T).reshape(*basis.shape[:-1], len(few.indptr) - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class ShapedProducts(ShapedPoints):
-    """Points that are bilinear in (1, β) and products: T of every term (M, L, 3), metres, for the template's own body
-    and the mean person, and its change (K, M, L, 3) for one standard deviation of each beta.
+    """Points that are bilinear in (1, β) and products: T of every term (M, 3, L), metres, for the template's own body
+    and the mean person, and its change (K, M, 3, L) for one standard deviation of each beta.
     """
 
     terms: Terms
@@ -154,7 +153,7 @@ class ShapedProducts(ShapedPoints):
 
     @property
     def count(self) -> int:
-        return self.own.shape[1]
+        return self.own.shape[2]
 
     @property
     def n_betas(self) -> int:
@@ -178,8 +177,8 @@ class ShapedProducts(ShapedPoints):
     @cached_property
     def _changes(self) -> Products:
         """The changes of all points by all betas, as if each were a point."""
-        K, M, L, _ = self.change.shape
-        return Products(self.terms, np.moveaxis(self.change, 0, 1).reshape(M, K * L, 3), np.zeros(3))
+        K, M, _, L = self.change.shape
+        return Products(self.terms, np.moveaxis(self.change, 0, 2).reshape(M, 3, K * L), np.zeros(3))
 
     def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
         own, mean, change = (_combined(T, weights) for T in (self.own, self.mean, self.change))
@@ -187,7 +186,7 @@ class ShapedProducts(ShapedPoints):
 
     def joined(self, other: ShapedPoints) -> ShapedProducts:
         assert isinstance(other, ShapedProducts), "of the same model"
-        own, mean, change = (np.concatenate([getattr(self, name), getattr(other, name)], axis=-2)
+        own, mean, change = (np.concatenate([getattr(self, name), getattr(other, name)], axis=-1)
                              for name in ("own", "mean", "change"))
         return replace(self, own=own, mean=mean, change=change)
 

@@ -171,7 +171,7 @@ class SkinningModel(BodyModel):
         return Terms(self.features, np.r_[np.arange(J), part.ravel()], np.r_[self.features.starts, feature.ravel()])
 
     def _middle(self, x: np.ndarray, joints: np.ndarray, bends: bool) -> np.ndarray:
-        """T (M, 1, 3) of the middle of the root's vertices, which stays where it is, of a body with rest vertices x."""
+        """T (M, 3, 1) of the middle of the root's vertices, which stays where it is, of a body with rest vertices x."""
         (ring, share), J, terms = self._root, len(joints), self._terms
         T, weights, below = np.zeros((terms.count, 3)), share[:, None] * self.weights[ring], share @ self.below[ring]
         T[:J] = weights.T @ x[ring] - below[:, None] * joints
@@ -179,7 +179,7 @@ class SkinningModel(BodyModel):
         if bends:
             each = np.einsum("rj,crd->jcd", weights, self.correctives[:, ring].astype(np.float64))
             T[J:] = each[(self.weights[ring] != 0).any(axis=0)].reshape(-1, 3)
-        return T[:, None]
+        return T[..., None]
 
     @cached_property
     def everywhere(self) -> ShapedBlended:
@@ -201,7 +201,7 @@ class SkinningModel(BodyModel):
         own = body(None)
         mean = replace(body(np.zeros(0)), bends=own.bends)
         return ShapedBlended(own, mean, U, joints, np.zeros((len(U), 3)) if held else joints[:, 0],
-                             np.array(middles).reshape(len(U), self._terms.count if held else 0, 1, 3))
+                             np.array(middles).reshape(len(U), self._terms.count if held else 0, 3, 1))
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedBlended:

@@ -178,12 +178,9 @@ class _ProductPoints(_Points):
                              (points.basis, points.basis, np.zeros((0, *points.basis.shape))))
         self.n_betas = len(change)
 
-        def rows(T: np.ndarray) -> np.ndarray:
-            """(..., 3M, L): products, then coordinates, times points."""
-            return np.swapaxes(T, -1, -2).reshape(*T.shape[:-3], 3 * T.shape[-3], T.shape[-2])
-
-        self.keep("own", rows(own))
-        self.keep("table", np.concatenate([rows(mean)[None], rows(change)]))
+        # (3M, L) and (1 + K, 3M, L): products, then coordinates, times points
+        self.keep("own", own.reshape(-1, own.shape[-1]))
+        self.keep("table", np.concatenate([mean[None], change]).reshape(1 + len(change), -1, own.shape[-1]))
         self.keep("part", terms.part)
         self.keep("feature", terms.feature)
         self.keep("origin", points.origin)

@@ -1,5 +1,6 @@
 """Which parts of a body the markers tell of, and what a recording of few markers is worth."""
 import csv
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,9 +16,13 @@ from model.built_in import load_built_in_model
 MODEL = load_built_in_model()         # small models have triangles that reach from the hip bone to the waist
 KEPT = np.array(MODEL.info["people_vertices"])
 LAYOUT = named_layout("plugingait39", MODEL.template, KEPT)
-SUBJECT = MODEL.subject(np.zeros(MODEL.n_betas))
-NAMES = np.array(SUBJECT.skeleton.names)
+NAMES = np.array(MODEL.skeleton.names)
 LEGS = tuple(label for label in LAYOUT.labels if label[1:] in ("ASI", "PSI", "THI", "KNE", "TIB", "ANK", "HEE", "TOE"))
+
+
+@cache
+def subject():
+    return MODEL.subject(np.zeros(MODEL.n_betas))
 
 
 def covered(labels, others=0, doubted=(), called="X"):
@@ -27,7 +32,8 @@ def covered(labels, others=0, doubted=(), called="X"):
     residuals[:, :len(labels)] = 0.005
     trusted = np.isfinite(residuals) & ~np.isin(every, doubted)
     motion = Motion(np.zeros((5, len(NAMES), 3)), np.zeros((5, 3)), None, 50.0, residuals, every, trusted=trusted)
-    return find_coverage(SUBJECT, LAYOUT, [motion], [MarkerSequence(np.zeros((5, len(every), 3)), every, 50.0)]), motion
+    recorded = MarkerSequence(np.zeros((5, len(every), 3)), every, 50.0)
+    return find_coverage(subject(), LAYOUT, [motion], [recorded]), motion
 
 
 def test_a_whole_set_tells_of_the_whole_body():
@@ -67,7 +73,7 @@ def test_markers_on_one_part_alone_tell_of_no_body():
     many = tuple(f"H{i}" for i in range(9))
     head = MarkerLayout(many, np.repeat(LAYOUT.select(["LFHD"]).nearest, 9))
     motion = Motion(np.zeros((2, len(NAMES), 3)), np.zeros((2, 3)), None, 50.0, np.zeros((2, 9)), many)
-    found = find_coverage(SUBJECT, head, [motion], [MarkerSequence(np.zeros((2, 9, 3)), many, 50.0)])
+    found = find_coverage(subject(), head, [motion], [MarkerSequence(np.zeros((2, 9, 3)), many, 50.0)])
     assert found.judgement().verdict == "failed" and "one part of the body, the head" in found.judgement().why
 
 
@@ -78,17 +84,17 @@ def test_markers_that_nobody_believes_tell_of_no_part():
 
 
 def test_a_part_between_two_is_told():
-    parents, names = SUBJECT.skeleton.parents, NAMES.tolist()
+    parents, names = subject().skeleton.parents, NAMES.tolist()
     hand, head = names.index("hand_left"), names.index("head")
     chest = names[parents[names.index("upper_arm_left")]]
-    told = set(NAMES[between(SUBJECT.skeleton, np.array([hand, head]))])
+    told = set(NAMES[between(subject().skeleton, np.array([hand, head]))])
     assert told == {"hand_left", "forearm_left", "upper_arm_left", chest, "head"}
-    assert not between(SUBJECT.skeleton, np.array([], dtype=int)).any()
+    assert not between(subject().skeleton, np.array([], dtype=int)).any()
 
 
 def test_angles_that_are_guesses_are_in_no_table(tmp_path):
     found, motion = covered(LEGS)
-    write_motion(tmp_path, motion, SUBJECT, None, found.told)
+    write_motion(tmp_path, motion, subject(), None, found.told)
     lines = (tmp_path / "motion.mot").read_text().splitlines()
     head = lines[lines.index("endheader") + 1].split("\t")
     assert "knee_angle_r" in head and "hip_flexion_l" in head and head[1:7] == [

@@ -71,7 +71,7 @@ def test_vertices_are_found_among_the_points_that_are_gathered(ids):
     points, at = few.gathered(np.array(ids), x)
     y, columns = points.columns(x)
     np.testing.assert_allclose(y[at], few.vertices(x)[ids], atol=1e-12)
-    np.testing.assert_allclose(columns[:, at], few.near(np.array(ids), x).columns(x)[1], atol=1e-12)
+    np.testing.assert_allclose(columns[..., at], few.near(np.array(ids), x).columns(x)[1], atol=1e-12)
 
 
 def test_few_vertices_of_an_unknown_shape_are_rough_and_their_own_derivative():
@@ -83,7 +83,7 @@ def test_few_vertices_of_an_unknown_shape_are_rough_and_their_own_derivative():
     np.testing.assert_allclose(y, few.vertices(x), atol=1e-12)
     ahead = x.copy()
     ahead[-1] += 1e-4
-    np.testing.assert_allclose(columns[-1], (few.vertices(ahead) - few.vertices(x)) / 1e-4, atol=1e-8)
+    np.testing.assert_allclose(columns[-1].T, (few.vertices(ahead) - few.vertices(x)) / 1e-4, atol=1e-8)
     assert np.linalg.norm(few.vertices(x) - whole.vertices(x)[IDS], axis=1).max() < 0.02
     held = few.held(x)
     np.testing.assert_allclose(held.vertices(x[:held.n_angles + 3]), whole.vertices(x)[IDS], atol=1e-9)

@@ -34,8 +34,8 @@ def test_every_product_is_stitched(model):
             wanted = model.parts.v_hat[faces] @ np.swapaxes(S[faces] @ a, -1, -2)
             edges[faces] = block.weights[:, None, None] * wanted
             alone = model.stitching.stitch(edges)
-            np.testing.assert_allclose(basis[m], alone, rtol=0, atol=1e-12)
-            np.testing.assert_allclose(some[m], alone[few], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(basis[m].T, alone, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(some[m].T, alone[few], rtol=0, atol=1e-12)
             m += 1
     assert m == len(basis) == model.terms.count
 

@@ -105,7 +105,7 @@ def test_derivatives_agree_with_finite_differences(known):
     x = np.random.default_rng(2).normal(0, 0.4, points.n_unknowns)
     y, columns = points.columns(x)
     np.testing.assert_allclose(y, points.positions(x), atol=1e-12)
-    np.testing.assert_allclose(np.moveaxis(columns, 0, -1), differences(points.positions, x), atol=1e-7)
+    np.testing.assert_allclose(np.swapaxes(columns, 0, 2), differences(points.positions, x), atol=1e-7)
 
 
 def test_vertices_without_weight_do_not_count(body, crab_model):
@@ -131,7 +131,7 @@ def test_a_body_of_another_size_has_the_same_pose_and_betas(known):
     points = large.near(ids, x)
     y, columns = points.columns(x)
     np.testing.assert_allclose(y, large.vertices(x)[ids], atol=1e-6)
-    np.testing.assert_allclose(np.moveaxis(columns, 0, -1), differences(points.positions, x), atol=1e-6)
+    np.testing.assert_allclose(np.swapaxes(columns, 0, 2), differences(points.positions, x), atol=1e-6)
     np.testing.assert_allclose(large.held(x).vertices(x[:person.n_angles + 3]), large.vertices(x), atol=1e-6)
     own, factor = large.in_metres(x)
     np.testing.assert_allclose(person.vertices(own), factor * large.vertices(x), atol=1e-6)

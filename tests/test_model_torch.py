@@ -1,4 +1,6 @@
 """The PyTorch layer says what the models say, and its gradients are right; skipped where PyTorch is not installed."""
+import importlib
+
 import numpy as np
 import pytest
 import toy_kind
@@ -6,10 +8,17 @@ from conformance_bodies import KINDS
 from model_bodies import random_poses
 
 from model import files
+from scanprep.geometry import rotations
 
-torch = pytest.importorskip("torch")
-from model.torch import BodyLayer, rotation_matrices, wrap_twists, write_onnx  # noqa: E402
-from scanprep.geometry import rotations  # noqa: E402
+torch = layers = None
+
+
+@pytest.fixture(scope="module", autouse=True)
+def pytorch():
+    """Loaded when the first test runs: it takes 3 s, which collecting all tests need not wait for."""
+    global torch, layers
+    torch = pytest.importorskip("torch")
+    layers = importlib.import_module("model.torch")
 
 
 @pytest.fixture(scope="module", params=list(KINDS))
@@ -42,30 +51,30 @@ def test_it_is_the_model(model, rng, people, size):
     few = np.arange(0, len(y[0]), 9)
     for dtype, near in ((torch.float64, 1e-10), (torch.float32, 1e-5)):
         inputs = [None if x is None else torch.tensor(x, dtype=dtype) for x in (poses, betas, trans)]
-        found, found_joints = BodyLayer(model, dtype=dtype)(*inputs)
+        found, found_joints = layers.BodyLayer(model, dtype=dtype)(*inputs)
         assert found.dtype == dtype
         np.testing.assert_allclose(found, y, rtol=0, atol=near)
         np.testing.assert_allclose(found_joints, joints, rtol=0, atol=near)
-        some, some_joints = BodyLayer(model, few, dtype=dtype)(*inputs)
+        some, some_joints = layers.BodyLayer(model, few, dtype=dtype)(*inputs)
         np.testing.assert_allclose(some, y[:, few], rtol=0, atol=near)
         np.testing.assert_allclose(some_joints, joints, rtol=0, atol=near)
-        chosen, _ = BodyLayer(model, dtype=dtype)(*inputs, vertices=torch.tensor(few))
+        chosen, _ = layers.BodyLayer(model, dtype=dtype)(*inputs, vertices=torch.tensor(few))
         np.testing.assert_allclose(chosen, y[:, few], rtol=0, atol=near)
 
 
 def test_gradients_are_differences(model, rng):
-    layer = BodyLayer(model, np.array([0, 7, 30]), dtype=torch.float64)
+    layer = layers.BodyLayer(model, np.array([0, 7, 30]), dtype=torch.float64)
     poses, betas, trans = (torch.tensor(x, requires_grad=True) for x in
                            (random_poses(model, 2, rng), rng.normal(size=(2, 3)), rng.normal(size=(2, 3))))
     assert torch.autograd.gradcheck(layer, (poses, betas, trans))
-    whole = BodyLayer(model, dtype=torch.float64)
+    whole = layers.BodyLayer(model, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda *x: whole(*x)[0].square().mean(), (poses, betas, trans))
     assert torch.autograd.gradcheck(lambda b: whole(poses.detach(), b)[1], (betas[:1].detach().requires_grad_(),))
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, np.pi, 2 * np.pi])
 def test_gradients_are_finite_where_formulas_divide(model, length):
-    layer = BodyLayer(model, dtype=torch.float64)
+    layer = layers.BodyLayer(model, dtype=torch.float64)
     poses = torch.zeros(1, 4, 3, dtype=torch.float64)
     poses[..., 0] = length
     poses.requires_grad_()
@@ -77,19 +86,19 @@ def test_gradients_are_finite_where_formulas_divide(model, length):
 def test_rotations_are_those_of_the_package(rng):
     t = np.concatenate([rng.normal(size=(50, 3)) * 3, np.zeros((1, 3)), 1e-2 * rng.normal(size=(5, 3)),
                         [[np.pi, 0, 0], [0, 2 * np.pi, 0], [3.2, 0, 0]]])
-    np.testing.assert_allclose(rotation_matrices(torch.tensor(t)), rotations.exp(t), rtol=0, atol=1e-12)
-    wrapped = wrap_twists(torch.tensor(t)).numpy()
+    np.testing.assert_allclose(layers.rotation_matrices(torch.tensor(t)), rotations.exp(t), rtol=0, atol=1e-12)
+    wrapped = layers.wrap_twists(torch.tensor(t)).numpy()
     assert (np.linalg.norm(wrapped, axis=1) <= np.pi + 1e-12).all()
     np.testing.assert_allclose(rotations.exp(wrapped), rotations.exp(t), rtol=0, atol=1e-12)
     near = torch.tensor([[0.0, 0, 0], [0.03, 0.01, 0], [0.0316, 0, 0], [0.0317, 0, 0]], dtype=torch.float64,
                         requires_grad=True)
-    assert torch.autograd.gradcheck(rotation_matrices, (near,))
+    assert torch.autograd.gradcheck(layers.rotation_matrices, (near,))
 
 
 def test_a_person_of_fixed_shape_has_a_layer(model, rng):
     betas, poses = rng.normal(size=3), random_poses(model, 2, rng)
     subject = model.subject(betas)
-    layer = BodyLayer(subject, dtype=torch.float64)
+    layer = layers.BodyLayer(subject, dtype=torch.float64)
     assert layer.n_betas == 0
     y, joints = layer(torch.tensor(poses))
     np.testing.assert_allclose(y, subject.vertices(poses), rtol=0, atol=1e-10)
@@ -97,7 +106,7 @@ def test_a_person_of_fixed_shape_has_a_layer(model, rng):
 
 
 def test_names_of_smplx_and_missing_batches(model, rng):
-    layer, poses = BodyLayer(model), torch.tensor(random_poses(model, 2, rng), dtype=torch.float32)
+    layer, poses = layers.BodyLayer(model), torch.tensor(random_poses(model, 2, rng), dtype=torch.float32)
     betas, trans = torch.randn(2, 3), torch.randn(2, 3)
     plain = layer(poses, betas, trans)
     for named in (layer(global_orient=poses[:, 0], body_pose=poses[:, 1:].flatten(1), betas=betas, transl=trans),
@@ -114,13 +123,13 @@ def test_names_of_smplx_and_missing_batches(model, rng):
 
 
 def test_it_maps_compiles_and_is_stored(model, rng):
-    layer = BodyLayer(model, dtype=torch.float64)
+    layer = layers.BodyLayer(model, dtype=torch.float64)
     poses, betas = torch.tensor(random_poses(model, 3, rng)), torch.tensor(rng.normal(size=(3, 3)))
     plain = layer(poses, betas)
     mapped = torch.func.vmap(lambda p, b: layer(p, b))(poses, betas)
     compiled = torch.compile(layer, backend="eager", fullgraph=True)(poses, betas)
     by_pose = torch.func.vmap(torch.func.jacrev(lambda p: layer(p)[1]))(poses)
-    other = BodyLayer(model, dtype=torch.float64)
+    other = layers.BodyLayer(model, dtype=torch.float64)
     for buffer in other.buffers():
         if buffer.is_floating_point():
             buffer.zero_()
@@ -132,7 +141,7 @@ def test_it_maps_compiles_and_is_stored(model, rng):
 
 
 def test_what_does_not_fit_is_told(model):
-    layer = BodyLayer(model)
+    layer = layers.BodyLayer(model)
     for inputs, told in (({"poses": torch.zeros(2, 5, 3)}, "poses: expected shape"),
                          ({"betas": torch.zeros(2, 9)}, "betas: expected at most 3"),
                          ({"poses": torch.zeros(2, 4, 3), "betas": torch.zeros(3, 2)}, "one batch size"),
@@ -143,14 +152,16 @@ def test_what_does_not_fit_is_told(model):
         with pytest.raises(ValueError, match=told):
             layer(**inputs)
     with pytest.raises(ValueError, match="expected places of 0"):
-        BodyLayer(model, np.array([-1]))
+        layers.BodyLayer(model, np.array([-1]))
 
 
+# a kind of each class of points: the others are written as these are, and one takes five seconds
+@pytest.mark.parametrize("model", ["scape-quaternion", "skinning-linear", "toy"], indirect=True)
 def test_onnx_says_the_same(model, rng, tmp_path):
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
-    layer, path = BodyLayer(model), tmp_path / "body.onnx"
-    write_onnx(layer, path)
+    layer, path = layers.BodyLayer(model), tmp_path / "body.onnx"
+    layers.write_onnx(layer, path)
     assert [file.name for file in tmp_path.iterdir()] == ["body.onnx"]
     poses, betas, trans = (torch.tensor(x, dtype=torch.float32) for x in
                            (random_poses(model, 3, rng), rng.normal(size=(3, 3)), rng.normal(size=(3, 3))))
@@ -159,4 +170,4 @@ def test_onnx_says_the_same(model, rng, tmp_path):
     for a, b in zip(found, layer(poses, betas, trans), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
     with pytest.raises(ValueError, match=r"called \.onnx"):
-        write_onnx(layer, tmp_path / "body.pt")
+        layers.write_onnx(layer, tmp_path / "body.pt")

@@ -44,12 +44,12 @@ class ToyModel(BodyModel):
         return whole.first(n_betas).combined(picked(len(x), vertex_ids, weights))
 
     def _carried(self, x):
-        """(J, N, 3) what each part carries of vertices (N, 3), about joints that follow them, the root's in place."""
+        """(J, 3, N) what each part carries of vertices (N, 3), about joints that follow them, the root's in place."""
         joints, below = self.joint_regressor @ x, (self.weights @ self.skeleton.descends).T[..., None]
         T = self.weights.T[..., None] * x - below * joints[:, None]
         np.add.at(T, self.skeleton.parents[1:], below[1:] * joints[1:, None])
         ring, share = self.skeleton.joint_weights(self.template, 0)
-        return T - np.einsum("n,jnd->jd", share, T[:, ring])[:, None]
+        return np.swapaxes(T - np.einsum("n,jnd->jd", share, T[:, ring])[:, None], 1, 2)
 
     def resampled(self, template, skeleton, rounds, progress):
         weights = np.maximum(Follower(self.template, template).values(self.weights), 0)

@@ -30,7 +30,7 @@ def posterior_error(body: FixedBody, x: np.ndarray, precision: np.ndarray) -> np
     root = np.linalg.inv(np.linalg.cholesky(precision + ridge * np.eye(len(x))))      # rootᵀ root is the covariance
     ids = np.arange(len(body.template.vertices))
     spread = root @ body.near(ids, x).columns(x)[1].reshape(len(x), -1)
-    return np.sqrt(np.einsum("pi,pi->i", spread, spread).reshape(-1, 3).sum(axis=1))
+    return np.sqrt(np.einsum("pi,pi->i", spread, spread).reshape(3, -1).sum(axis=0))
 
 
 def distance_to_seen(mesh: Mesh, seen: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ class NearPoints(Protocol):
         ...
 
     def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        """Positions (L, 3) and their derivatives (P, 3, L)."""
         ...
 
 
@@ -216,12 +216,12 @@ class CarriedPoints:
         return self.operator.evaluate(pose, trans) + self.gap + self.D @ (betas - self.at)
 
     def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        """Positions (L, 3) and their derivatives (P, 3, L)."""
         pose, trans, betas = self._split(x)
         y, by_pose = self.operator.columns(pose, trans)
-        by_place = np.broadcast_to(np.eye(3)[:, None], (3, *y.shape))
+        by_place = np.broadcast_to(np.eye(3)[..., None], (3, 3, len(y)))
         return (y + self.gap + self.D @ (betas - self.at),
-                np.concatenate([by_pose, by_place, np.moveaxis(self.D, -1, 0)]))
+                np.concatenate([by_pose, by_place, np.swapaxes(self.D, 0, 2)]))
 
     def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         n = 3 * len(self.operator.skeleton.parents)
@@ -307,10 +307,10 @@ class ResizedPoints:
         return resize(self.inner.positions(x), self.origin + x[self.n_angles:self.n_angles + 3], self.factor)
 
     def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        """Positions (L, 3) and their derivatives (P, 3, L)."""
         y, columns = self.inner.columns(x)
         columns = self.factor * columns
-        columns[self.n_angles:self.n_angles + 3] = np.eye(3)[:, None]          # the place is not resized
+        columns[self.n_angles:self.n_angles + 3] = np.eye(3)[..., None]        # the place is not resized
         return resize(y, self.origin + x[self.n_angles:self.n_angles + 3], self.factor), columns
 
 

@@ -47,8 +47,8 @@ class Pull:
             columns, gather = self.points.columns(x[0])[1], self._gather(len(places))
             force = gather @ (self.to_point[:, None] * off + (self.to_plane * along)[:, None] * self.normals)
             rows = columns.reshape(x.shape[1], -1)
-            drawn = np.swapaxes(np.swapaxes(columns, 0, 1) @ self._stiffness(gather), 0, 1).reshape(rows.shape)
-            return Dense(cost, known.gradient + rows @ force.ravel(), known.hessian + rows @ drawn.T)
+            drawn = np.einsum("pjv,ijv->piv", columns, self._stiffness(gather)).reshape(rows.shape)
+            return Dense(cost, known.gradient + rows @ force.T.ravel(), known.hessian + rows @ drawn.T)
 
         return Deferred(cost, assemble)
 
@@ -63,7 +63,7 @@ class Pull:
         return csr_array(coo_array((np.ones(len(each)), (self.at, each)), shape=(count, len(each))))
 
     def _stiffness(self, gather: csr_array) -> np.ndarray:
-        """(V, 3, 3) the sum of a I + b n nᵀ over the matches of each point."""
+        """(3, 3, V) the sum of a I + b n nᵀ over the matches of each point."""
         n = self.normals
         each = self.to_point[:, None, None] * np.eye(3) + self.to_plane[:, None, None] * n[:, :, None] * n[:, None, :]
-        return (gather @ each.reshape(-1, 9)).reshape(-1, 3, 3)
+        return np.ascontiguousarray((gather @ each.reshape(-1, 9)).T).reshape(3, 3, -1)

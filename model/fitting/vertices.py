@@ -228,11 +228,11 @@ def _equations(points: PointOperator | ShapedPoints, target: np.ndarray, weights
                ) -> Callable[[np.ndarray], Dense]:
     """The normal equations of points that are to be at their targets (L, 3), times the roots (L,) of their weights."""
     posed = PosedPoints(points)
-    root = np.ones((len(target), 1)) if weights is None else np.sqrt(weights)[:, None]
+    root = np.ones(len(target)) if weights is None else np.sqrt(weights)
 
     def equations(x: np.ndarray) -> Dense:
         y, columns = posed.columns(x[0])
-        residual, columns = (root * (y - target)).ravel(), (root * columns).reshape(posed.n_unknowns, -1)
+        residual, columns = (root * (y - target).T).ravel(), (root * columns).reshape(posed.n_unknowns, -1)
         return Dense(np.array([residual @ residual]), (columns @ residual)[None], (columns @ columns.T)[None])
 
     return equations

@@ -136,7 +136,8 @@ class Rays:
         # Embree works in float32: centre the mesh so that no accuracy is lost far from the origin.
         self._origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
         self._scene = rtcore_scene.EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, (mesh.vertices - self._origin)[mesh.faces].astype(np.float32))
+        self._mesh = TriangleMesh(self._scene, (mesh.vertices - self._origin).astype(np.float32),
+                                  mesh.faces.astype(np.int32))
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6
              ) -> tuple[np.ndarray, np.ndarray]:

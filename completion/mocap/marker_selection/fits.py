@@ -94,7 +94,7 @@ class BodyPoints:
         """The points with their derivatives by the unknowns (B, P); keep B small."""
         pose, trans, betas = self._split(x)
         found = [self.shaped.operator(own).columns(p, t) for own, p, t in zip(betas, pose, trans, strict=True)]
-        by_pose = np.moveaxis(np.stack([columns for _, columns in found]), 1, -1)
+        by_pose = np.swapaxes(np.stack([columns for _, columns in found]), 1, 3)
         return moving_points(np.stack([y for y, _ in found]), by_pose, self.shaped.shape_jacobian(pose))
 
 

@@ -26,7 +26,7 @@ class PartShapes:
         self.skeleton, self.lift, self.origin = terms.skeleton, features.lift, operator.origin
         J, L, m = len(terms.skeleton.parents), operator.count, features.lift.width
         self.joints, self.count = J, L
-        flat = operator.basis.transpose(0, 2, 1).reshape(terms.count, -1)
+        flat = operator.basis.reshape(terms.count, -1)
         of_part = terms.part == np.arange(J)[:, None]
         self.constant = ((of_part * features.constant[terms.feature]) @ flat).reshape(J, 3, L)
         uses = np.array([features.uses[terms.feature[mine]].any(axis=0) for mine in of_part])    # (J parts, J joints)
@@ -110,7 +110,7 @@ class SkinnedShapes(PartShapes):
         features = operator.features
         constants = np.arange(features.count)[features.constant == 1]
         super().__init__(Products(Terms(features, np.arange(len(of_part)), constants),
-                                  np.zeros((len(of_part), L, 3)), operator.origin))
+                                  np.zeros((len(of_part), 3, L)), operator.origin))
         self.bends = {(int(p), j): np.zeros((self.lift.width, 3, L))
                       for p, j in zip(part, (j for joints in of_part for j in joints), strict=True)}
         self.operator, self.lifts = operator, False
@@ -125,8 +125,7 @@ class SkinnedShapes(PartShapes):
         # a turn d from the right changes the pose by the inverse right Jacobian times d
         local = np.swapaxes(rotations.inverse_right_jacobian(pose), -1, -2)
         out = np.empty((B, 3 * J + 3, 3, L))
-        by_turn = (local @ by_pose.reshape(B, J, 3, 3 * L)).reshape(B, 3 * J, L, 3)
-        out[:, :-3] = np.swapaxes(by_turn, -1, -2)
+        out[:, :-3] = (local @ by_pose.reshape(B, J, 3, 3 * L)).reshape(B, 3 * J, 3, L)
         out[:, -3:] = np.eye(3)[:, :, None]
         y = np.swapaxes(y, 1, 2)
         if self.lifts:
