@@ -30,7 +30,7 @@ from .products import Products, ShapedProducts, Terms
 from .stitching import edge_operator
 
 AT_ONCE = 96                         # coordinates that are made together: more leave the cache, fewer waste products
-MANY = 10                            # of so many vertices one: all products are made, 77 ms of 12,500, then 4 ms for some
+MANY = 10                            # one vertex in so many: all products are made, 77 ms of 12,500, then some in 4 ms
 
 
 @dataclass(frozen=True, eq=False)
