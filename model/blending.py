@@ -16,9 +16,9 @@ from scanprep.skeleton.tree import Skeleton
 from .condensed import Condensation, Condensed, ShapedCondensed, slices
 from .features import PoseFeatures
 from .gradients import edges
-from .linear import Subject, check_points
+from .linear import Subject
 from .pose_space import PoseSpace
-from .products import ShapedProducts, Terms
+from .products import Terms
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
@@ -153,31 +153,6 @@ class BlendedTemplate:
         """A body with a pose space in the making, the template's own unless S (F, 3, 3) is given."""
         S = np.broadcast_to(np.eye(3), (len(self.template.faces), 3, 3)) if S is None else S
         return Subject(self.template, self.skeleton, None, self.operator(space, S))
-
-    def points(self, space: PoseSpace, shapes: ShapeSpace, vertex_ids: np.ndarray, weights: np.ndarray | None
-               ) -> ShapedProducts:
-        """Some points as a function of pose and betas: stitched backwards from them, edge by edge."""
-        ids, weights = check_points(len(self.template.vertices), vertex_ids, weights)
-        if weights is None:
-            ids, weights = ids[:, None], np.ones((len(ids), 1))
-        pick = np.zeros((len(self.template.vertices), len(ids)))
-        np.add.at(pick, (ids, np.arange(len(ids))[:, None]), weights)
-        reach = self.stitching.edge_operator @ self.stitching.solve_adjoint(pick)                # (2F, L)
-        each = [np.broadcast_to(np.eye(3), (len(self.v_hat), 3, 3)), shapes.mean, *shapes.components]
-        blocks = []
-        for block in self.blocks:
-            faces, a = _coefficients(space, block)
-            posed = (self.v_hat[faces] * block.weights[:, None, None]) @ np.swapaxes(a, -1, -2)   # (n, f, 2, 3)
-            posed = posed.transpose(1, 2, 0, 3).reshape(len(faces), -1, 3)                        # (f, 2n, 3)
-            mine = np.ascontiguousarray(reach[(2 * faces[:, None] + np.arange(2)).ravel()].T)
-            found = np.empty((len(each), len(a), 3, len(ids)))
-            for k, S in enumerate(each):
-                # one wide product a shape: a stack of products with three columns each takes four times as long
-                wanted = (posed @ np.swapaxes(S[faces], -1, -2)).reshape(2 * len(faces), -1)
-                found[k] = (mine @ wanted).reshape(len(ids), len(a), 3).transpose(1, 2, 0)
-            blocks.append(found)
-        basis = np.concatenate(blocks, axis=1)
-        return ShapedProducts(self.terms(space.features), basis[0], basis[1], basis[2:], self.skeleton.joints[0])
 
 
 def _coefficients(space: PoseSpace, block: Block) -> tuple[np.ndarray, np.ndarray]:

@@ -125,6 +125,18 @@ class Condensation:
         A = self.factored.solve(np.eye(len(self.border)) - self.follow[:, None]).T
         return np.concatenate([A, -np.ones((len(A), 1))], axis=1)
 
+    def reach(self, ids: np.ndarray) -> np.ndarray:
+        """(n + 1, L) metres: what a unit load on each border vertex, and the last one, does to some vertices (L,)."""
+        place, answer = self.place_of[ids], self.answer.T
+        out = np.empty((len(answer), len(ids)))
+        of_border = place - (self.n_vertices - len(self.border))          # negative for vertices inside a part
+        out[:, of_border >= 0] = answer[:, of_border[of_border >= 0]]
+        for part, inside in zip(self.parts, self.inside, strict=True):
+            mine = np.flatnonzero((place >= inside.start) & (place < inside.stop))
+            if len(mine):
+                out[:, mine] = answer[:, part.places] @ part.spread[place[mine] - inside.start].T
+        return out
+
     def spreads(self, dtype: Any) -> list[np.ndarray]:
         """Hᵀ (b, i) of every part, contiguous, in a type."""
         if dtype not in self._spreads:
@@ -215,16 +227,12 @@ class Condensed(PointOperator):
                                for part, table in zip(self.system.parts, self.tables, strict=True)])
 
     def combined(self, weights: np.ndarray | sparray) -> Products:
-        rows = chosen_rows(weights)
+        used, mixed = needed_vertices(weights)
         # more than a tenth of the vertices are asked for again and again, as a fit matches others in every round
-        if "products" in self.__dict__ or (rows is not None and len(rows) * MANY > self.count):
+        if "products" in self.__dict__ or len(used) * MANY > self.count:
             return self.products.combined(weights)
-        if rows is not None:
-            return self.of_vertices(np.asarray(rows))
-        sparse = csr_array(weights)
-        used, place_of = np.unique(sparse.indices, return_inverse=True)
-        few = csr_array((sparse.data, place_of, sparse.indptr), shape=(sparse.shape[0], len(used)))
-        return self.of_vertices(used).combined(weights[:, used] if isinstance(weights, np.ndarray) else few)
+        some = self.of_vertices(used)
+        return some if mixed is None else some.combined(mixed)
 
     def plus(self, factor: float, other: PointOperator) -> Condensed:
         assert isinstance(other, Condensed), "of the same kind of model"
@@ -236,6 +244,16 @@ class Condensed(PointOperator):
 
     def astype(self, dtype: Any) -> Condensed:
         return replace(self, tables=tuple(table.astype(dtype, copy=False) for table in self.tables))
+
+
+def needed_vertices(weights: np.ndarray | sparray) -> tuple[np.ndarray, csr_array | None]:
+    """The vertices (n,) that combinations (L, N) need, and their weights (L, n); no weights where each is a vertex."""
+    rows = chosen_rows(weights)
+    if rows is not None:
+        return np.asarray(rows), None
+    sparse = csr_array(weights)
+    used, place = np.unique(sparse.indices, return_inverse=True)
+    return used, csr_array((sparse.data, place, sparse.indptr), shape=(sparse.shape[0], len(used)))
 
 
 def assemble_vertices(system: Condensation, local: list[np.ndarray]) -> np.ndarray:
@@ -335,13 +353,21 @@ class ShapedCondensed(ShapedPoints):
         return np.moveaxis(y, -1, -3)
 
     def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
-        own, mean, changes = self.own.combined(weights).basis, self.mean.combined(weights).basis, []
-        for change in self.flat:
-            tables = tuple(change[some].reshape(table.shape) for some, table in
-                           zip(self._slices, self.mean.tables, strict=True))
-            changes.append(replace(self.mean, tables=tables).combined(weights).basis)
-        return ShapedProducts(self.mean.terms, own, mean, np.array(changes).reshape(self.n_betas, *mean.shape),
-                              self.mean.origin)
+        used, mixed = needed_vertices(weights)
+        system, L, basis = self.mean.system, len(used), []
+        reach, place = system.reach(used), system.place_of[used]
+        # of every part the tables of the two bodies and of all betas, as rows of one product
+        for part, inside, some, own, mean in zip(system.parts, system.inside, self._slices, self.own.tables,
+                                                 self.mean.tables, strict=True):
+            rows = np.concatenate([own.reshape(1, -1), mean.reshape(1, -1), self.flat[:, some]])
+            rows = rows.reshape(-1, mean.shape[2])
+            found = rows[:, len(part.inside):] @ reach[part.loads]
+            mine = np.flatnonzero((place >= inside.start) & (place < inside.stop))
+            found[:, mine] += rows[:, place[mine] - inside.start]
+            basis.append(found.reshape(2 + self.n_betas, -1, 3, L))
+        T = np.concatenate(basis, axis=1)
+        points = ShapedProducts(self.mean.terms, T[0], T[1], T[2:], self.mean.origin)
+        return points if mixed is None else points.combined(mixed)
 
     def joined(self, other: ShapedPoints) -> ShapedProducts:
         return self.combined(eye_array(self.count, format="csr")).joined(other)

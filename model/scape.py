@@ -18,7 +18,7 @@ from .body import BodyModel, Progress, restored_variances
 from .condensed import Condensed, ShapedCondensed
 from .features import PoseFeatures
 from .gradients import GradientSystem, ShapeSolver, shape_gradients
-from .linear import Subject, check_pose
+from .linear import Subject, check_pose, picked
 from .pose_space import PoseSpace, faces_of_part
 from .priors import sample_poses
 from .products import Terms
@@ -116,7 +116,8 @@ class ScapeModel(BodyModel):
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedPoints:
-        return self.parts.points(self.pose_space, self.shape_space.first(n_betas), vertex_ids, weights)
+        whole = self.everywhere if n_betas is None else self.everywhere.first(n_betas)
+        return whole.combined(picked(len(self.template.vertices), vertex_ids, weights))
 
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         pose, _ = check_pose(self.skeleton, pose, None)

@@ -66,15 +66,17 @@ def test_sums_sizes_and_types(model):
 
 @WORMS
 def test_points_of_free_shape(model):
-    """Some points, and all of them with others after them, are those that are stitched backwards from the points."""
+    """Some points, and all of them with others after them, are those of the stitched body."""
     betas, pose = np.array([0.7, -1.2, 0.4]), np.random.default_rng(0).normal(0, 0.5, (4, 3))
     ids = np.array([17, 3, 250])
     other, whole = model.points(ids), model.everywhere
     both = whole.joined(other).operator(betas).turned(pose)
     np.testing.assert_allclose(both[:, :whole.count], whole.operator(betas).turned(pose), rtol=0, atol=1e-12)
     np.testing.assert_allclose(both[:, whole.count:], both[:, ids], rtol=0, atol=1e-12)
-    some = whole.combined(np.eye(whole.count)[ids])
-    np.testing.assert_allclose(some.change, other.change, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(both[:, whole.count:].T, model.vertices_of(pose, betas)[ids], rtol=0, atol=1e-12)
+    mixed = np.random.default_rng(1).dirichlet(np.ones(whole.count), 2)
+    np.testing.assert_allclose(whole.combined(mixed).operator(betas).turned(pose), both[:, :whole.count] @ mixed.T,
+                               rtol=0, atol=1e-12)
     turned = whole.along(np.eye(3)[[2, 0]]).operator(np.array([0.5, 1.0]))
     np.testing.assert_allclose(turned.turned(pose), whole.operator(np.array([1.0, 0, 0.5])).turned(pose), rtol=0,
                                atol=1e-12)
