@@ -78,10 +78,15 @@ class Rig:
         """
         R = self.skeleton.part_rotations(poses)
         offset = joint_places(self.skeleton, poses, trans) - np.einsum("...jab,jb->...ja", R, self.skeleton.joints)
-        out = np.einsum("nj,nb,...jab->...na", self.weights, self.mesh.vertices, R, optimize=True)
-        if changes is not None:
-            out += np.einsum("nj,...nb,...jab->...na", self.weights, changes, R, optimize=True)
-        return out + self.weights @ offset
+        motions = np.concatenate([R, offset[..., None]], axis=-1).reshape(-1, R.shape[-3], 12)
+        parts, rest = np.ascontiguousarray(self.weights.T), np.ascontiguousarray(self.mesh.vertices.T)
+        added = np.broadcast_to(0.0 if changes is None else changes, (len(motions), *self.mesh.vertices.shape))
+        out = np.empty((len(motions), *self.mesh.vertices.shape))
+        for t, motion in enumerate(motions):
+            M = (motion.T @ parts).reshape(3, 4, -1)                # the mean motion of every vertex
+            x = rest if changes is None else rest + added[t].T
+            out[t] = (np.einsum("abn,bn->an", M[:, :3], x) + M[:, 3]).T
+        return out.reshape(*poses.shape[:-2], *self.mesh.vertices.shape)
 
     def local_rotations(self, poses: np.ndarray) -> np.ndarray:
         """(..., J, 3, 3) the bones against the bones they hang on, the root's in the world, of poses (..., J, 3)."""

@@ -14,6 +14,7 @@ from ..geometry.sparse import distinct
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
 SKY, BOUNCE = np.array([0.32, 0.34, 0.38]), np.array([0.20, 0.175, 0.16])
 BACK_FACE = np.array([0.30, 0.33, 0.40])      # tint of the inner side of an open surface
+SKY_RAYS = 48                                 # from each vertex in sight; 80 look the same, and take 1.7 times as long
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class Scene:
         self.attributes[..., :3] = np.concatenate([s.normals for s in shapes])
         self.attributes[..., 3:6] = np.concatenate([s.colors for s in shapes])
         self._tree = EmbreeScene()
-        self._kept = TriangleMesh(self._tree, self.corners)
+        self._kept = TriangleMesh(self._tree, *_indexed(shapes))
         span = self.corners.reshape(-1, 3)
         self.size = float(np.linalg.norm(np.ptp(span, axis=0))) if len(span) else 1.0
         solids = [s.corners.reshape(-1, 3) @ vertical for s in shapes if s.faces is not None and len(s.corners)]
@@ -74,7 +75,7 @@ class Scene:
         face = hit["primID"][rays]
         # fill in the visibility at the corners of the triangles in sight
         faces = distinct(face)
-        sky = sphere_directions(80)
+        sky = sphere_directions(SKY_RAYS)
         key = cone_directions(_unit(np.array(KEY[0])) @ self.axes, 0.16, 14)
         for shape, start, end in zip(self._shapes, self._starts[:-1], self._starts[1:], strict=True):
             mine = faces[(faces >= start) & (faces < end)] - start
@@ -153,6 +154,21 @@ class Scene:
         key = _unit(np.array(KEY[0])) @ self.axes
         key = _unit(key + max(0.0, 1.3 - float(key @ self.vertical)) * self.vertical)
         return sky + 0.40 * (1 - self._open(points, normals, cone_directions(key, 0.22, 32), 4 * self.size))
+
+
+def _indexed(shapes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float32 and triangles (F, 3) int32 of all shapes: a tree of them is made in half the time."""
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    for shape in shapes:
+        if shape.faces is None or shape.vertex_normals is None:
+            own, places = np.arange(3 * len(shape.corners)).reshape(-1, 3), shape.corners.reshape(-1, 3)
+        else:
+            own, places = shape.faces, np.zeros_like(shape.vertex_normals)
+            places[own] = shape.corners
+        vertices.append(places)
+        faces.append(own + count)
+        count += len(places)
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32)
 
 
 class Canvas:

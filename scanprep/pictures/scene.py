@@ -68,7 +68,8 @@ def pack_scene(panes: Sequence[Pane], whole: bool = False) -> bytes:
          "layers": [_layer(shape, pane.camera.target, columns, whole) for shape in pane.shapes]} for pane in panes]}
     text = json.dumps({**header, "columns": columns.described}, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    return zlib.compress(len(text).to_bytes(4, "little") + text + columns.data, 9)
+    # level 9 takes ten times as long for 3% less
+    return zlib.compress(len(text).to_bytes(4, "little") + text + columns.data, 6)
 
 
 def small_scene(panes: Sequence[Pane]) -> bytes:
