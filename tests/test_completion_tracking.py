@@ -1,3 +1,4 @@
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ from test_completion_partial import MARKS, QUICK
 
 from completion import Motion, TrackConfig, smoothing, track
 from completion.smoothing import inertia, predicted, smooth
+from completion.tracking import frames
 from completion.tracking.frame_fit import FrameFit, shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
 from completion.tracking.sequence import Tracker
@@ -16,6 +18,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.least_squares import step_between
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sanitise import sanitise
 from scanprep.geometry.surface import Surface
 
 RATE, FRAMES = 30.0, 18
@@ -251,6 +254,25 @@ def test_normals_of_noisy_points_stand_off_the_body(model, known_by):
     to = (camera - cloud.points) / np.linalg.norm(camera - cloud.points, axis=1, keepdims=True)
     seen_from = np.einsum("nd,nd->n", cloud.normals, to)
     assert cloud.border[seen_from < 0.3].mean() > 3 * cloud.border[seen_from > 0.7].mean()
+
+
+def test_triangles_face_outward_with_a_body_to_compare_and_without(model, monkeypatch):
+    """A view that faces as the expected body does is taken as it is; one that does not, or is far off, is not."""
+    body, asked = model.template, []
+    monkeypatch.setattr(frames, "sanitise", lambda view, name: asked.append(view) or sanitise(view, name))
+    front = Mesh(body.vertices, body.faces[body.face_normals[:, 1] < 0])
+    inward = Mesh(front.vertices, front.faces[:, ::-1])
+    wanted = prepare_frame(front, 600, 24)
+    assert asked == [front]
+    for view, expected, looked_into in ((front, body, []), (inward, body, [inward]),
+                                        (front, body.with_vertices(body.vertices + 2), [front])):
+        asked.clear()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")                              # that triangles faced inward
+            found = prepare_frame(view, 600, 24, expected=expected)
+        assert asked == looked_into
+        np.testing.assert_array_equal(found.points, wanted.points)
+        np.testing.assert_allclose(found.normals, wanted.normals, atol=1e-12)
 
 
 def test_points_that_are_not_finite_are_left_out(model):

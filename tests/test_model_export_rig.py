@@ -146,6 +146,16 @@ def test_bad_rigs_are_refused(model, rig):
         turn_up(3)
 
 
+def test_small_systems_are_solved_as_by_lapack():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(40, 3, 3))
+    A, y = A @ A.swapaxes(1, 2) + 0.1 * np.eye(3), rng.normal(size=(40, 3))
+    found = correctives._solve_small(np.moveaxis(A, 0, -1), y.T).T
+    np.testing.assert_allclose(found, np.linalg.solve(A, y[..., None])[..., 0], atol=1e-9)
+    lost = 1 - np.clip(np.abs(np.linalg.det(A)), 0, 1)
+    np.testing.assert_allclose(correctives._lost(np.moveaxis(A, 0, -1)), lost, atol=1e-12)
+
+
 def test_corrections_undo_what_skinning_does(model, rig):
     rng = np.random.default_rng(2)
     poses = random_poses(model, 4, rng, 0.2)

@@ -8,12 +8,15 @@ from jointed_bodies import bent, crab
 from scan_folders import QUICK, ball
 from test_scanprep_registration_start import BEND, small
 
+from model.built_in import load_built_in_model
+from model.coregistration import lead
 from model.coregistration.lead import model_lead
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.cli import group
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
+from scanprep.registration import person
 from scanprep.registration.cli import judge_registration
 from scanprep.registration.lead import lead_of
 from scanprep.registration.nonrigid import register
@@ -115,6 +118,23 @@ def test_no_model_where_none_is_wanted_or_known(body, tmp_path):
     assert lead_of(body, "none") is None and lead_of(body, "auto") is None          # a crab has two ends
     with pytest.raises(ValueError, match=r"gone\.npz"):
         lead_of(body, str(tmp_path / "gone.npz"))
+
+
+def test_a_template_in_known_triangles_is_not_searched(monkeypatch):
+    """Those of the model, or those of the synthetic people, of which the built-in model keeps some vertices."""
+    monkeypatch.setattr(lead, "lay_model", lambda *given: pytest.fail("the model was sought"))
+    monkeypatch.setattr(person, "register", lambda *given: pytest.fail("a person was registered"))
+    model, template = load_built_in_model(), Person(BodyShape.random(np.random.default_rng(3))).mesh
+    kept = np.array(model.info["people_vertices"])
+    whole = model_lead(template, "people")
+    off = np.linalg.norm(whole.carry(model.template.with_vertices(template.vertices[kept])) - template.vertices, axis=1)
+    assert off[kept].max() < 1e-6 and off.max() < 0.003        # the others lie beside the coarser surface
+    assert set(whole.parts.skeleton.names) == set(model.skeleton.names)
+    own = model_lead(model.template, "people")
+    np.testing.assert_allclose(own.off, 0, atol=1e-9)
+    np.testing.assert_allclose(own.carry(model.template), model.template.vertices, atol=1e-9)
+    parts = person.person_parts(template)
+    np.testing.assert_array_equal(parts.skeleton.part_of_face, person.average_person().part_of_face)
 
 
 def test_a_crab_is_no_person(body):

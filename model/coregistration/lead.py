@@ -16,7 +16,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.person import PersonParts
+from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
 
@@ -78,18 +78,30 @@ def model_lead(template: Mesh, through: str, progress: Callable[[int, int], None
     """
     name = BUILT_IN if through == "auto" else through
     model = model_at(name)
-    # the body is found on the template as on any scan, and laid on it
-    try:
-        laid = lay_model(model, template, progress)
-    except ModelMismatchError as error:
-        if through == "auto":
-            return None
-        raise ValueError(f"--through {through}: {error}") from error
+    laid = _in_same_triangles(model, template)
+    if laid is None:
+        # the body is found on the template as on any scan, and laid on it
+        try:
+            laid = lay_model(model, template, progress)
+        except ModelMismatchError as error:
+            if through == "auto":
+                return None
+            raise ValueError(f"--through {through}: {error}") from error
     # every vertex of the template gets a place on the body, and a distance from its skin
     place = Surface(laid).closest(template.vertices)
     corners = laid.faces[place.faces]
     off = np.einsum("nd,nd->n", template.vertices - place.points, normals_at(laid, corners, place.bary))
     return ModelLead(name, corners, place.bary, off, _parts(model, laid, template))
+
+
+def _in_same_triangles(model: BodyModel, template: Mesh) -> Mesh | None:
+    """The model's body on a template whose vertices are its own, or those of the synthetic people; None for others."""
+    if np.array_equal(template.faces, model.template.faces):
+        return template
+    kept = model.info.get("people_vertices")
+    if kept is None or not np.array_equal(template.faces, average_person().mesh.faces):
+        return None
+    return model.template.with_vertices(template.vertices[np.array(kept)])
 
 
 def learn_set_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None, path: Path

@@ -70,16 +70,21 @@ def stature(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> float:
 
 def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts | None:
     """The parts of a template that was not seen before."""
-    person, fit = average_person(), _person_on(template, None, RegistrationConfig(), tell)
-    if fit is None:
-        return None
-    nearest = Surface(fit.mesh).closest(template.corners.mean(axis=1)).faces
-    part_of_face = person.part_of_face[nearest]
+    person = average_person()
+    if np.array_equal(template.faces, person.mesh.faces):
+        # in the triangles of the synthetic people every vertex is known: nothing has to be registered
+        part_of_face, vertices = person.part_of_face, template.vertices
+    else:
+        fit = _person_on(template, None, RegistrationConfig(), tell)
+        if fit is None:
+            return None
+        nearest = Surface(fit.mesh).closest(template.corners.mean(axis=1)).faces
+        part_of_face, vertices = person.part_of_face[nearest], fit.mesh.vertices
     if len(np.unique(part_of_face)) < len(PARTS):
         return None
-    joints = person.skeleton.joint_regressor(person.mesh) @ fit.mesh.vertices
+    joints = person.skeleton.joint_regressor(person.mesh) @ vertices
     return PersonParts(Skeleton(part_of_face, PARENTS, joints, PARTS),
-                       person.skeleton.fit_rotations(person.mesh, fit.mesh.vertices))
+                       person.skeleton.fit_rotations(person.mesh, vertices))
 
 
 def has_limbs(template: Mesh) -> bool:
