@@ -187,7 +187,8 @@ def test_the_search_for_parts_tells_how_far_it_is(person, monkeypatch):
         for done in range(8):
             progress(done, 7)
         nothing = np.zeros(0)
-        return Registration(person.mesh.with_vertices(template.vertices), nothing, nothing, 0.0, 0.0, True, 1, {}, 0, nothing, 0.0)
+        found = person.mesh.with_vertices(template.vertices)
+        return Registration(found, nothing, nothing, 0.0, 0.0, True, 1, {}, 0, nothing, 0.0)
 
     monkeypatch.setattr(person_module, "find_correspondences", correspondences)
     monkeypatch.setattr(person_module, "register", register)
