@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -30,6 +30,13 @@ class _Points:
     viewpoint: np.ndarray | None
 
 
+class _Skin(NamedTuple):
+    """Where the body is expected: its vertices, to find the nearest of them, and their normals (N, 3)."""
+
+    tree: cKDTree
+    normals: np.ndarray
+
+
 def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = None, expected: Mesh | None = None
                   ) -> ScanPoints | None:
     """Points with normals of a frame, or None when it shows nothing.
@@ -40,11 +47,12 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
     """
     views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
     given = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
-    read = [_read(view, None if given is None else given[i], i, expected) for i, view in enumerate(views)]
+    skin = None if expected is None else _Skin(cKDTree(expected.vertices), expected.vertex_normals)
+    read = [_read(view, None if given is None else given[i], i, skin) for i, view in enumerate(views)]
     read = [view for view in read if len(view.points) > max(NEIGHBOURS, neighbours)]
     if sum(len(view.points) for view in read) < 60:  # points below which a frame shows nothing
         return None
-    parts = [_oriented(view, count // len(read), neighbours, expected) for view in read]
+    parts = [_oriented(view, count // len(read), neighbours, skin) for view in read]
     points, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     dense = np.concatenate([part[2] for part in parts])
     border, spacing = _borders(points, normals, dense, neighbours)
@@ -57,9 +65,9 @@ def as_views(cloud: ScanPoints) -> list[PointCloud]:
     return [PointCloud(cloud.points[cloud.view == k], cloud.normals[cloud.view == k]) for k in np.unique(cloud.view)]
 
 
-def _read(view: View, viewpoint: np.ndarray | None, number: int, expected: Mesh | None) -> _Points:
+def _read(view: View, viewpoint: np.ndarray | None, number: int, skin: _Skin | None) -> _Points:
     if isinstance(view, Mesh):
-        sound = view if expected is not None and _faces_as(expected, view) else sanitise(view, f"frame: view {number}")
+        sound = view if skin is not None and _faces_as(skin, view) else sanitise(view, f"frame: view {number}")
         points, rough = view.vertices, sound.vertex_normals if len(sound.faces) else None
     elif isinstance(view, PointCloud):
         points, rough = view.points, view.normals
@@ -76,7 +84,7 @@ def _read(view: View, viewpoint: np.ndarray | None, number: int, expected: Mesh 
     return _Points(points[good], None if rough is None else np.nan_to_num(rough[good]), viewpoint)
 
 
-def _faces_as(expected: Mesh, view: Mesh) -> bool:
+def _faces_as(skin: _Skin, view: Mesh) -> bool:
     """Whether the triangles of a view face outward: nearly all that lie near the expected body face as it does.
 
     What rays would tell without a body costs twenty times as much.
@@ -88,13 +96,13 @@ def _faces_as(expected: Mesh, view: Mesh) -> bool:
     if not seen.any():
         return False
     normals = np.cross(corners[seen, 1] - corners[seen, 0], corners[seen, 2] - corners[seen, 0])
-    far, nearest = cKDTree(expected.vertices).query(middle[seen], distance_upper_bound=CLOSE)
+    far, nearest = skin.tree.query(middle[seen], distance_upper_bound=CLOSE)
     near = np.isfinite(far)
-    agree = np.einsum("fd,fd->f", normals[near], expected.vertex_normals[nearest[near]]) > 0
+    agree = np.einsum("fd,fd->f", normals[near], skin.normals[nearest[near]]) > 0
     return 2 * near.sum() > len(seen) and float(agree.mean()) >= AGREE
 
 
-def _oriented(view: _Points, count: int, neighbours: int, expected: Mesh | None
+def _oriented(view: _Points, count: int, neighbours: int, skin: _Skin | None
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some points of a view, their normals, and the denser points that these were made from."""
     many = spread(view.points, DENSER * count) if len(view.points) > DENSER * count else np.arange(len(view.points))
@@ -107,9 +115,8 @@ def _oriented(view: _Points, count: int, neighbours: int, expected: Mesh | None
         outward = view.rough[many][near].sum(axis=1)
     elif view.viewpoint is not None:
         outward = view.viewpoint - dense[few]
-    elif expected is not None:
-        _, beside = cKDTree(expected.vertices).query(dense[few], 4)
-        outward = expected.vertex_normals[beside].sum(axis=1)
+    elif skin is not None:
+        outward = skin.normals[skin.tree.query(dense[few], 4)[1]].sum(axis=1)
     else:
         outward = prepare_scan(dense).normals[few]
     normals *= np.where(np.einsum("nd,nd->n", normals, outward) < 0, -1, 1)[:, None]

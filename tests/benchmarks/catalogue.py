@@ -67,6 +67,12 @@ BENCHMARKS = (
               "folder.py SCRATCH --scans 100 1000 --workers 2 --different 4 --faces 3000", scans.folders,
               "A template of 3,000 triangles, four scans under many names; other benchmarks may run beside it.",
               quick=""),
+    Benchmark("cluster", "Folders of inputs on a cluster, one of its two workers killed",
+              "cluster.py SCRATCH --count 100", scans.cluster,
+              "Four inputs under many names, completed on a coarse model; recordings of 30 frames. Files of results "
+              "are compared with those of this machine alone; `track` is killed in the middle of one recording and "
+              "goes on. Other benchmarks may run beside it.",
+              quick="cluster.py SCRATCH --count 6 --different 2"),
     Benchmark("mosh_speed", "How long `scape mosh` takes", "mosh_speed.py C3D -m MEN", mocap.speed,
               "Whole commands with all files and pages, on one thread; a synthetic person walks for a minute, "
               "without faults and with them. The paper: 7 minutes for a person, 1 s for the poses and 2 s for the "

@@ -29,6 +29,14 @@ def folders(report: dict) -> str:
     return table(tuple(names.values()), [tuple(row[name] for name in names) for row in report["rows"]])
 
 
+def cluster(report: dict) -> str:
+    """Commands on a folder of inputs: memory on the way, and whether a killed worker or process changes anything."""
+    header = ("command", "inputs", "all (s)", "memory at a quarter (MB)", "at half", "at the end", "peak", "page (MB)",
+              "files compared", "the same")
+    return table(header, [(row["command"], row["count"], row["wall_s"], *row["memory_mb"], row["page_mb"],
+                           row["compared"], row["same"]) for row in report["rows"]])
+
+
 def registration(report: dict) -> str:
     """Every scan, and the means of poses and men."""
     names = ("all_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped", "cpu_s")
