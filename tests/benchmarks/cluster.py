@@ -1,4 +1,4 @@
-"""A folder of a thousand inputs on a Dask cluster of two workers, of which one is killed on the way.
+"""A folder of inputs on a Dask cluster of two workers, of which one is killed on the way.
 
     python tests/benchmarks/cluster.py FOLDER [--commands complete mosh track] [--count 1000] [-o cluster.json]
 
@@ -180,7 +180,7 @@ def main() -> None:
                     on_cluster(command, asked.folder, asked.count, asked.different))
         print("  ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
     if asked.output:
-        write_report(asked.output, {"protocol": "a thousand inputs on a cluster of two workers",
+        write_report(asked.output, {"protocol": "folders of inputs on a cluster of two workers",
                                     "machine": machine(), "rows": rows})
 
 
