@@ -364,7 +364,7 @@ class ShapedCondensed(ShapedPoints):
             found = rows[:, len(part.inside):] @ reach[part.loads]
             mine = np.flatnonzero((place >= inside.start) & (place < inside.stop))
             found[:, mine] += rows[:, place[mine] - inside.start]
-            basis.append(found.reshape(2 + self.n_betas, -1, 3, L))
+            basis.append(found.reshape(2 + self.n_betas, len(mean), 3, L))
         T = np.concatenate(basis, axis=1)
         points = ShapedProducts(self.mean.terms, T[0], T[1], T[2:], self.mean.origin)
         return points if mixed is None else points.combined(mixed)

@@ -74,6 +74,7 @@ def test_points_of_free_shape(model):
     np.testing.assert_allclose(both[:, :whole.count], whole.operator(betas).turned(pose), rtol=0, atol=1e-12)
     np.testing.assert_allclose(both[:, whole.count:], both[:, ids], rtol=0, atol=1e-12)
     np.testing.assert_allclose(both[:, whole.count:].T, model.vertices_of(pose, betas)[ids], rtol=0, atol=1e-12)
+    assert whole.combined(np.zeros((0, whole.count))).operator(betas).turned(pose).shape == (3, 0)
     mixed = np.random.default_rng(1).dirichlet(np.ones(whole.count), 2)
     np.testing.assert_allclose(whole.combined(mixed).operator(betas).turned(pose), both[:, :whole.count] @ mixed.T,
                                rtol=0, atol=1e-12)

@@ -91,7 +91,7 @@ def test_lifts_and_their_slopes(lift):
 
 
 def test_blended_points_are_sums_of_products():
-    """The dense form of skinning, T (M, N, 3) of every part and every part's share of every corrective, as oracle."""
+    """The dense form of skinning, T (M, 3, N) of every part and every part's share of every corrective, as oracle."""
     model, rng = skinned_worm(True), np.random.default_rng(4)
     free, J = np.flatnonzero(model.features.constant == 0), len(model.skeleton.parents)
     part, feature = (a.ravel() for a in np.meshgrid(np.arange(J), np.arange(len(free)), indexing="ij"))
@@ -101,7 +101,8 @@ def test_blended_points_are_sums_of_products():
                         model.weights.T[part, :, None] * model.correctives[feature]])
     np.add.at(T, model.skeleton.parents[1:], model.below.T[1:, :, None] * joints[1:, None])
     ring, share = model.skeleton.joint_weights(model.template, 0)
-    dense = Products(terms, T - np.einsum("n,mnd->md", share, T[:, ring])[:, None], model.skeleton.joints[0])
+    T = np.swapaxes(T - np.einsum("n,mnd->md", share, T[:, ring])[:, None], 1, 2)
+    dense = Products(terms, T, model.skeleton.joints[0])
     poses, trans = check_pose(model.skeleton, rng.normal(0, 0.7, (3, J, 3)), rng.normal(size=(3, 3)))
     ours, ids = model.operator(None), rng.choice(len(x), (20, 3))
     np.testing.assert_allclose(ours.evaluate(poses, trans), dense.evaluate(poses, trans), rtol=0, atol=1e-12)

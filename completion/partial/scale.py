@@ -92,9 +92,9 @@ class _OneByOne:
         return self.follow(x[None]).positions[0]
 
     def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        """Positions (L, 3) and their derivatives (P, 3, L)."""
         found = self.follow(x[None])
-        return found.positions[0], np.moveaxis(found.jacobian[0], -1, 0)
+        return found.positions[0], np.swapaxes(found.jacobian[0], 0, 2)
 
 
 def rough_scale(body: FixedBody, points: np.ndarray) -> float:

@@ -21,8 +21,8 @@ CANDIDATES = 3                       # starts that are carried on from the landm
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
 STEPS = 2                            # for each matching of them: they are too few to settle with one
 PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
-# of many starts, those that go on after the first round: on 28 half views the bodies are those of all
-THROUGH = 8
+# of many starts, those that go on after the first round: on 14 half views the bodies are those of all 24
+THROUGH = 12
 FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
 # of a body's length: a scan that is shorter is of a part of it; half a man had 0.49
 HALF = 0.65
@@ -38,7 +38,7 @@ AT_ONCE = 1000                       # points that are compared at a time
 # placements that are compared on all points, after a first look on a third: fifteen times as many as are kept
 FINE = 3000
 POOL = 200                           # best placements that are kept
-BLIND, APART = 16, 0.08              # of them, starts that differ by so many metres on average; 24 end in the same
+BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
 
 
 def first_starts(fit: ScanFit, few: ScanFit) -> np.ndarray:
