@@ -179,8 +179,9 @@ class _ProductPoints(_Points):
         self.n_betas = len(change)
 
         # (3M, L) and (1 + K, 3M, L): products, then coordinates, times points
-        self.keep("own", own.reshape(-1, own.shape[-1]))
-        self.keep("table", np.concatenate([mean[None], change]).reshape(1 + len(change), -1, own.shape[-1]))
+        rows = 3 * len(own), own.shape[-1]
+        self.keep("own", own.reshape(rows))
+        self.keep("table", np.concatenate([mean[None], change]).reshape(1 + len(change), *rows))
         self.keep("part", terms.part)
         self.keep("feature", terms.feature)
         self.keep("origin", points.origin)

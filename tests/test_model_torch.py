@@ -151,6 +151,7 @@ def test_what_does_not_fit_is_told(model):
                          ({"trans": torch.zeros(2, 4)}, "trans: expected shape")):
         with pytest.raises(ValueError, match=told):
             layer(**inputs)
+    assert layers.BodyLayer(model, np.zeros(0, dtype=int))()[0].shape == (0, 3)           # joints alone
     with pytest.raises(ValueError, match="expected places of 0"):
         layers.BodyLayer(model, np.array([-1]))
 
