@@ -15,7 +15,7 @@ from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
 
 DENSER = 4                           # times as many points as are matched make the normals
-ASKED = 500                          # triangles of a view that are compared with the expected body; 3 ms
+ASKED = 500                          # triangles of a view that are compared with the expected body
 CLOSE, AGREE = 0.05, 0.95            # metres; share of those this close that face as the body does: 0.99 of a walk
 
 Frame = Mesh | PointCloud | np.ndarray | Sequence[View] | None
@@ -87,8 +87,9 @@ def _read(view: View, viewpoint: np.ndarray | None, number: int, skin: _Skin | N
 def _faces_as(skin: _Skin, view: Mesh) -> bool:
     """Whether the triangles of a view face outward: nearly all that lie near the expected body face as it does.
 
-    What rays would tell without a body costs twenty times as much.
+    Without a body rays would have to tell it, as `sanitise` asks them: that takes more than ten times as long.
     """
+    # some of the triangles, without those at vertices that are not finite
     some = view.faces[:: max(1, len(view.faces) // ASKED)]
     corners = view.vertices[some]
     middle = corners.mean(axis=1)
@@ -96,6 +97,7 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
     if not seen.any():
         return False
     normals = np.cross(corners[seen, 1] - corners[seen, 0], corners[seen, 2] - corners[seen, 0])
+    # against the nearest vertex of the body
     far, nearest = skin.tree.query(middle[seen], distance_upper_bound=CLOSE)
     near = np.isfinite(far)
     agree = np.einsum("fd,fd->f", normals[near], skin.normals[nearest[near]]) > 0

@@ -157,7 +157,7 @@ class Scene:
 
 
 def _indexed(shapes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float32 and triangles (F, 3) int32 of all shapes: a tree of them is made in half the time."""
+    """Vertices (n, 3) float32 and triangles (F, 3) int32 of all shapes: a tree of these is made faster."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     for shape in shapes:
         if shape.faces is None or shape.vertex_normals is None:

@@ -87,22 +87,13 @@ def follow(child: subprocess.Popen, done: Callable[[], int], count: int, halfway
     marks, peak, now = [0.25, 0.5, 1.0], 0.0, 0.0
     found: list[float] = []
     while child.poll() is None:
-        peak, now = max(peak, resident_mb(child.pid)), current_mb(child.pid) or now
+        peak, now = max(peak, resident_mb(child.pid)), resident_mb(child.pid, "VmRSS") or now
         if len(found) < 2 and done() >= marks[len(found)] * count:
             found.append(now)
             if len(found) == 2:
                 halfway()
         time.sleep(POLL)
     return [*found, *[now] * (3 - len(found)), peak]
-
-
-def current_mb(pid: int) -> float:
-    """The memory that a process has now, megabytes; 0 for one that is gone."""
-    try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except OSError:
-        return 0.0
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")), 0.0)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -124,7 +115,8 @@ def on_cluster(command: str, folder: Path, count: int, different: int) -> Row:
         victim = next(iter(cluster.workers.values()))
 
         def done() -> int:
-            return sum(1 for path in output.iterdir() if path.is_dir()) if output.is_dir() else 0
+            made = output.iterdir() if output.is_dir() else ()
+            return sum(path.is_dir() and path.name != ".scapekit" for path in made)
 
         memory = follow(child, done, count, lambda: os.kill(victim.pid, signal.SIGKILL))
     seconds = time.perf_counter() - start

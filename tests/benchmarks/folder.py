@@ -106,13 +106,13 @@ def descendants(pid: int) -> list[int]:
     return [found for child in own for found in (child, *descendants(child))]
 
 
-def resident_mb(pid: int) -> float:
-    """The most memory that a process has had, megabytes; 0 for one that is gone."""
+def resident_mb(pid: int, field: str = "VmHWM") -> float:
+    """The most memory that a process has had, or has now (VmRSS), megabytes; 0 for one that is gone."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:
         return 0.0
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:")), 0.0)
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(field + ":")), 0.0)
 
 
 def main() -> None:
