@@ -25,7 +25,7 @@ from .mocap.marker_selection.design import design_markers as design_markers
 from .mocap.marker_selection.fits import DesignConfig as DesignConfig
 from .mocap.marker_sets.layout import MarkerLayout as MarkerLayout
 from .mocap.marker_sets.named import layout_names as layout_names
-from .mocap.marker_sets.named import named_layout as named_layout
+from .mocap.marker_sets.named import load_layout as load_layout
 from .mocap.marker_sets.symmetry import SkinMirror as SkinMirror
 from .mocap.marker_sets.symmetry import find_skin_mirror as find_skin_mirror
 from .mocap.marker_sets.transfer import TransferredLayout as TransferredLayout
@@ -39,7 +39,7 @@ from .mocap.pose.follow import animate as animate
 from .mocap.pose.marked_body import AnimateConfig as AnimateConfig
 from .mocap.pose.stream import Frame as Frame
 from .mocap.pose.stream import MarkerStream as MarkerStream
-from .mocap.retargeting.retarget import morphed_vertices as morphed_vertices
+from .mocap.retargeting.retarget import morph_vertices as morph_vertices
 from .mocap.retargeting.retarget import retarget as retarget
 from .mocap.retargeting.soft_tissue import deformation as deformation
 from .mocap.retargeting.soft_tissue import retarget_soft_tissue as retarget_soft_tissue

@@ -52,6 +52,6 @@ def marks_of_template(model: BodyModel, given: Path | None, name: str, wanted: b
 def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: Unit | None
                         ) -> tuple[np.ndarray, np.ndarray] | None:
     """Vertices (L,) and points (L, 3) of the landmarks that a file and the model have in common; None where too few."""
-    from scanprep.geometry.landmarks import read_landmarks, shared_landmarks
+    from scanprep.geometry.landmarks import read_landmarks, try_match_landmarks
 
-    return shared_landmarks(scan, marks_of_template(model, template, name), read_landmarks(scan, None, unit))
+    return try_match_landmarks(scan, marks_of_template(model, template, name), read_landmarks(scan, None, unit))

@@ -77,7 +77,7 @@ class LightMesh:
 Bodies = Callable[[np.ndarray], np.ndarray]            # frames (n,) -> vertices (n, N, 3), metres
 
 
-def played(motion: Motion) -> tuple[np.ndarray, float]:
+def frames_to_play(motion: Motion) -> tuple[np.ndarray, float]:
     """The frames that a page plays, and how many a second."""
     step = max(1, round(motion.rate / PLAYED), -(-len(motion.poses) // MOST_PLAYED))
     return np.arange(0, len(motion.poses), step), motion.rate / step
@@ -90,7 +90,7 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
 
     Lost frames are grey. `bodies` says what it looks like, if not as the subject.
     """
-    frames, rate = played(motion)
+    frames, rate = frames_to_play(motion)
     light = light or LightMesh.of(subject.template)
     make = bodies or (lambda some: motion.vertices(subject, some))
     # 128 bodies are held at a time
@@ -110,10 +110,10 @@ def moving_pane(motion: Motion, subject: Subject, dots: Sequence[tuple[Dots, np.
     return Pane(shapes, camera, label)
 
 
-def dotted_pane(motion: Motion, subject: Subject, places: np.ndarray, name: str, labels: Sequence[str],
-                on_top: bool = False) -> Pane:
+def pane_with_dots(motion: Motion, subject: Subject, places: np.ndarray, name: str, labels: Sequence[str],
+                   on_top: bool = False) -> Pane:
     """A body in motion with the places (T, L, 3), metres, that it follows."""
-    at = places[played(motion)[0]]
+    at = places[frames_to_play(motion)[0]]
     return moving_pane(motion, subject, [(Dots(at[0], MARKER, 0.013, on_top, name=name, labels=labels), at)])
 
 

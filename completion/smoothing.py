@@ -18,14 +18,15 @@ def inertia(n_unknowns: int, rate: float, angle: float, place: float) -> np.ndar
     return (rate**2 / sd)**2
 
 
-def predicted(x: np.ndarray, before: np.ndarray, momentum: float) -> np.ndarray:
+def predict(x: np.ndarray, before: np.ndarray, momentum: float) -> np.ndarray:
     """Unknowns (P,) of the next frame from those of the last two, by the share of the velocity that is kept."""
     n = len(x) - 3
     return retract_pose(n)(x, momentum * step_between(before, x, n))
 
 
-def coupled_steps(x: np.ndarray, equations: Callable[[slice], tuple[np.ndarray, np.ndarray]], stiffness: np.ndarray
-                  ) -> np.ndarray:
+def solve_coupled_steps(x: np.ndarray, equations: Callable[[slice], tuple[np.ndarray, np.ndarray]],
+                        stiffness: np.ndarray
+                        ) -> np.ndarray:
     """The step (T, P) of frames x (T, P), at least 3, constant velocity as a prior with `inertia` as its stiffness.
 
     Of everything else come half the gradient (n, P), which is used up, and the Gauss-Newton matrix (n, P, P) of some
@@ -43,7 +44,7 @@ def coupled_steps(x: np.ndarray, equations: Callable[[slice], tuple[np.ndarray, 
 
 
 def smooth(x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, stiffness: np.ndarray, rounds: int) -> np.ndarray:
-    """All frames (T, P) after some rounds of `coupled_steps`, each frame with what its own data said as a quadratic.
+    """Smooth all frames (T, P) by some rounds of `solve_coupled_steps`, the data of each frame as a quadratic.
 
     Frames are no longer needed: near its own optimum x a frame is its gradient and its Gauss-Newton matrix.
     """
@@ -54,5 +55,5 @@ def smooth(x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, stiffness: 
         def equations(near: slice, slope: np.ndarray = slope) -> tuple[np.ndarray, np.ndarray]:
             return slope[near].copy(), hessian[near]
 
-        at = retract_pose(n)(at, coupled_steps(at, equations, stiffness))
+        at = retract_pose(n)(at, solve_coupled_steps(at, equations, stiffness))
     return at

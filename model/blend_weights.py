@@ -6,7 +6,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import laplacian
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.remeshing import clamped_cotangents
+from scanprep.geometry.remeshing import clamp_cotangents
 from scanprep.geometry.sparse import Factored, factor
 from scanprep.skeleton.tree import Skeleton
 
@@ -45,7 +45,7 @@ def skin_weights(template: Mesh, skeleton: Skeleton, width: float = 0.05) -> np.
         np.add.at(labels, (template.faces[:, corner], skeleton.part_of_face), template.face_areas / 3)
     alone = ~labels.any(axis=1)
     labels[alone, skeleton.part_of_vertex(template)[alone]] = areas[alone]
-    spread = factor(csc_array(diags_array(areas) + width**2 * clamped_cotangents(template)))(labels)
+    spread = factor(csc_array(diags_array(areas) + width**2 * clamp_cotangents(template)))(labels)
     return to_neighbours(np.maximum(spread, 0), skeleton)
 
 
@@ -95,14 +95,14 @@ def strongest(weights: np.ndarray, count: int = CARRIERS, least: float = 1e-6) -
     return kept / kept.sum(axis=1, keepdims=True)
 
 
-def diffused_weights(template: Mesh, skeleton: Skeleton, width: float) -> np.ndarray:
+def diffuse_weights(template: Mesh, skeleton: Skeleton, width: float) -> np.ndarray:
     """Weights (N, J) that pass from part to part over a width, in metres, along the surface."""
     own = np.eye(len(skeleton.parents))[skeleton.part_of_vertex(template)]
     # at most 6 parts that a vertex may choose from
-    return strongest(diffused(template, own, width), 6, 1e-3)
+    return strongest(diffuse(template, own, width), 6, 1e-3)
 
 
-def diffused(template: Mesh, values: np.ndarray, width: float) -> np.ndarray:
+def diffuse(template: Mesh, values: np.ndarray, width: float) -> np.ndarray:
     """Values (N, k) of the vertices after they have spread over a width, in metres, along the surface."""
     reach = (width / template.mean_edge) ** 2
     smooth = eye_array(len(values)) + reach * csc_array(laplacian(template.vertex_adjacency))

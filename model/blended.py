@@ -19,8 +19,8 @@ from scanprep.geometry import rotations
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .features import PoseFeatures, lifted, lifted_slopes
-from .linear import PointOperator, chosen_rows
+from .features import PoseFeatures, lift_derivative, lift_twists
+from .linear import PointOperator, find_single_rows
 from .products import Products
 
 AT_ONCE = 2**21                      # numbers of the blended motions that are held together
@@ -88,7 +88,7 @@ class Blended(PointOperator):
             y = M[:, :, 3]
             for k in range(3):
                 y += M[:, :, k] * x[:, k, None]
-            out[some] = _mixed(y, self.mix)
+            out[some] = _mix(y, self.mix)
         if self.middle is not None:
             out -= self.middle.turned(poses) * self._share
         return out.reshape(*pose.shape[:-2], 3, self.count)
@@ -105,13 +105,13 @@ class Blended(PointOperator):
         # ω × x = hat(ω) @ x for every column ω of `turn`
         columns = rotations.hat(np.swapaxes(turn, -1, -2)) @ carried[:, :, None]                # (B, J, 3, 3, n)
         if self.bent and self.bends.size:
-            slope = self.bent * np.swapaxes(lifted_slopes(self.features.lift, poses)[:, 1:], -1, -2)
+            slope = self.bent * np.swapaxes(lift_derivative(self.features.lift, poses)[:, 1:], -1, -2)
             sway = (slope @ self.bends.reshape(*self.bends.shape[:2], -1)).reshape(B, J - 1, 3, 3, n)
             G = self._motions(R, t, moved)[:, None, None]
             for k in range(3):
                 columns[:, 1:] += G[..., k, :] * sway[..., k, None, :]
-        y = np.swapaxes(_mixed(carried[:, 0], self.mix), -1, -2).reshape(*leading, self.count, 3)
-        columns = _mixed(columns, self.mix).reshape(*leading, 3 * J, 3, self.count)
+        y = np.swapaxes(_mix(carried[:, 0], self.mix), -1, -2).reshape(*leading, self.count, 3)
+        columns = _mix(columns, self.mix).reshape(*leading, 3 * J, 3, self.count)
         if self.middle is not None:
             held, by_pose = self.middle.columns(pose, np.zeros(3))
             y, columns = y - held * self._share[:, None], columns - by_pose * self._share
@@ -120,7 +120,7 @@ class Blended(PointOperator):
     def _rigid(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rotations (B, J, 3, 3) of the parts, what follows them (B, J, 3), and where joints are; the root's is 0."""
         R = self.skeleton.part_rotations(poses)
-        return R, *hung(self.skeleton, R, self.places)
+        return R, *relative_to_parents(self.skeleton, R, self.places)
 
     def _motions(self, R: np.ndarray, t: np.ndarray, _: np.ndarray) -> np.ndarray:
         """(B, 3, 4, n) the mean motion of every vertex: a mean of rotations, then a translation."""
@@ -133,11 +133,11 @@ class Blended(PointOperator):
         x = np.ascontiguousarray(self.rest.T)
         if not self.bent or not self.bends.size:
             return np.broadcast_to(x, (len(poses), *x.shape))
-        f = self.bent * lifted(self.features.lift, poses)[:, 1:].reshape(len(poses), -1)
+        f = self.bent * lift_twists(self.features.lift, poses)[:, 1:].reshape(len(poses), -1)
         return (f.astype(x.dtype, copy=False) @ self.bends.reshape(f.shape[1], -1)).reshape(-1, *x.shape) + x
 
     def combined(self, weights: np.ndarray | sparray) -> Blended:
-        used, mix = _picked(self.mix, weights)
+        used, mix = _needed_vertices(self.mix, weights)
         return replace(self, weights=self.weights[used], rest=self.rest[used],
                        bends=np.ascontiguousarray(self.bends[..., used]), mix=mix)
 
@@ -171,7 +171,7 @@ class Blended(PointOperator):
                        mix=mix)
 
 
-def hung(skeleton: Skeleton, R: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def relative_to_parents(skeleton: Skeleton, R: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of part rotations (B, J, 3, 3) and joints (..., J, 3): `y_j - R j` (B, ..., J, 3), and `y_j`, the root's zero."""
     R = R.reshape(len(R), *(1,) * (joints.ndim - 2), *R.shape[1:])
     y = np.zeros(np.broadcast_shapes(R.shape[:-1], joints.shape))
@@ -181,9 +181,9 @@ def hung(skeleton: Skeleton, R: np.ndarray, joints: np.ndarray) -> tuple[np.ndar
     return y - (R @ joints[..., None])[..., 0], y
 
 
-def _picked(mix: Mix, weights: np.ndarray | sparray) -> tuple[np.ndarray | slice, Mix]:
+def _needed_vertices(mix: Mix, weights: np.ndarray | sparray) -> tuple[np.ndarray | slice, Mix]:
     """Which vertices combinations (K, L) of points, `mix` of n vertices, need, and how they are mixed of those."""
-    rows = chosen_rows(weights) if mix is None else None
+    rows = find_single_rows(weights) if mix is None else None
     if rows is not None:
         return rows, None
     if isinstance(weights, np.ndarray):
@@ -193,7 +193,7 @@ def _picked(mix: Mix, weights: np.ndarray | sparray) -> tuple[np.ndarray | slice
     return used, csr_array((whole.data, place, whole.indptr), shape=(whole.shape[0], len(used)))
 
 
-def _mixed(y: np.ndarray, mix: Mix) -> np.ndarray:
+def _mix(y: np.ndarray, mix: Mix) -> np.ndarray:
     """(..., L) combinations of (..., n)."""
     return y if mix is None else np.asarray(y.reshape(-1, y.shape[-1]) @ mix.T).reshape(*y.shape[:-1], mix.shape[0])
 
@@ -241,11 +241,12 @@ class ShapedBlended(ShapedPoints):
         pose = np.asarray(pose, dtype=np.float64)
         poses = pose.reshape(-1, *pose.shape[-2:])
         R = self.skeleton.part_rotations(poses)
-        out = np.swapaxes(hung(self.skeleton, R, self.joints)[0], -1, -2) @ self.mean.weights.T       # (B, K, 3, n)
+        # (B, K, 3, n)
+        out = np.swapaxes(relative_to_parents(self.skeleton, R, self.joints)[0], -1, -2) @ self.mean.weights.T
         G = (np.swapaxes(R.reshape(*R.shape[:2], 9), 1, 2) @ self.mean.weights.T).reshape(len(R), 1, 3, 3, -1)
         for k in range(3):
             out += G[:, :, :, k] * self.rest[:, None, :, k]
-        out = _mixed(out, self.mean.mix)
+        out = _mix(out, self.mean.mix)
         if self.mean.middle is not None:
             out -= np.swapaxes(self._middles.turned(poses), -1, -2)[..., None]
         out += self.origin[..., None]
@@ -258,7 +259,7 @@ class ShapedBlended(ShapedPoints):
         return replace(self.mean.middle, basis=np.moveaxis(self.middle[..., 0], 0, -1))
 
     def combined(self, weights: np.ndarray | sparray) -> ShapedBlended:
-        used, _ = _picked(self.mean.mix, weights)
+        used, _ = _needed_vertices(self.mean.mix, weights)
         return replace(self, own=self.own.combined(weights), mean=self.mean.combined(weights), rest=self.rest[:, used])
 
     def joined(self, other: ShapedPoints) -> ShapedBlended:

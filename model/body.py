@@ -18,7 +18,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
 from .blend_weights import skin_weights
-from .features import PoseFeatures, restored_features
+from .features import PoseFeatures, restore_features
 from .linear import PointOperator, Subject, check_pose
 
 Progress = Callable[[int, int], None]
@@ -207,8 +207,8 @@ class BodyModel(ABC):
         """Read a file of `save`; see `load_model`."""
         header, arrays = storage.load(path, cls.kind, (1, 2, VERSION))
         with storage.taking_apart(path, "a whole model"):
-            parts = restored_parts(header, arrays)
-            return cls.restored(parts, restored_features(parts["skeleton"], header, arrays), header, arrays)
+            parts = restore_parts(header, arrays)
+            return cls.restored(parts, restore_features(parts["skeleton"], header, arrays), header, arrays)
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
@@ -222,7 +222,7 @@ class BodyModel(ABC):
     @abstractmethod
     def restored(cls: type[Model], parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
                  arrays: Mapping[str, np.ndarray]) -> Model:
-        """The model of a file: fields that all kinds have (`restored_parts`), features, the header, the arrays.
+        """The model of a file: fields that all kinds have (`restore_parts`), features, the header, the arrays.
 
         KeyError, TypeError or ValueError for what is missing or does not fit the rest.
         """
@@ -320,7 +320,7 @@ class BodyModel(ABC):
         return Derivatives(y, by_pose, by_shape)
 
 
-def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def restore_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """What every kind of model has, from a file of it; files of earlier versions may have no pose examples.
 
     KeyError, TypeError or ValueError for what is missing or does not fit the rest.
@@ -346,7 +346,7 @@ def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) 
             "pose_examples": examples}
 
 
-def restored_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.ndarray, float]:
+def restore_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.ndarray, float]:
     """Variances (K,) of the shape components and the variance in all directions, from a model file."""
     variances = storage.numbers(arrays, "shape_variances", None)
     whole = float(storage.numbers(arrays, total))

@@ -31,7 +31,7 @@ from scanprep.skeleton.tree import affine_weights
 
 from .body import Progress
 from .importing import Published, as_skinning, import_model
-from .skinning import SkinningModel, unblended
+from .skinning import SkinningModel, invert_blended
 
 # by the file that only this model's folder has: the module and class of the library
 FOLDERS = {"mhr_model.pt": ("body_models.mhr.numpy", "MHR"), "SOMA_neutral.npz": ("body_models.soma.numpy", "SOMA")}
@@ -120,7 +120,7 @@ def corrective_shapes(body: Library, plain: SkinningModel, j: int, rng: np.rando
     controls = body.draw([j], BENT, POSES, rng)
     poses = body.poses(controls)
     off = body.vertices(controls) - plain.subject(None).vertices(poses)
-    lacking = np.stack([unblended(plain.blended(pose)) @ each[..., None]
+    lacking = np.stack([invert_blended(plain.blended(pose)) @ each[..., None]
                         for pose, each in zip(poses, off, strict=True)])
     X = (rotations.exp(poses[:, j]) - np.eye(3)).reshape(POSES, 9)
     # mean square of a number of R - I that counts as nothing

@@ -25,7 +25,7 @@ from scanprep.geometry.sparse import Factored, gatherer
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .linear import PointOperator, chosen_rows
+from .linear import PointOperator, find_single_rows
 from .products import Products, ShapedProducts, Terms
 from .stitching import edge_operator
 
@@ -227,7 +227,7 @@ class Condensed(PointOperator):
                                for part, table in zip(self.system.parts, self.tables, strict=True)])
 
     def combined(self, weights: np.ndarray | sparray) -> Products:
-        used, mixed = needed_vertices(weights)
+        used, mixed = find_needed_vertices(weights)
         # more than a tenth of the vertices are asked for again and again, as a fit matches others in every round
         if "products" in self.__dict__ or len(used) * MANY > self.count:
             return self.products.combined(weights)
@@ -246,9 +246,9 @@ class Condensed(PointOperator):
         return replace(self, tables=tuple(table.astype(dtype, copy=False) for table in self.tables))
 
 
-def needed_vertices(weights: np.ndarray | sparray) -> tuple[np.ndarray, csr_array | None]:
+def find_needed_vertices(weights: np.ndarray | sparray) -> tuple[np.ndarray, csr_array | None]:
     """The vertices (n,) that combinations (L, N) need, and their weights (L, n); no weights where each is a vertex."""
-    rows = chosen_rows(weights)
+    rows = find_single_rows(weights)
     if rows is not None:
         return np.asarray(rows), None
     sparse = csr_array(weights)
@@ -353,7 +353,7 @@ class ShapedCondensed(ShapedPoints):
         return np.moveaxis(y, -1, -3)
 
     def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
-        used, mixed = needed_vertices(weights)
+        used, mixed = find_needed_vertices(weights)
         system, L, basis = self.mean.system, len(used), []
         reach, place = system.reach(used), system.place_of[used]
         # of every part the tables of the two bodies and of all betas, as rows of one product

@@ -30,7 +30,7 @@ def body_digests(*sets: np.ndarray | None) -> list[str]:
     return [body_digest(body) for bodies in sets if bodies is not None for body in bodies]
 
 
-def trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
+def was_trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
     """(M,) bool: which of the bodies (M, N, 3) the model was trained on; None where its file does not say."""
     known = model.info.get("digests")
     if known is None:
@@ -38,7 +38,7 @@ def trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
     return np.array([body_digest(body) in set(known) for body in bodies], dtype=bool)
 
 
-def checked_bodies(template: Mesh, bodies: np.ndarray, name: str, least: int = 1) -> np.ndarray:
+def check_bodies(template: Mesh, bodies: np.ndarray, name: str, least: int = 1) -> np.ndarray:
     """At least so many finite bodies (n, N, 3) in the template's topology, or ValueError."""
     bodies, N = np.asarray(bodies, dtype=np.float64), len(template.vertices)
     if bodies.ndim != 3 or bodies.shape[1:] != (N, 3):

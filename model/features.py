@@ -132,12 +132,12 @@ LIFTS: dict[str, Lift] = {lift.kind: lift for lift in (LinearLift(), QuadraticLi
                                                        QuaternionLift())}
 
 
-def lifted(lift: Lift, pose: np.ndarray) -> np.ndarray:
+def lift_twists(lift: Lift, pose: np.ndarray) -> np.ndarray:
     """The lifted twists (..., J, m) of poses (..., J, 3) of any length."""
     return lift.evaluate(twists(pose))
 
 
-def lifted_slopes(lift: Lift, pose: np.ndarray) -> np.ndarray:
+def lift_derivative(lift: Lift, pose: np.ndarray) -> np.ndarray:
     """(..., J, m, 3) derivative of the lifted twists of each joint by its pose parameters (..., J, 3)."""
     pose = np.asarray(pose, dtype=np.float64)
     t = twists(pose)
@@ -150,7 +150,7 @@ def lifted_slopes(lift: Lift, pose: np.ndarray) -> np.ndarray:
     return slope
 
 
-def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
+def restore_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
     """The features of a model file, or ValueError."""
     J = len(skeleton.parents)
     if "direction_count" in arrays:             # of the first version, which had linear ones only
@@ -218,12 +218,12 @@ class PoseFeatures:
 
     def evaluate(self, pose: np.ndarray) -> np.ndarray:
         """Features (..., A) of poses (..., J, 3), radians."""
-        raised = lifted(self.lift, pose)
+        raised = lift_twists(self.lift, pose)
         return raised.reshape(*raised.shape[:-2], len(self._flat)) @ self._flat + self.constant
 
     def derivative(self, pose: np.ndarray) -> np.ndarray:
         """(..., A, J, 3) derivative of every feature by the pose parameters (..., J, 3)."""
-        by_joint = np.swapaxes(self.mix, -1, -2) @ lifted_slopes(self.lift, pose)              # (..., J, A, 3)
+        by_joint = np.swapaxes(self.mix, -1, -2) @ lift_derivative(self.lift, pose)              # (..., J, A, 3)
         return np.swapaxes(by_joint, -2, -3)
 
 

@@ -90,10 +90,10 @@ def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.nd
     loose = np.full(mean.size, 0.25)
     loose[:3] = 0                                                                 # the root is at rest
     theirs = people.mean(axis=0), np.cov(people.reshape(DRAWN, -1).T) + np.diag(loose**2)
-    return mixed((mean, covariance), theirs, count / (count + WORTH))
+    return mix_moments((mean, covariance), theirs, count / (count + WORTH))
 
 
-def mixed(one: Moments, other: Moments, share: float) -> Moments:
+def mix_moments(one: Moments, other: Moments, share: float) -> Moments:
     """Moments of poses of which a share has those of the one, and the rest those of the other."""
     apart = (one[0] - other[0]).ravel()
     return (share * one[0] + (1 - share) * other[0],

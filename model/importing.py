@@ -160,10 +160,10 @@ def read_published(path: str | Path) -> Published:
             raise
         if "header" in arrays:
             raise ValueError("it is a model of ours already: nothing to import")
-        return _checked(arrays)
+        return _check_arrays(arrays)
 
 
-def _checked(a: dict[str, np.ndarray]) -> Published:
+def _check_arrays(a: dict[str, np.ndarray]) -> Published:
     """What the arrays are, or ValueError or KeyError."""
     for name in NEEDED:
         if name not in a:

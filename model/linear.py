@@ -208,10 +208,10 @@ class Subject:
         ValueError
             Indices out of range, shapes that do not agree, weights that do not sum to 1.
         """
-        return self.operator.combined(picked(self.n_vertices, vertex_ids, weights)).astype(np.float64)
+        return self.operator.combined(combination_weights(self.n_vertices, vertex_ids, weights)).astype(np.float64)
 
 
-def picked(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None) -> csr_array:
+def combination_weights(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None) -> csr_array:
     """(L, N) surface points as combinations of vertices; arguments as of `Subject.points`."""
     ids, weights = check_points(n_vertices, vertex_ids, weights)
     share = np.ones(ids.shape) if weights is None else weights
@@ -221,7 +221,7 @@ def picked(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None) 
     return found
 
 
-def chosen_rows(weights: np.ndarray | sparray) -> np.ndarray | None:
+def find_single_rows(weights: np.ndarray | sparray) -> np.ndarray | None:
     """(K,) the points, where weights (K, L) pick one each; None for true combinations."""
     if isinstance(weights, np.ndarray) or weights.nnz != weights.shape[0]:
         return None

@@ -85,7 +85,7 @@ def nearest_joints(template: Mesh, skeleton: Skeleton, count: int = 2) -> np.nda
     return near
 
 
-def kept_directions(poses: np.ndarray, threshold: float) -> tuple[np.ndarray, ...]:
+def principal_directions(poses: np.ndarray, threshold: float) -> tuple[np.ndarray, ...]:
     """J arrays (3, k_j): principal twist directions of variance at or above a threshold, rad², the largest first.
 
     [SCAPE] §4.2

@@ -18,7 +18,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
 from .features import PoseFeatures
-from .linear import PointOperator, chosen_rows
+from .linear import PointOperator, find_single_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class Products(PointOperator):
         return y, columns.reshape(*leading, 3 * J, 3, L)
 
     def combined(self, weights: np.ndarray | sparray) -> Products:
-        return replace(self, basis=_combined(self.basis, weights))
+        return replace(self, basis=_combine(self.basis, weights))
 
     def plus(self, factor: float, other: PointOperator) -> Products:
         assert isinstance(other, Products), "of the same kind of model"
@@ -121,9 +121,9 @@ class Products(PointOperator):
         return replace(self, basis=self.basis.astype(dtype, copy=False))
 
 
-def _combined(basis: np.ndarray, weights: np.ndarray | sparray) -> np.ndarray:
+def _combine(basis: np.ndarray, weights: np.ndarray | sparray) -> np.ndarray:
     """T (..., 3, L) of combinations of points."""
-    rows = chosen_rows(weights)
+    rows = find_single_rows(weights)
     if rows is not None:
         return np.take(basis, rows, axis=-1)
     if isinstance(weights, np.ndarray):
@@ -181,7 +181,7 @@ class ShapedProducts(ShapedPoints):
         return Products(self.terms, np.moveaxis(self.change, 0, 2).reshape(M, 3, K * L), np.zeros(3))
 
     def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
-        own, mean, change = (_combined(T, weights) for T in (self.own, self.mean, self.change))
+        own, mean, change = (_combine(T, weights) for T in (self.own, self.mean, self.change))
         return replace(self, own=own, mean=mean, change=change)
 
     def joined(self, other: ShapedPoints) -> ShapedProducts:

@@ -48,7 +48,7 @@ class Rig:
     skeleton: Skeleton               # with the joints of this body
     weights: np.ndarray              # (N, J), rows sum to 1, with at most `CARRIERS` entries that are not zero
     shapes: np.ndarray               # (K, N, 3) metres, change of the rest mesh for one standard deviation of each beta
-    # (J, 3, 3): columns are the axes of each bone at rest, in the world; y along the bone where they are `aimed`
+    # (J, 3, 3): columns are the axes of each bone at rest, in the world; y along the bone where they are `aim_bones`
     axes: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 3)))
     correctives: Correctives | None = None          # of the one motion that the rig is written with
 
@@ -157,7 +157,7 @@ def subject_rig(subject: Subject) -> Rig:
                strongest(skin_weights(template, skeleton)), np.zeros((0, *rest.shape)))
 
 
-def rerooted(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tuple[Rig, np.ndarray, np.ndarray]:
+def change_root(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tuple[Rig, np.ndarray, np.ndarray]:
     """The same surface in the same motion, with a skeleton that hangs on another part.
 
     All parts turn as before and all joints between parts stay where they are; the root's own joint is the centroid of
@@ -195,8 +195,8 @@ def rerooted(rig: Rig, poses: np.ndarray, trans: np.ndarray, root: str) -> tuple
             places - new.joints[0])
 
 
-def carried(rig: Rig, poses: np.ndarray, trans: np.ndarray, rest: tuple[np.ndarray, np.ndarray],
-            world: tuple[np.ndarray, np.ndarray]) -> tuple[Rig, np.ndarray, np.ndarray]:
+def transform_rig(rig: Rig, poses: np.ndarray, trans: np.ndarray, rest: tuple[np.ndarray, np.ndarray],
+                  world: tuple[np.ndarray, np.ndarray]) -> tuple[Rig, np.ndarray, np.ndarray]:
     """The same body, turned and shifted at rest by (R (3, 3), shift (3,)), and in its motion by those of `world`.
 
     Poses (T, J, 3) radians, trans (T, 3) metres; T may be 0.

@@ -14,11 +14,11 @@ from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
 from .blending import BlendedTemplate, rigid_weights
-from .body import BodyModel, Progress, restored_variances
+from .body import BodyModel, Progress, restore_variances
 from .condensed import Condensed, ShapedCondensed
 from .features import PoseFeatures
 from .gradients import GradientSystem, ShapeSolver, shape_gradients
-from .linear import Subject, check_pose, picked
+from .linear import Subject, check_pose, combination_weights
 from .pose_space import PoseSpace, faces_of_part
 from .priors import sample_poses
 from .products import Terms
@@ -117,7 +117,7 @@ class ScapeModel(BodyModel):
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedPoints:
         whole = self.everywhere if n_betas is None else self.everywhere.first(n_betas)
-        return whole.combined(picked(len(self.template.vertices), vertex_ids, weights))
+        return whole.combined(combination_weights(len(self.template.vertices), vertex_ids, weights))
 
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         pose, _ = check_pose(self.skeleton, pose, None)
@@ -231,7 +231,7 @@ class ScapeModel(BodyModel):
         flat = storage.numbers(arrays, "pose_coefficients", 9 * int(n @ sizes))
         blocks = np.split(flat, np.cumsum(9 * n * sizes)[:-1])
         coefficients = tuple(b.reshape(k, f, 3, 3) for b, k, f in zip(blocks, n, sizes, strict=True))
-        variances, total = restored_variances(arrays, "shape_total_variance")
+        variances, total = restore_variances(arrays, "shape_total_variance")
         shapes = ShapeSpace(storage.numbers(arrays, "shape_mean", F, 3, 3),
                             storage.numbers(arrays, "shape_components", len(variances), F, 3, 3), variances, total)
         return cls(pose_space=PoseSpace(features, coefficients), shape_space=shapes, **parts, **cls._extra(arrays))

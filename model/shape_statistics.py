@@ -35,7 +35,7 @@ class ShapeStatistics:
         return axes * np.sqrt(np.maximum(variance, 0))
 
 
-def known_sexes(model: BodyModel) -> tuple[Sex, ...]:
+def list_sexes(model: BodyModel) -> tuple[Sex, ...]:
     """The sexes whose statistics a model keeps; none of most models."""
     return tuple(sex for sex in SEXES if sex in model.info.get("sexes", {}))
 
@@ -73,7 +73,7 @@ def shape_statistics(model: BodyModel, sex: Sex | None = None) -> ShapeStatistic
         return ShapeStatistics(np.zeros(K), np.eye(K))
     if sex not in SEXES:
         raise ValueError(f"sex: expected 'female' or 'male', got {sex!r}")
-    if sex not in known_sexes(model):
+    if sex not in list_sexes(model):
         raise ValueError(f"sex: the model does not tell women from men, so it has no {WORDS[sex]}; leave it out, or "
                          "take the built-in model, which is named people")
     kept = model.info["sexes"][sex]
@@ -101,7 +101,7 @@ def draw_betas(model: BodyModel, count: int, rng: np.random.Generator, sex: Sex 
     ((4, 30), ('female', 'male', 'female', 'male'))
     """
     z = rng.normal(size=(count, model.n_betas))
-    both = known_sexes(model)
+    both = list_sexes(model)
     if sex is not None or len(both) < 2:
         people = shape_statistics(model, sex)
         # a unit covariance has roots in any direction: those who ask for none get the numbers as they are drawn

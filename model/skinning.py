@@ -15,9 +15,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton, affine_weights
 
 from .blended import Blended, ShapedBlended
-from .body import BodyModel, Progress, restored_variances
+from .body import BodyModel, Progress, restore_variances
 from .features import PoseFeatures, RotationLift
-from .linear import Subject, picked
+from .linear import Subject, combination_weights
 from .products import Products, Terms
 from .resolution.transfer import Follower
 
@@ -206,7 +206,7 @@ class SkinningModel(BodyModel):
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedBlended:
         whole = self.everywhere if n_betas is None else self.everywhere.first(n_betas)
-        return whole.combined(picked(len(self.rest), vertex_ids, weights))
+        return whole.combined(combination_weights(len(self.rest), vertex_ids, weights))
 
     def unposed(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(N, 3) rest vertices that the model carries onto a body (N, 3) exactly, joints of their own included.
@@ -214,7 +214,7 @@ class SkinningModel(BodyModel):
         The root's joint is where the template has it. `x = B⁻¹ (y - Σ_j below_j turn_j j_j) - c` with joints j = A x is
         first solved for the joints alone.
         """
-        back, A, J = unblended(self.blended(pose)), self.joint_regressor, len(pose)
+        back, A, J = invert_blended(self.blended(pose)), self.joint_regressor, len(pose)
         bare = np.einsum("nij,nj->ni", back, vertices) - self.corrections(pose)
         pull = np.einsum("nj,nik,jkl->nijl", self.below, back, self.joint_turns(pose)).reshape(len(vertices), -1)
         coupling = (A @ pull).reshape(3 * J, 3 * J)
@@ -282,7 +282,7 @@ class SkinningModel(BodyModel):
                  arrays: Mapping[str, np.ndarray]) -> SkinningModel:
         stored: dict[str, Any] = {name: storage.numbers(arrays, name, *(None,) * axes)
                                   for name, axes in _STORED.items()}
-        stored["shape_variances"], stored["shape_total"] = restored_variances(arrays, "shape_total")
+        stored["shape_variances"], stored["shape_total"] = restore_variances(arrays, "shape_total")
         if header.get("own_joints"):
             J, data = len(parts["skeleton"].parents), storage.numbers(arrays, "regressor_weight", None)
             at = tuple(storage.numbers(arrays, f"regressor_{name}", len(data), kinds="iu")
@@ -295,7 +295,7 @@ class SkinningModel(BodyModel):
 _STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3}
 
 
-def unblended(B: np.ndarray) -> np.ndarray:
+def invert_blended(B: np.ndarray) -> np.ndarray:
     """Inverses (N, 3, 3) of means of rotations, gently where they have collapsed."""
     flat = np.linalg.det(B) < SOFTEST
     if flat.any():

@@ -363,7 +363,7 @@ class BodyLayer(nn.Module):
         if isinstance(self.points, _BlendedPoints) and not self.points.held:
             self.joints = _ChainedJoints(self.points)
         elif vertices is not None:
-            self.joints = _points_layer(body.points(*_padded(regressor)), skeleton.parents)
+            self.joints = _points_layer(body.points(*_pad_regressor(regressor)), skeleton.parents)
         else:
             ring = np.unique(regressor.indices)
             self.register_buffer("ring", torch.from_numpy(ring.astype(np.int64)))
@@ -483,7 +483,7 @@ def _features_of(operator: PointOperator) -> PoseFeatures:
     return operator.terms.features
 
 
-def _padded(regressor: csr_array) -> tuple[np.ndarray, np.ndarray]:
+def _pad_regressor(regressor: csr_array) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (J, k) and weights (J, k) of a regressor (J, N), rows filled up with weights of zero."""
     counts = np.diff(regressor.indptr)
     ids, weights = np.zeros((2, len(counts), counts.max()))

@@ -270,7 +270,7 @@ def read_line(prog: str, text: str, arguments: Sequence[Argument], argv: Sequenc
         A flag that there is not, with the nearest; what is missing, all of it; a value of another type.
     """
     parser = make_parser(prog, text, arguments)
-    given, left = parser.parse_known_intermixed_args(_joined(argv, arguments))
+    given, left = parser.parse_known_intermixed_args(_join_flag_values(argv, arguments))
     if left:
         word = next((word for word in left if word.startswith("-")), left[0])
         if not word.startswith("-"):
@@ -287,7 +287,7 @@ def read_line(prog: str, text: str, arguments: Sequence[Argument], argv: Sequenc
     return {a.name: a.value(getattr(given, a.name)) if hasattr(given, a.name) else a.default for a in arguments}
 
 
-def _joined(argv: Sequence[str], arguments: Sequence[Argument]) -> list[str]:
+def _join_flag_values(argv: Sequence[str], arguments: Sequence[Argument]) -> list[str]:
     """A flag and its value in one word where the value begins with a dash, as in `--up -y`; flags as help has them."""
     single = {flag for a in arguments if a.nargs is None and a.type is not bool for flag in a.flags}
     known = {"-h", "--help", *(flag for a in arguments for flag in a.flags)}

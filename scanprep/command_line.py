@@ -58,7 +58,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
                 raise
             for failure in getattr(error, "failures", ()):
                 say(call.real(f"{prog}: failed: {call.arguments.as_flags(failure)}") if call else failure)
-            told = _told(error)
+            told = _error_line(error)
             say(f"{prog}: {told if call is None else call.real(call.arguments.as_flags(told))}")
             return 2 if isinstance(error, UsageError) else wrong
     judgement = outcome.judgement
@@ -131,7 +131,7 @@ class _Settings:
             value = given.pop(name)
             if flag.path:
                 first, *rest = flag.path
-                values[first] = config_files.replaced(values[first], tuple(rest), value)
+                values[first] = config_files.replace_at(values[first], tuple(rest), value)
         return {**given, **values}
 
 
@@ -281,7 +281,7 @@ def _notes(prog: str) -> Iterator[tuple[list[Callable[[str], str]], list[str]]]:
         yield spelled, notes
 
 
-def _told(error: Exception) -> str:
+def _error_line(error: Exception) -> str:
     """One line for what went wrong; with the way to the traceback where nobody foresaw it."""
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError):
@@ -307,7 +307,7 @@ def dispatch(commands: Mapping[str, tuple[str, str]], prog: str, argv: list[str]
                          f"`{prog} COMMAND --help` tells the rest.\n")
         return 0 if argv else 2
     if first not in commands:
-        everywhere = {path.split()[-1]: path for path in listed(commands, prog)}
+        everywhere = {path.split()[-1]: path for path in list_commands(commands, prog)}
         at = everywhere.get(first)
         hint = f"; did you mean {at}?" if at else near(first, commands) or near(first, everywhere)
         say(f"{prog}: no command '{first}'{hint or '; there are: ' + ', '.join(commands)}")
@@ -324,12 +324,12 @@ def load(target: str) -> Callable[..., Any]:
     return getattr(importlib.import_module(module), function)
 
 
-def listed(commands: Mapping[str, tuple[str, str]], prog: str) -> dict[str, str]:
+def list_commands(commands: Mapping[str, tuple[str, str]], prog: str) -> dict[str, str]:
     """Every command below a group, as it is typed, with its "module:function"."""
     found: dict[str, str] = {}
     for name, (_, target) in commands.items():
         if target.endswith(":group"):
-            found |= listed(importlib.import_module(target.split(":")[0]).COMMANDS, f"{prog} {name}")
+            found |= list_commands(importlib.import_module(target.split(":")[0]).COMMANDS, f"{prog} {name}")
         else:
             found[f"{prog} {name}"] = target
     return found

@@ -52,10 +52,10 @@ def _flags(path: Path_, config: Settings) -> Iterator[Flag]:
             yield from _flags((*path, field.name), value)
 
 
-def replaced(config: Settings, path: Path_, value: Any) -> Settings:
+def replace_at(config: Settings, path: Path_, value: Any) -> Settings:
     """Settings with another value at a path of field names."""
     first, *rest = path
-    inner = replaced(getattr(config, first), tuple(rest), value) if rest else value
+    inner = replace_at(getattr(config, first), tuple(rest), value) if rest else value
     return dataclasses.replace(config, **{first: inner})
 
 
@@ -128,10 +128,10 @@ def read(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
     """Settings with what a file changes in them; ValueError names file, line, what was expected, the nearest name."""
     with storage.taking_apart(path, "settings in TOML"):
         text = storage.read_bytes(path, "settings in TOML").decode("utf-8")
-    return parsed(text, path, settings)
+    return parse_settings(text, path, settings)
 
 
-def parsed(text: str, path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
+def parse_settings(text: str, path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
     """The same of a text that stands in a file."""
     import tomlkit
     from tomlkit.exceptions import ParseError
@@ -144,10 +144,10 @@ def parsed(text: str, path: Path, settings: Mapping[str, Settings]) -> dict[str,
     kept = _of_files(settings)
     if len(kept) == 1:
         name, config = next(iter(kept.items()))
-        return {**settings, name: _changed(config, tree, (), place)}
+        return {**settings, name: _apply_table(config, tree, (), place)}
     for name in tree:
         place.check_name(name, kept, (), "table")
-    changed = {name: _changed(config, tree.get(name, {}), (name,), place) for name, config in kept.items()}
+    changed = {name: _apply_table(config, tree.get(name, {}), (name,), place) for name, config in kept.items()}
     return {**settings, **changed}
 
 
@@ -182,7 +182,7 @@ class _Place:
         return 1
 
 
-def _changed(config: Settings, tree: Any, table: Path_, place: _Place) -> Settings:
+def _apply_table(config: Settings, tree: Any, table: Path_, place: _Place) -> Settings:
     """Settings with the values of a table."""
     import msgspec
 
@@ -199,7 +199,7 @@ def _changed(config: Settings, tree: Any, table: Path_, place: _Place) -> Settin
             (option() for option in options if isinstance(option, type) and issubclass(option, Settings)), None)
         try:
             new = msgspec.convert(value, hints[name]) if inner is None else \
-                _changed(inner, value, (*table, name), place)
+                _apply_table(inner, value, (*table, name), place)
             config = dataclasses.replace(config, **{name: new})
         except OutOfRange as error:
             raise place.error(name, table, error.args[1]) from None

@@ -140,7 +140,7 @@ def add_entry(page: Page, name: str, lines: Iterable[str], shown: str | None = N
     page.markup(f'<div class="entry"><div><a href="{address}"><b>{escape(name)}</b></a>{told}</div>{shown}</div>')
 
 
-def kept_results(space: Workspace, names: Sequence[str]) -> Results:
+def load_results(space: Workspace, names: Sequence[str]) -> Results:
     """What is known of things by their names, from a folder that need not be open."""
     kept = set(space.kept(""))
     failures = (space.value(PAGE) if PAGE in kept else None) or {}

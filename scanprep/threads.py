@@ -34,7 +34,7 @@ _users = 0
 _in_worker = False
 
 
-def asked() -> int | None:
+def threads_asked() -> int | None:
     """The number of threads that the user's environment asks for, or None; 1 where it cannot be read."""
     for name in VARIABLES:
         text = os.environ.get(name, "").split(",")[0].strip()
@@ -52,7 +52,7 @@ def one_thread() -> Iterator[None]:
     global _users
     with _guard:
         _users += 1
-        if not _before and asked() is None:
+        if not _before and threads_asked() is None:
             import scipy.linalg  # noqa: F401  (its own OpenBLAS; what is loaded later would not be limited)
             from threadpoolctl import ThreadpoolController
 
@@ -72,7 +72,7 @@ def search_threads(points: int) -> int:
     """Threads for a search of so many points in a k-d tree; the answer does not depend on them."""
     if points <= 4000:               # threads cost more than they save
         return 1
-    return asked() or _cores()
+    return threads_asked() or _cores()
 
 
 def helpers(at_most: int) -> int:
@@ -86,7 +86,7 @@ def begin_worker() -> None:
     global _in_worker
     from threadpoolctl import threadpool_limits
 
-    _in_worker, number = True, asked() or 1
+    _in_worker, number = True, threads_asked() or 1
     for name in (*VARIABLES, LIBIGL):
         os.environ.setdefault(name, str(number))
     threadpool_limits(number)

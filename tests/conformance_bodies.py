@@ -9,7 +9,7 @@ from completion_bodies import MEAN, SD
 from model_bodies import worm, worm_model, worm_skeleton
 from toy_kind import ToyModel
 
-from model.blend_weights import diffused_weights
+from model.blend_weights import diffuse_weights
 from model.body import BodyModel
 from model.features import Lift, PoseFeatures, QuadraticLift, QuaternionLift
 from model.learning.skinning import corrective_features
@@ -58,7 +58,7 @@ def scape_worm(lift: Lift | None = None, bulge: float = 0.05) -> ScapeModel:
 def blendscape_worm() -> BlendScapeModel:
     """The SCAPE worm with rotations blended over 10 cm around the borders."""
     m = scape_worm()
-    smooth = diffused_weights(m.template, m.skeleton, 0.1)[m.template.faces].mean(axis=1)
+    smooth = diffuse_weights(m.template, m.skeleton, 0.1)[m.template.faces].mean(axis=1)
     blend = 0.1 * np.eye(4)[m.skeleton.part_of_face] + 0.9 * smooth
     return BlendScapeModel(m.template, m.skeleton, m.pose_space, m.shape_space, m.pose_mean, m.pose_covariance,
                            m.info, blend=blend)
@@ -77,7 +77,7 @@ def skinned_worm(correctives: bool) -> SkinningModel:
     waves = np.cos(x[:, :1] * [1, 2, 3]).T[..., None] * rng.normal(0, 0.02, (3, 1, 3))
     people = waves + 0.03 * (x - skeleton.joints[0]) * rng.normal(0, 1, (3, 1, 3))
     variances = (people**2).sum(axis=(1, 2))
-    return SkinningModel(template, skeleton, x, diffused_weights(template, skeleton, 0.08), features,
+    return SkinningModel(template, skeleton, x, diffuse_weights(template, skeleton, 0.08), features,
                          bumps.astype(np.float32), x * [1.02, 0.97, 1.03], people, variances,
                          float(variances.sum()), **LEARNED)
 

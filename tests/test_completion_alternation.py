@@ -5,7 +5,7 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 from derivatives import slope
 
-from completion.partial.alternation import Alternation, Blocks, Markers, damped_twists, nearest_markers
+from completion.partial.alternation import Alternation, Blocks, Markers, nearest_markers, solve_twists
 from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
@@ -77,8 +77,8 @@ def test_twists_without_damping_are_those_of_each_part_and_with_much_they_are_on
     part = MODEL.skeleton.part_of_face
     turn = rng.normal(0, 1e-4, (4, 3))
     v = e @ np.swapaxes(rotations.exp(turn), -1, -2)[part]
-    np.testing.assert_allclose(damped_twists(MODEL.skeleton, part, e, v, 0.0), turn, atol=1e-7)
-    stiff = damped_twists(MODEL.skeleton, part, e, v, 1e6)
+    np.testing.assert_allclose(solve_twists(MODEL.skeleton, part, e, v, 0.0), turn, atol=1e-7)
+    stiff = solve_twists(MODEL.skeleton, part, e, v, 1e6)
     np.testing.assert_allclose(stiff, np.tile(stiff[0], (4, 1)), atol=1e-9)
 
 
@@ -92,7 +92,7 @@ def test_damped_twists_are_where_the_gradient_of_their_energy_vanishes():
         off = e + np.cross(t[part][:, None], e) - v
         return (off**2).sum() + 0.2 * ((t[1:] - t[skeleton.parents[1:]])**2).sum()
 
-    found = damped_twists(skeleton, part, e, v, 0.2)
+    found = solve_twists(skeleton, part, e, v, 0.2)
     for step in np.eye(12).reshape(12, 4, 3):
         ahead, behind = energy(found + step), energy(found - step)
         assert abs(ahead - behind) < 1e-9 * (ahead + behind - 2 * energy(found))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from glb_reader import Glb
 
-from completion.partial.colors import ColorConfig, blend, carry_colors, colored_views
+from completion.partial.colors import ColorConfig, blend, carry_colors, views_with_colors
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
@@ -67,7 +67,7 @@ def test_the_view_that_looked_squarely_counts_most():
     points, up = np.column_stack([x, y, 0 * x]), np.tile([0, 0, 1.0], (len(x), 1))
     square, slanted = (PointCloud(points, up, np.tile(c, (len(x), 1))) for c in ([1.0, 0, 0], [0, 0, 1.0]))
     cameras = np.array([[0, 0, 2.0], [2 * np.sin(1.2), 0, 2 * np.cos(1.2)]])
-    found = colored_views([square, slanted], cameras)
+    found = views_with_colors([square, slanted], cameras)
     colors, weight = blend(found, np.zeros((1, 3)), up[:1], ColorConfig())
     share = np.cos(1.2)**2 / (1 + np.cos(1.2)**2)
     np.testing.assert_allclose(colors[0], [1 - share, 0, share], atol=1e-9)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.partial.confidence import distance_to_seen, expected_error, posterior_error, probability_within
+from completion.partial.confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from model.fitting import energy
 from model.fitting.bodies import FixedBody, ShapedBody
 from model.priors import gaussian_prior
@@ -43,18 +43,18 @@ def test_what_nobody_saw_is_less_certain():
 
 def test_the_error_sets_in_away_from_the_data():
     posterior, away = np.full(6, 0.02), np.array([0, 0.01, 0.03, 0.1, 1, np.inf])
-    error = expected_error(posterior, away, 0.001)
+    error = estimate_error(posterior, away, 0.001)
     assert error[0] == pytest.approx(0.001) and (np.diff(error) >= 0).all()
     assert error[-1] > 0.02 and error[-1] == pytest.approx(error[-2], rel=1e-3)
-    assert (expected_error(2 * posterior, away, 0.001)[1:] > error[1:]).all()
-    assert np.isfinite(expected_error(posterior, away, np.nan)).all()   # no point of the scan was used
+    assert (estimate_error(2 * posterior, away, 0.001)[1:] > error[1:]).all()
+    assert np.isfinite(estimate_error(posterior, away, np.nan)).all()   # no point of the scan was used
 
 
 def test_errors_set_in_within_millimetres_and_add_up_as_squares():
     """As chosen on half views of tuning bodies (`half_views.py`): half of the square is there at 14 mm times log 2."""
     half, far = 0.014 * np.log(2), np.inf
     for left_out, beyond in ((0.01, 0.0085), (None, 0.0075)):
-        error = expected_error(np.full(3, 0.02), np.array([0, half, far]), 0.002, left_out)
+        error = estimate_error(np.full(3, 0.02), np.array([0, half, far]), 0.002, left_out)
         square = (1.4 * 0.02)**2 + beyond**2
         np.testing.assert_allclose(error**2, 0.002**2 + square * np.array([0, 0.5, 1]))
 

@@ -8,14 +8,14 @@ import pytest
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.files.motion_files import write_motion
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.coverage import between, find_coverage, marker_labels
 from completion.motion import Motion
 from model.built_in import load_built_in_model
 
 MODEL = load_built_in_model()         # small models have triangles that reach from the hip bone to the waist
 KEPT = np.array(MODEL.info["people_vertices"])
-LAYOUT = named_layout("plugingait39", MODEL.template, KEPT)
+LAYOUT = load_layout("plugingait39", MODEL.template, KEPT)
 NAMES = np.array(MODEL.skeleton.names)
 LEGS = tuple(label for label in LAYOUT.labels if label[1:] in ("ASI", "PSI", "THI", "KNE", "TIB", "ANK", "HEE", "TOE"))
 

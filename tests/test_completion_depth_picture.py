@@ -9,7 +9,7 @@ from PIL import Image
 
 from completion.__main__ import main
 from completion.partial import report
-from completion.partial.completion import complete, doubts, load_completion, strayed
+from completion.partial.completion import complete, doubts, find_stray, load_completion
 from completion.partial.inputs import in_metres
 from completion.partial.work import read_picture
 from model.fitting.bodies import as_body
@@ -66,7 +66,7 @@ def test_what_is_beyond_the_border_is_unknown_and_not_doubted(model, body, marks
     np.testing.assert_allclose(fit.mesh(x).vertices, body.vertices, atol=1e-9)
     above = body.vertices[:, 1] < body.vertices[:, 1].mean() - 0.02
     assert fit.beyond(x)[above].all() and not fit.beyond(x).all()
-    assert strayed(fit, x) == []
+    assert find_stray(fit, x) == []
     seen, error = np.zeros(len(fit.part), dtype=bool), np.where(fit.beyond(x), 1.0, 0.001)
     within = [p for p in range(4) if not fit.beyond(x)[fit.part == p].any()]
     assert within and doubts(fit, x, np.where(np.isin(fit.part, within), 0.001, 1.0), seen) != doubts(
@@ -74,7 +74,7 @@ def test_what_is_beyond_the_border_is_unknown_and_not_doubted(model, body, marks
     assert len(doubts(fit, x, error, seen)) < 4
     aside = x.copy()
     aside[3 * len(POSE)] += 0.3
-    assert len(strayed(fit, aside)) == 2         # it stands in seen space, and leaves what was seen without a body
+    assert len(find_stray(fit, aside)) == 2         # it stands in seen space, and leaves what was seen without a body
 
 
 def test_what_a_picture_cannot_have_is_refused(model, body):

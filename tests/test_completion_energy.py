@@ -103,7 +103,7 @@ def test_points_above_the_skin_keep_their_distance_and_turn_with_the_body():
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), distance)
     for side in (1, 2):
         np.testing.assert_allclose(np.einsum("ld,ld->l", up, base[:, side] - base[:, 0]), 0, atol=1e-14)
-    np.testing.assert_allclose(energy.lifted(supports.positions, distance), points.positions, atol=1e-14)
+    np.testing.assert_allclose(energy.rise_above_skin(supports.positions, distance), points.positions, atol=1e-14)
     turned = x.copy()
     turn = rotations.exp(np.array([0.3, -0.2, 0.9]))
     turned[:3] = rotations.log(turn @ rotations.exp(x[:3]))

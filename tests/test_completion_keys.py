@@ -10,7 +10,7 @@ from test_completion_animate_cli import told
 from test_completion_motions import WRITTEN
 
 from completion.__main__ import main
-from completion.mocap.animate.keys import holds_keys, read_keys, turned_between
+from completion.mocap.animate.keys import holds_keys, interpolate_rotations, read_keys
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.storage import StorageError
@@ -41,15 +41,15 @@ def keyed(tmp_path, text, rate=10.0):
 def test_joints_go_the_shorter_way_and_stay_where_two_keys_are_alike():
     times, at = np.array([0.0, 1, 2, 3]), np.linspace(0, 3, 61)
     turns = np.radians([[0, 0, 0], [0, 90, 0], [0, 90, 0], [30, 0, 60]])
-    found = turned_between(times, turns, at)
+    found = interpolate_rotations(times, turns, at)
     np.testing.assert_allclose(exp(found[::20]), exp(turns), atol=1e-12)              # every key
     np.testing.assert_allclose(np.degrees(found[20:41]), [[0, 90, 0]] * 21, atol=1e-9)
     assert np.degrees(np.linalg.norm(found[:21], axis=1)).max() < 90 + 1e-9           # nothing swings beyond
     small = np.radians([[5, 0, 0], [0, 0, 20]])
     line = Slerp([0, 1], Rotation.from_rotvec(small))([0.25, 0.5, 0.75])
-    off = line.inv() * Rotation.from_rotvec(turned_between([0, 1], small, [0.25, 0.5, 0.75]))
+    off = line.inv() * Rotation.from_rotvec(interpolate_rotations([0, 1], small, [0.25, 0.5, 0.75]))
     assert np.degrees(off.magnitude()).max() < 0.02
-    long = turned_between([0, 1], np.radians([[170, 0, 0], [-170, 0, 0]]), np.array([0.5]))
+    long = interpolate_rotations([0, 1], np.radians([[170, 0, 0], [-170, 0, 0]]), np.array([0.5]))
     assert np.degrees(np.linalg.norm(long)) == pytest.approx(180)                     # by 20 degrees, not by 340
 
 

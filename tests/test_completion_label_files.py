@@ -26,7 +26,7 @@ from completion.mocap.files.markers import MarkerFileError, read_points
 from completion.mocap.labelling import recording
 from completion.mocap.labelling.corrections import COLUMNS, read_corrections, write_labels
 from completion.mocap.labelling.label import GHOST, UNKNOWN
-from completion.mocap.labelling.recording import known_columns, pack_tracks
+from completion.mocap.labelling.recording import columns_of_labels, pack_tracks
 from completion.mocap.labelling.tracks import link_points
 from completion.mocap.mosh import cli as mosh_cli
 from completion.mocap.mosh.call import MoshCall
@@ -271,7 +271,7 @@ def test_labels_that_the_recording_has_are_believed_unless_asked(here):
     names = [f"*{i}" for i in range(35)]
     names[5], names[6], names[7] = "Worm:m6", "Worm:M5", "Worm:stick"
     write_markers("some.csv", MarkerSequence(points, names, RATE))
-    known = known_columns(read_points("some.csv"), MarkerLayout.load("layout.json"))
+    known = columns_of_labels(read_points("some.csv"), MarkerLayout.load("layout.json"))
     assert np.unique(known[:, 5]) == 6 and np.unique(known[:, 6]) == 5 and (known[:, [4, 7, 34]] == UNKNOWN).all()
     assert label("some.csv", "-o", "kept.csv") == 0 and label("some.csv", "-o", "anew.csv", "--relabel") == 0
     kept, anew = read_markers("kept.csv"), read_markers("anew.csv")
@@ -295,7 +295,7 @@ def test_several_people(here, monkeypatch):
                                    atol=1e-6)
     # what was written is known when it is read again
     layout = MarkerLayout.load("layout.json")
-    known = known_columns(out, layout, ["Person1:", "Person2:"])
+    known = columns_of_labels(out, layout, ["Person1:", "Person2:"])
     np.testing.assert_array_equal(known[:, :68], np.where(out.seen[:, :68], np.arange(68), UNKNOWN))
     assert (known[:, 68] == UNKNOWN).all()
     # people whom the recording names keep their names

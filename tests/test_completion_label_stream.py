@@ -6,7 +6,7 @@ from people_bodies import kept, small_people
 from completion import LabelStream, MarkerStream
 from completion.mocap.labelling.body_search import Placement
 from completion.mocap.labelling.live_matching import ALONE, SEEN_SD, Expected, certainty, intersect, match, shift_groups
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from model.human_poses import human_poses
 from scanprep.geometry import rotations
 
@@ -22,7 +22,7 @@ def subject():
 
 @pytest.fixture(scope="module")
 def layout():
-    return named_layout("cmu41", small_people().template, kept())
+    return load_layout("cmu41", small_people().template, kept())
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from people_bodies import small_people
 from completion.__main__ import main
 from completion.mocap.marker_sets import pictures, transfer
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import layout_names, named_layout, read_layout
+from completion.mocap.marker_sets.named import layout_names, load_layout, read_layout
 from completion.mocap.marker_sets.opensim import opensim_markers
 from completion.mocap.marker_sets.pictures import marker_rows, picture_layout
 from model.fitting.bodies import at_rest
@@ -43,7 +43,7 @@ def test_a_layout_is_shown_on_a_mesh_and_can_be_used_again(tmp_path, person):
     assert all(label in page for label in layout.labels) and (tmp_path / "out" / "layout.png").stat().st_size > 5_000
     figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "out" / "report.json").read_text())["metrics"]}
     assert (figures["markers"], figures["pairs of left and right"], figures["without a side"]) == (47, 21, 5)
-    named = named_layout("vicon47", person.mesh)
+    named = load_layout("vicon47", person.mesh)
     assert set(zip(layout.labels, layout.vertices.tolist(), strict=True)) == \
         set(zip(named.labels, named.vertices.tolist(), strict=True))
 
@@ -85,7 +85,7 @@ def test_markers_are_on_the_bodies_of_opensim():
 
 
 def test_the_picture_shows_every_marker(person):
-    layout = named_layout("helenhayes29", person.mesh)
+    layout = load_layout("helenhayes29", person.mesh)
     bare = MarkerLayout(layout.labels[:1], layout.vertices[:1])
     full, one = (picture_layout(person.mesh, x, 220).astype(int) for x in (layout, bare))
     assert full.shape == one.shape and full.shape[0] > 220
@@ -93,7 +93,7 @@ def test_the_picture_shows_every_marker(person):
 
 
 def test_the_table_has_partners_and_parts(person):
-    layout = named_layout("cmu41", person.mesh)
+    layout = load_layout("cmu41", person.mesh)
     rows = {row[0]: row for row in marker_rows(person.mesh, layout, person.skeleton)}
     assert rows["LELB"][3] == "RELB" and rows["C7"][3] == "middle" and rows["RBAC"][3] == "-"
     assert rows["LTHI"][2] == "thigh_left" and rows["LTHI"][5] == "loose" and rows["LWRA"][4] == "45.0 mm"
@@ -122,7 +122,7 @@ def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, mon
     assert seen["landmarks"][0].tolist() == [5, 9, 700]
     target = read_mesh(tmp_path / "b.ply")
     np.testing.assert_allclose(MarkerLayout.load(out, 12500).select(["C7", "LELB"]).place(target),
-                               named_layout("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
+                               load_layout("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
     assert out.with_suffix(".png").exists() and len(read_mesh(out.with_suffix(".registered.ply")).vertices) == 12500
     told = json.loads((tmp_path / "b.layout.json.report.json").read_text())
     figures = {m["metric"]: m["value"] for m in told["metrics"]}

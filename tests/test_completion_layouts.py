@@ -12,7 +12,7 @@ from completion.mocap.marker_sets.named import (
     faces_digest,
     fitting_layout,
     layout_names,
-    named_layout,
+    load_layout,
     read_layout,
 )
 from scanprep.geometry.landmarks import write_landmarks
@@ -64,7 +64,7 @@ def test_files_are_whole(path):
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_left_is_the_persons_left_and_the_front_is_ahead(name, person):
-    layout = named_layout(name, person)
+    layout = load_layout(name, person)
     place = dict(zip(layout.labels, layout.place(person), strict=True))
     for label, at in place.items():                       # a person faces -y and has the left side at +x
         if label not in MIDDLE:
@@ -83,33 +83,33 @@ def test_left_is_the_persons_left_and_the_front_is_ahead(name, person):
 
 def test_a_body_is_known_by_its_triangles_alone(person):
     moved = person.with_vertices(1.1 * person.vertices @ exp(np.array([0.3, 0.2, 1.0])).T)
-    np.testing.assert_array_equal(named_layout("cmu41", moved).vertices,
-                                  named_layout("cmu41", person).vertices)
+    np.testing.assert_array_equal(load_layout("cmu41", moved).vertices,
+                                  load_layout("cmu41", person).vertices)
     assert faces_digest(person.faces) == faces_digest(person.faces.astype(np.int32))
     assert faces_digest(person.faces) != faces_digest(person.faces[:, [1, 2, 0]])
 
 
 def test_other_bodies_and_names_are_refused_with_a_way_out(person):
     with pytest.raises(ValueError, match=r"expected a marker layout of biomech57, .* got 'cmu40'; .*markersets"):
-        named_layout("cmu40", person)
+        load_layout("cmu40", person)
     with pytest.raises(ValueError, match=r"synthetic people \(12500 vertices\), SCAPE and SPRING \(12500 vertices\); "
                                          r"got another triangulation with 12500 vertices; .*indices"):
-        named_layout("cmu41", Mesh(person.vertices, person.faces[:, [1, 2, 0]]))
+        load_layout("cmu41", Mesh(person.vertices, person.faces[:, [1, 2, 0]]))
 
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_a_template_that_kept_some_vertices_carries_the_markers_there(name, person):
     model = small_people()
-    whole, small = named_layout(name, person), named_layout(name, model.template, kept())
+    whole, small = load_layout(name, person), load_layout(name, model.template, kept())
     rest = Mesh(person.vertices[kept()], model.template.faces)
     off = np.linalg.norm(small.place(rest) - whole.place(person), axis=1)
     assert small.labels == whole.labels and small.loose == whole.loose and off.mean() < 0.008 and off.max() < 0.032
     with pytest.raises(ValueError, match="another triangulation"):
-        named_layout(name, model.template)
+        load_layout(name, model.template)
 
 
 def test_aliases_stand_in_where_the_marker_is_missing(person):
-    layout = named_layout("cmu41", person)
+    layout = load_layout("cmu41", person)
     assert layout.matched(["RBAK", "C7", "T10"]) == ("RBAK", "C7", "T10")
     assert layout.matched(["RBAK", "C7", "T10", "RBAC"]) == ("C7", "T10", "RBAC")
     np.testing.assert_array_equal(layout.select(["RBAK"]).vertices, layout.select(["RBAC"]).vertices)
@@ -121,7 +121,7 @@ def test_aliases_stand_in_where_the_marker_is_missing(person):
 
 
 def test_loose_markers_and_aliases_are_kept_in_files(person, tmp_path):
-    layout = named_layout("cmu41", person).moved({"RBAK": 17})
+    layout = load_layout("cmu41", person).moved({"RBAK": 17})
     layout.save(tmp_path / "a.json")
     back = MarkerLayout.load(tmp_path / "a.json")
     assert set(back.loose) == set(layout.loose) and back.aliases == layout.aliases
@@ -133,7 +133,7 @@ def test_loose_markers_and_aliases_are_kept_in_files(person, tmp_path):
 
 def test_the_layout_that_knows_most_labels_is_found(person):
     for name in COUNTS:
-        layout = named_layout(name, person)
+        layout = load_layout(name, person)
         assert fitting_layout(layout.labels, person)[1] == name
     told = "of these 3 the sets know cmu41 1, .*biomech57 0.*scape layout list.*--layout"
     with pytest.raises(ValueError, match=told):
@@ -141,7 +141,7 @@ def test_the_layout_that_knows_most_labels_is_found(person):
 
 
 def test_markers_that_some_wear_on_wands_are_said_and_kept(person, tmp_path):
-    layout = named_layout("plugingait39", person)
+    layout = load_layout("plugingait39", person)
     assert set(layout.wands) == {"LTHI", "RTHI", "LTIB", "RTIB"} and set(layout.wands) < set(layout.loose)
     layout.save(tmp_path / "a.json")
     assert set(MarkerLayout.load(tmp_path / "a.json").wands) == set(layout.wands)
@@ -161,7 +161,7 @@ NEIGHBOURS = {"pelvis": ("abdomen", "thigh"), "chest": ("abdomen",)}         # p
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_labels_lie_on_the_part_that_the_anatomy_says(name, person, part_names):
-    layout = named_layout(name, person)
+    layout = load_layout(name, person)
     parts = part_names[layout.vertices].tolist()
     told = 0
     for label, part in zip(layout.labels, parts, strict=True):
@@ -177,7 +177,7 @@ def test_labels_lie_on_the_part_that_the_anatomy_says(name, person, part_names):
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_no_marker_is_inside(name, person):
-    layout = named_layout(name, person)
+    layout = load_layout(name, person)
     points = layout.place(person)
     found = Surface(person).closest(points)
     above = np.einsum("ld,ld->l", points - found.points, person.face_normals[found.faces])
@@ -185,7 +185,7 @@ def test_no_marker_is_inside(name, person):
 
 
 def test_mosh67_is_vicon47_and_twenty_more(person):
-    few, many = (named_layout(name, person) for name in ("vicon47", "mosh67"))
+    few, many = (load_layout(name, person) for name in ("vicon47", "mosh67"))
     assert set(few.labels) < set(many.labels) and many.aliases == few.aliases and not many.loose
     np.testing.assert_array_equal(many.select(few.labels).vertices, few.vertices)
 

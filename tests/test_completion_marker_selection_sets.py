@@ -10,7 +10,7 @@ from derivatives import differences
 from completion.mocap.marker_selection.design import design_markers
 from completion.mocap.marker_selection.fits import BodyPoints, DesignConfig, prior_around, rough_poses, vertex_errors
 from completion.mocap.marker_selection.greedy import ADD, REMOVE, MarkerSets, exchange, symmetric_groups, walk
-from completion.mocap.marker_selection.linear import LinearBodies, fit_bodies, shared_shape
+from completion.mocap.marker_selection.linear import LinearBodies, fit_bodies, share_betas
 from completion.mocap.marker_sets.layout import MarkerLayout
 from model.fitting.vertices import spread_vertices
 from scanprep.geometry import rotations
@@ -143,14 +143,14 @@ def test_moved_turned_and_reordered_bodies_have_the_same_markers():
 
 
 def test_betas_common_to_one_body_are_its_own():
-    alone = shared_shape(FITS.linear, FITS.x, np.arange(5), 3)
+    alone = share_betas(FITS.linear, FITS.x, np.arange(5), 3)
     for chosen in ([0, 3, 8], [1, 2, 5, 9, 10]):
         assert alone.rmse(chosen) == pytest.approx(FITS.linear.rmse(chosen), rel=1e-9)
 
 
 def test_two_equal_bodies_with_common_betas_are_one_with_half_the_shape_prior():
     twice = np.repeat(np.arange(5), 2)
-    joint = shared_shape(FITS.linear.of(twice), FITS.x[twice], twice, 3)
+    joint = share_betas(FITS.linear.of(twice), FITS.x[twice], twice, 3)
     prior = FITS.prior
     weaker = prior_around(MODEL, FITS.x, 0.5)
     one = replace(FITS.linear, precision=weaker.precision, lean=(weaker.mean - FITS.x) @ weaker.precision)

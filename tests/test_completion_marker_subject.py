@@ -6,7 +6,7 @@ import pytest
 from people_bodies import kept, small_people
 
 from completion.mocap.files.markers import MarkerSequence
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.subject.person import PersonConfig, choose_frames, find_person, spread_frames
 from scanprep.synthetic.people import BodyShape, Person, walk
@@ -23,7 +23,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def layout(model):
-    return named_layout("cmu41", model.template, kept())
+    return load_layout("cmu41", model.template, kept())
 
 
 def carried(model, layout, betas, frames=FRAMES, seed=0):
@@ -118,7 +118,7 @@ def test_markers_on_wands_and_without_their_bars_are_the_same_person(model, layo
 
 def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
     person = Person(BodyShape.like("male", stature=1.88, weight=1.0))
-    on_skin = named_layout("cmu41", person.mesh)
+    on_skin = load_layout("cmu41", person.mesh)
     poses, trans = walk(40, 40.0)
     bodies = np.stack([person.posed(p, t) for p, t in zip(poses, trans, strict=True)])
     places = np.stack([on_skin.place(person.mesh.with_vertices(v)) for v in bodies])

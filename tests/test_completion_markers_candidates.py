@@ -7,7 +7,7 @@ import pytest
 from completion.mocap.marker_selection import candidates as candidates_module
 from completion.mocap.marker_selection.candidates import candidate_layout, sitting_room
 from completion.mocap.marker_sets.layout import DISTANCE, MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.marker_sets.symmetry import find_skin_mirror, label_pairs
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.rotations import exp
@@ -28,7 +28,7 @@ def mirror(person):
 
 @pytest.fixture(scope="module")
 def base(person):
-    return named_layout("vicon47", person)
+    return load_layout("vicon47", person)
 
 
 @pytest.fixture(scope="module")

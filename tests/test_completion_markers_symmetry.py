@@ -3,12 +3,12 @@ import numpy as np
 import pytest
 
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import layout_names, named_layout
+from completion.mocap.marker_sets.named import layout_names, load_layout
 from completion.mocap.marker_sets.symmetry import (
     find_skin_mirror,
     label_pairs,
     marker_pairs,
-    mirrored_points,
+    mirror_points,
     other_side,
     side_of,
 )
@@ -77,7 +77,7 @@ def test_who_does_not_stand_symmetrically_needs_landmarks(person):
 
 @pytest.mark.parametrize("name", layout_names())
 def test_places_tell_what_labels_tell(name, person, mirror):
-    layout = named_layout(name, person)
+    layout = load_layout(name, person)
     by_label = label_pairs(layout.labels)
     np.testing.assert_array_equal(label_pairs(layout.labels), by_label)
     numbered = MarkerLayout(tuple(f"marker {i}" for i in range(len(layout.labels))), layout.vertices)
@@ -90,9 +90,9 @@ def test_places_tell_what_labels_tell(name, person, mirror):
 
 @pytest.mark.parametrize("name", layout_names())
 def test_layouts_of_people_are_their_own_mirror_image(name, person, mirror):
-    layout = named_layout(name, person)
+    layout = load_layout(name, person)
     pairs = label_pairs(layout.labels)
     both = [i for i in range(len(pairs)) if pairs[i] >= 0 and layout.labels[i][1:] not in ("FRM", "THI", "TIB", "SHN",
                                                                                          "UPA", ".Shank", ".Thigh")]
     partner = layout.skin_points(person.vertices)[pairs[both]]
-    assert np.linalg.norm(partner - mirrored_points(layout, person, mirror)[both], axis=1).max() < 0.001
+    assert np.linalg.norm(partner - mirror_points(layout, person, mirror)[both], axis=1).max() < 0.001

@@ -6,7 +6,7 @@ import pytest
 from people_bodies import kept, small_people
 
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.marker_sets.transfer import transfer_layout
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
@@ -23,7 +23,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def layout(body):
-    return named_layout("cmu41", body, kept())
+    return load_layout("cmu41", body, kept())
 
 
 def renumbered(body, rng):

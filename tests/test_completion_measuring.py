@@ -14,7 +14,7 @@ from model import find_tapes, measure
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.survey import ordinal, percentiles
 from scanprep import Mesh, RegisteredSet, write_mesh
-from scanprep.geometry.landmark_names import known_landmarks, landmark_name
+from scanprep.geometry.landmark_names import landmark_name, translate_landmarks
 from scanprep.judgement import Judgement
 from scanprep.synthetic.people import BodyShape, Person
 
@@ -72,7 +72,7 @@ TAPES = ("stature", "chest_girth", "hip_girth", "thigh_girth_left", "calf_girth_
 def test_a_model_with_the_ten_landmarks_of_the_readme_is_measured(folder, tmp_path, capsys):
     """Heels, crotch and all that is not among them are found; they were refused before."""
     model = small_people()
-    known = known_landmarks(model.info["landmarks"])
+    known = translate_landmarks(model.info["landmarks"])
     readme = {name: known[landmark_name(name)] for name in (
         "crown", "navel", "LeftHand", "RightHand", "foot_l", "foot_r", "left elbow", "right elbow", "l_knee", "r_knee")}
     replace(model, info={**model.info, "landmarks": readme}).save(tmp_path / "ten.npz")

@@ -7,7 +7,7 @@ from marker_faults import CONFIG, FRAMES, LABELS, RATE, exchanged
 
 from completion import smoothing
 from completion.mocap.artefacts import find
-from completion.mocap.artefacts.find import Simulation, ambiguous_swap, bridged, find_artefacts
+from completion.mocap.artefacts.find import Simulation, ambiguous_swap, bridge_gaps, find_artefacts
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.pictures import chart_artefacts
@@ -207,7 +207,7 @@ def test_bridges_join_both_ends_and_long_ones_pass_the_usual_place():
     local = np.zeros((100, 1, 3))
     local[:20], local[20:], local[90:] = 0.01, 0.03, 0.05
     local[10:20] = local[40:90] = np.nan
-    out = bridged(local, 15.0)[:, 0, 0]
+    out = bridge_gaps(local, 15.0)[:, 0, 0]
     np.testing.assert_allclose(out[9:21], np.interp(np.arange(9, 21), [9, 20], [0.01, 0.03]), atol=1e-12)
     usual = np.nanmedian(local[:, 0, 0])
     np.testing.assert_allclose(out[54:75], usual, atol=1e-12)

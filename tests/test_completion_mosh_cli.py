@@ -15,9 +15,9 @@ from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write
 from completion.__main__ import main
 from completion.mocap.mosh import cli
 from completion.mocap.mosh.recordings import Grouping, find_actors, write_table
-from completion.mocap.mosh.takes import held_out
+from completion.mocap.mosh.takes import measure_held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
-from completion.motion_pictures import played
+from completion.motion_pictures import frames_to_play
 from model.learning.sexes import SexPlane
 from scanprep.geometry.format_glb import turn_up
 from scanprep.pictures.camera import upright
@@ -79,7 +79,7 @@ def test_held_out_markers_are_used_in_no_stage_and_scored(done, place):
     figures = told(done / "ann" / "walk")
     model, layout = worm_with_prior(), MarkerLayout.load(place / "layout.json")
     markers = read_markers(place / "people" / "ann" / "walk.csv")
-    held = held_out(model, layout, ("M7", "M9"), markers, motion, None)
+    held = measure_held_out(model, layout, ("M7", "M9"), markers, motion, None)
     meshes = motion.vertices(model.subject(motion.betas))
     places = np.stack([layout.select(["M7", "M9"]).place(model.template.with_vertices(v)) for v in meshes])
     off = np.linalg.norm(places - markers.select(["M7", "M9"]).positions, axis=2)
@@ -93,7 +93,7 @@ def test_held_out_markers_of_a_changing_shape_are_those_of_its_meshes(done, plac
     markers = read_markers(place / "people" / "ann" / "walk.csv")
     soft = SoftTissue.load(done / "ann" / "walk" / "soft_tissue.npz")
     soft = SoftTissue(soft.motion, np.sin(np.arange(3 * FRAMES)).reshape(FRAMES, 3))
-    held = held_out(model, layout, ("M7", "M9"), markers, soft.motion, soft)
+    held = measure_held_out(model, layout, ("M7", "M9"), markers, soft.motion, soft)
     places = np.stack([layout.select(["M7", "M9"]).place(model.template.with_vertices(v))
                        for v in soft.vertices(model)])
     off = np.linalg.norm(places - markers.select(["M7", "M9"]).positions, axis=2)
@@ -153,7 +153,7 @@ def test_pages_lead_to_each_other_and_tell_the_markers(done):
     assert "M33" in {label.split(":")[0] for label in worn["labels"]}
     moving = scenes_of(take)[0]
     motion = Motion.load(done / "ann" / "walk" / "motion.npz")
-    assert moving.layer("body")["motion"]["frames"] == len(played(motion)[0])
+    assert moving.layer("body")["motion"]["frames"] == len(frames_to_play(motion)[0])
     seen = np.isfinite(moving.frames(moving.layer("held-out markers"))).all(axis=2).any(axis=0)
     assert [moving.layer("held-out markers")["labels"][i] for i in np.flatnonzero(seen)] == ["M7", "M9"]
 
@@ -276,7 +276,7 @@ def test_a_table_says_who_is_who(tmp_path, ending):
                                                (10**5, 120, 50), (10**5 + 1, 25, 51)])
 def test_a_page_plays_no_more_frames_than_it_can_carry(count, rate, step):
     motion = Motion(np.zeros((count, 1, 3)), np.zeros((count, 3)), None, rate, np.zeros((count, 0)))
-    frames, shown = played(motion)
+    frames, shown = frames_to_play(motion)
     assert frames[1:2].tolist() == [step][:count - 1] and shown == rate / step and len(frames) <= 2000
 
 

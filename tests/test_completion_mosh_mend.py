@@ -15,9 +15,9 @@ from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.mocap.mosh import cli
 from completion.mocap.mosh.call import MoshCall
 from completion.mocap.mosh.mend import MoshApp
-from completion.mocap.mosh.mended_layout import Spot, changes, mended, next_file
+from completion.mocap.mosh.mended_layout import Spot, apply_corrections, changes, next_file
 from scanprep.batch.calls import RUN
-from scanprep.batch.opening import locked
+from scanprep.batch.opening import lock_output
 from scanprep.batch.ownership import HOME
 from scanprep.geometry.storage import StorageError
 from scanprep.viewer.messages import Message
@@ -76,12 +76,12 @@ def test_a_changed_layout_is_told_by_its_changes():
     vertices = np.array([3, 5, 8, 9])
     layout = MarkerLayout(("A", "B", "C", "D"), vertices, [0.01, 0.02, 0.01, 0.01], aliases={"a": "A"}, loose=("B",))
     spots = {"A": Spot.of(layout, "B"), "B": Spot(np.array([1, 2, 4]), np.array([0.2, 0.3, 0.5]), 0.02), "D": None}
-    after = mended(layout, spots)
+    after = apply_corrections(layout, spots)
     assert set(after.labels) == {"A", "B", "C"} and after.loose == ("A",) and after.aliases == {"a": "A"}
     back = changes(layout, after)
     assert set(back) == set(spots) and back["D"] is None
     assert all(back[label].same(spots[label]) for label in "AB")
-    assert changes(layout, layout) == {} == changes(layout, mended(layout, {}))
+    assert changes(layout, layout) == {} == changes(layout, apply_corrections(layout, {}))
 
 
 def test_files_of_corrections_are_numbered(tmp_path, monkeypatch):
@@ -144,7 +144,7 @@ def test_a_correction_is_of_the_layout_and_so_of_all_people(place, tmp_path):
 def test_another_run_at_work_is_told_and_corrections_stay(place):
     app = MoshApp(place / "out")
     sent(app, "remove", pane=1, name="M5")
-    with locked(place / "out" / HOME / "lock", place / "out"):
+    with lock_output(place / "out" / HOME / "lock", place / "out"):
         sent(app, "run")
         while app.working is not None:
             time.sleep(0.02)

@@ -6,7 +6,7 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import MarkerLayout, MarkerSequence, mosh_by_sex
-from completion.mocap.mosh.mosh import MoshConfig, checked_models
+from completion.mocap.mosh.mosh import MoshConfig, check_models
 from completion.mocap.subject.person import PersonConfig
 from model.learning.sexes import PLANE, learn_sex_plane
 
@@ -73,4 +73,4 @@ def test_refuses_models_that_cannot_tell(models, layout):
                             np.arange(700))[0])}, "'male'")):
         with pytest.raises(ValueError, match=word):
             mosh_by_sex(wrong, sequence, layout, QUICK)
-    checked_models(models)
+    check_models(models)

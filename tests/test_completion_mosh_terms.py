@@ -8,7 +8,7 @@ from derivatives import differences
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.marked_body import supports
 from completion.mocap.subject import latent_fit as terms
-from completion.mocap.subject.attachment import above_triangles, latent_markers, simulated
+from completion.mocap.subject.attachment import above_triangles, latent_markers, simulate_markers
 from completion.mocap.subject.latent_fit import LatentPoints
 from model.fitting import energy
 from model.fitting.bodies import FixedBody
@@ -78,7 +78,7 @@ def of_frames(kind):
         pose, trans, betas = x[None, :12].reshape(1, 4, 3), x[None, 12:15], x[15:15 + K]
         y, d_pose = points.operator(betas).jacobian(pose, trans)
         moving = energy.moving_points(y, d_pose, points.shape_jacobian(pose))
-        found, frame = simulated(kind, moving, x[15 + K:].reshape(-1, 3))
+        found, frame = simulate_markers(kind, moving, x[15 + K:].reshape(-1, 3))
         J = np.concatenate([found.jacobian, terms.each_own(frame)], axis=-1)
         residual = terms.data_term(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
         return Residual(residual.values[0], residual.jacobian[0])
@@ -182,7 +182,7 @@ def test_markers_are_where_they_were_hung_and_move_with_the_body(kind):
     pose = np.random.default_rng(2).normal(0, 0.4, (4, 3))
     posed = MODEL.vertices(pose, np.zeros(K))
     supports_ = MovingPoints(markers.supports(posed), np.zeros((3 * L, 3, 1)))
-    np.testing.assert_allclose(simulated(kind, supports_, c)[0].positions, markers.places(posed, c), atol=1e-12)
+    np.testing.assert_allclose(simulate_markers(kind, supports_, c)[0].positions, markers.places(posed, c), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

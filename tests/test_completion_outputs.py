@@ -6,7 +6,7 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion.mocap.files.motion_files import joint_angles, joint_centres, write_motion
-from completion.mocap.retargeting.retarget import betas_over_time, lowest, morphed_vertices, retarget, world_up
+from completion.mocap.retargeting.retarget import betas_over_time, lowest, morph_vertices, retarget, world_up
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp, log
 from scanprep.pictures.camera import upright
@@ -125,19 +125,19 @@ def test_up_is_found_in_whatever_axes_the_world_has(motion, subject):
 
 def test_a_body_that_changes_is_in_each_frame_that_of_its_betas(motion, model):
     betas = np.random.default_rng(0).normal(size=(FRAMES, 3))
-    got = morphed_vertices(model, motion, betas, grounded=False)
+    got = morph_vertices(model, motion, betas, grounded=False)
     for t in (0, 17, 39):
         np.testing.assert_allclose(got[t], model.subject(betas[t]).vertices(motion.poses[t], motion.trans[t]),
                                    atol=1e-9)
-    np.testing.assert_allclose(morphed_vertices(model, motion, betas, np.array([17]), grounded=False)[0], got[17],
+    np.testing.assert_allclose(morph_vertices(model, motion, betas, np.array([17]), grounded=False)[0], got[17],
                                atol=1e-9)
     up, sign = world_up(motion, model.subject(BETAS))
-    grounded = morphed_vertices(model, motion, betas)
+    grounded = morph_vertices(model, motion, betas)
     np.testing.assert_allclose((sign * grounded[:, :, up]).min(axis=1),
                                lowest(model.subject(BETAS), motion.poses, motion.trans, up, sign), atol=1e-9)
     away = grounded - got
     assert np.abs(np.delete(away, up, axis=2)).max() < 1e-12 and np.ptp(away, axis=1).max() < 1e-9
-    still = morphed_vertices(model, motion, {0.0: BETAS}, grounded=True)
+    still = morph_vertices(model, motion, {0.0: BETAS}, grounded=True)
     np.testing.assert_allclose(still, motion.vertices(model.subject(BETAS)), atol=1e-9)
 
 
@@ -150,9 +150,9 @@ def test_betas_go_straight_from_key_to_key():
 
 def test_wrong_betas_and_bodies_are_refused(motion, model, subject):
     with pytest.raises(ValueError, match=r"betas: expected \(40, k\) with k at most 3, got \(40, 4\)"):
-        morphed_vertices(model, motion, np.zeros((FRAMES, 4)))
+        morph_vertices(model, motion, np.zeros((FRAMES, 4)))
     with pytest.raises(ValueError, match=r"with k at most 3, got \(3, 3\)"):
-        morphed_vertices(model, motion, np.zeros((3, 3)))
+        morph_vertices(model, motion, np.zeros((3, 3)))
     short = Motion(motion.poses[:, :3], motion.trans, None, 20.0, np.zeros((FRAMES, 0)))
     with pytest.raises(ValueError, match="expected a body of the 4 parts"):
         retarget(short, subject, subject)

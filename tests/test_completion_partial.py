@@ -82,7 +82,7 @@ def test_the_completed_mesh_follows_the_scan_where_the_model_cannot(model, known
 def test_soles_that_come_to_rest_on_a_floor_are_told(model, known, monkeypatch, tmp_path):
     """The completed mesh is the one that stands, and the files say what was done."""
     _, points, _, landmarks, result, _ = known
-    monkeypatch.setattr(completing, "grounded", lambda reference, body, foot, points, normals: Grounded(
+    monkeypatch.setattr(completing, "put_on_floor", lambda reference, body, foot, points, normals: Grounded(
         body.vertices + 0.01, None, (0.022, 0.001)))
     stands = complete(model.subject(None), points, landmarks, QUICK)
     np.testing.assert_allclose(stands.completed.vertices, result.completed.vertices + 0.01)

@@ -10,11 +10,11 @@ from completion.partial.completion import (
     Completion,
     beyond_closed,
     doubts,
-    left_over,
+    find_unexplained,
     load_completion,
     save_completion,
 )
-from completion.partial.confidence import expected_error
+from completion.partial.confidence import estimate_error
 from completion.partial.settings import CompletionConfig
 from model.fitting.bodies import FixedBody
 from model.fitting.rounds import Solved, solve_jointly
@@ -95,8 +95,8 @@ def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():
         found = doubts(fit, np.zeros(15), np.full(398, 0.004), np.ones(398, dtype=bool))
         assert len(found) == told and all("50 mm off" in reason for reason in found)
     far, off = np.array([0.0, 1.0]), np.zeros(2)
-    np.testing.assert_allclose(expected_error(off, far, 0.001, 0.05), [0.001, 0.0425], rtol=1e-3)
-    np.testing.assert_allclose(expected_error(off, far, 0.001), [0.001, 0.0076], rtol=1e-2)
+    np.testing.assert_allclose(estimate_error(off, far, 0.001, 0.05), [0.001, 0.0425], rtol=1e-3)
+    np.testing.assert_allclose(estimate_error(off, far, 0.001), [0.001, 0.0076], rtol=1e-2)
 
 
 def test_a_bend_that_the_model_never_saw_is_named():
@@ -158,7 +158,8 @@ def test_a_joint_held_as_in_no_known_pose_is_named_and_a_known_way_is_not():
 def test_a_limbs_worth_of_scan_without_a_body_is_told(explained, told):
     fit = scan_fit(FixedBody(MODEL.subject(None)), prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64),
                   np.zeros((0, 3)), CompletionConfig())
-    assert left_over(fit, explained) == (["5.0% of the scan has no body near: clutter, or a limb elsewhere"] * told)
+    assert find_unexplained(fit,
+                            explained) == (["5.0% of the scan has no body near: clutter, or a limb elsewhere"] * told)
 
 
 def test_a_body_that_goes_on_where_the_scan_is_closed_is_doubted():

@@ -11,7 +11,7 @@ from model.fitting.free_space import Outside, find_camera
 from model.fitting.limbs import examples_of
 from model.fitting.scan import prepare_scan
 from model.fitting.scan_fit import scan_fit
-from model.fitting.starts import AXES, all_rotations, at_a_glance, from_nothing, placements, starting_poses, varied
+from model.fitting.starts import AXES, all_rotations, at_a_glance, from_nothing, pick_varied, placements, starting_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -50,8 +50,8 @@ def test_turns_are_rotations_that_leave_no_gap():
 def test_varied_poses_are_the_corners():
     poses = np.zeros((9, 2, 3))
     poses[:, 1, 0] = [0, 0.1, 0.2, -0.1, 1, 0.9, -1, -0.95, 0.05]
-    np.testing.assert_array_equal(varied(poses, 3)[:, 1, 0], [0, 1, -1])
-    assert varied(poses, 9) is poses
+    np.testing.assert_array_equal(pick_varied(poses, 3)[:, 1, 0], [0, 1, -1])
+    assert pick_varied(poses, 9) is poses
 
 
 def test_the_table_says_what_the_camera_denies(scene):

@@ -76,7 +76,7 @@ def test_normals_that_turn_with_their_part_are_near_the_exact_ones(subject, layo
     ids, weights = supports(subject.template, layout)
     poses = MEAN + np.random.default_rng(2).normal(0, 0.25, (40, 4, 3))
     x = body.body.join(poses, np.zeros((40, 3)))
-    exact = energy.lifted(subject.points(ids, weights).evaluate(poses), np.asarray(layout.distances))
+    exact = energy.rise_above_skin(subject.points(ids, weights).evaluate(poses), np.asarray(layout.distances))
     apart = np.linalg.norm(body.positions(x) - exact, axis=2)
     assert apart.mean() < 0.0007 and np.percentile(apart, 95) < 0.002            # of 12 mm
 

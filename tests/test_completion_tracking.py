@@ -7,9 +7,9 @@ from completion_bodies import half_view, worm_with_prior
 from test_completion_partial import MARKS, QUICK
 
 from completion import Motion, TrackConfig, smoothing, track
-from completion.smoothing import inertia, predicted, smooth
+from completion.smoothing import inertia, predict, smooth
 from completion.tracking import frames
-from completion.tracking.frame_fit import FrameFit, shared_shape, spread_poses
+from completion.tracking.frame_fit import FrameFit, fit_shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
 from completion.tracking.sequence import Tracker
 from model.fitting.bodies import FixedBody, ShapedBody
@@ -180,10 +180,10 @@ def test_a_sequence_without_anything_is_refused(model):
 def test_prediction_is_exact_at_constant_velocity():
     x = np.stack([np.r_[0.5 * (t + 1) * np.array([1.0, 2, 2]) / 3, 0.2 * t, 0, -t] for t in range(8)])
     for t in range(2, 8):
-        ahead = predicted(x[t - 1], x[t - 2], 1.0)
+        ahead = predict(x[t - 1], x[t - 2], 1.0)
         np.testing.assert_allclose(rotations.exp(ahead[:3]), rotations.exp(x[t, :3]), atol=1e-12)
         np.testing.assert_allclose(ahead[3:], x[t, 3:], atol=1e-12)
-    np.testing.assert_array_equal(predicted(x[3], x[3], 1.0)[3:], x[3, 3:])
+    np.testing.assert_array_equal(predict(x[3], x[3], 1.0)[3:], x[3, 3:])
 
 
 def test_smoothing_bridges_a_gap_at_constant_velocity():
@@ -231,7 +231,7 @@ def test_several_frames_tell_the_shape(model):
     poses, trans = motion()
     body = ShapedBody(model)
     x = FixedBody(model.subject(np.zeros(3))).join(poses, trans)[chosen]
-    betas, found = shared_shape(body, clouds, x, np.zeros(3), SETTINGS)
+    betas, found = fit_shared_shape(body, clouds, x, np.zeros(3), SETTINGS)
     assert np.linalg.norm(betas - BETAS) < 0.35
     for i, at in zip(chosen, found, strict=True):
         assert np.linalg.norm(body.vertices(np.r_[at, betas]) - bodies[i].vertices, axis=1).mean() < 0.008

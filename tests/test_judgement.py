@@ -388,7 +388,7 @@ def test_the_first_row_of_every_command_is_a_verdict(place, monkeypatch, command
 def test_every_command_is_among_those_that_are_run():
     quick = {" ".join(word for word in command.split()[:2]) for command in COMMANDS}
     known = [*quick, *SHOW_ONLY, *(command for some in ELSEWHERE.values() for command in some)]
-    assert sorted(f"scape {command}" for command in known) == sorted(command_line.listed(SCAPE, "scape"))
+    assert sorted(f"scape {command}" for command in known) == sorted(command_line.list_commands(SCAPE, "scape"))
     tests = Path(__file__).parent
     for name, some in ELSEWHERE.items():
         text = (tests / f"{name}.py").read_text()

@@ -10,7 +10,7 @@ from people_bodies import make_model
 from completion.cli import read_landmark_pairs, read_model
 from completion.mocap.joint_angles import anatomical_angles
 from completion.motion import Motion
-from completion.viewing.kinds import reported_model
+from completion.viewing.kinds import model_of_report
 from model import fit_pose, load_model
 from model.built_in import STORED, load_built_in_model, load_fingered_model, pack_coefficients, unpack_coefficients
 from scanprep.geometry import storage
@@ -118,7 +118,7 @@ def test_models_that_reports_name(tmp_path, monkeypatch, named, known):
     monkeypatch.chdir(tmp_path)
     Path("model.npz").write_text("")
     Path("report.json").write_text(json.dumps({"settings": {"model": named}}))
-    assert reported_model(Path("report.json")) == (Path(named) if known else None)
+    assert model_of_report(Path("report.json")) == (Path(named) if known else None)
 
 
 def test_fingers_bend_in_their_bones():

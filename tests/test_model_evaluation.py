@@ -7,7 +7,7 @@ from conformance_bodies import KINDS
 from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, learn_scape
-from model.digests import body_digest, digest, trained_on
+from model.digests import body_digest, digest, was_trained_on
 from model.evaluation.cli import evaluate, sample
 from model.evaluation.errors import (
     compactness,
@@ -17,7 +17,7 @@ from model.evaluation.errors import (
     vertex_components,
 )
 from model.evaluation.page import error_pane
-from model.evaluation.sampling import sample_bodies, specificity, unposed
+from model.evaluation.sampling import sample_bodies, specificity, unpose_people
 from model.fitting.vertices import FitConfig, ShapeFitter
 from model.posing.cli import mesh as mesh_command
 from model.scape import ScapeModel
@@ -146,11 +146,11 @@ def test_people_come_to_rest_with_what_the_model_leaves_of_them(model):
     rng = np.random.default_rng(3)
     betas, rest = rng.normal(size=(3, 3)), np.zeros((3, 4, 3))
     at_rest = model.vertices(rest, betas)
-    np.testing.assert_allclose(unposed(model, at_rest + [1.0, 0, 0]), at_rest, atol=1e-5)
+    np.testing.assert_allclose(unpose_people(model, at_rest + [1.0, 0, 0]), at_rest, atol=1e-5)
     noisy = at_rest + rng.normal(0, 1e-4, at_rest.shape)      # what is left comes along, so nothing is lost
-    np.testing.assert_allclose(unposed(model, noisy), noisy, atol=2e-4)
+    np.testing.assert_allclose(unpose_people(model, noisy), noisy, atol=2e-4)
     turned = model.vertices(random_poses(model, 3, rng, 0.3), betas)
-    np.testing.assert_allclose(unposed(model, turned), at_rest, atol=1e-4)
+    np.testing.assert_allclose(unpose_people(model, turned), at_rest, atol=1e-4)
 
 
 def test_specificity_is_zero_where_the_random_bodies_are_the_people(model):
@@ -164,7 +164,7 @@ def test_specificity_is_zero_where_the_random_bodies_are_the_people(model):
 
 def test_specificity_against_all_distances(model, people):
     found = specificity(model, people, 5, np.random.default_rng(0), (1, 3))
-    real = unposed(model, people)
+    real = unpose_people(model, people)
     betas = np.random.default_rng(0).normal(size=(5, 3))
     for c, k in enumerate((1, 3)):
         bodies = model.vertices(np.zeros((5, 4, 3)), betas[:, :k])
@@ -200,12 +200,12 @@ def test_a_model_knows_the_bodies_that_trained_it(model, people):
     poses = model.vertices(random_poses(model, 6, np.random.default_rng(4)))
     learned = learn_scape(model.template, poses, people, model.skeleton, LearnConfig(refinements=0, components=3))
     assert learned.info["digest"] == digest(model.template, poses, people)
-    assert trained_on(learned, poses).all() and trained_on(learned, people).all()
-    assert not trained_on(learned, poses + 1e-3).any()
+    assert was_trained_on(learned, poses).all() and was_trained_on(learned, people).all()
+    assert not was_trained_on(learned, poses + 1e-3).any()
     told = ScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, model.pose_mean,
                       model.pose_covariance, {"digests": [body_digest(p) for p in people[:3]]})
-    np.testing.assert_array_equal(trained_on(told, people[2:5].astype(np.float32)), [True, False, False])
-    assert trained_on(model, people) is None
+    np.testing.assert_array_equal(was_trained_on(told, people[2:5].astype(np.float32)), [True, False, False])
+    assert was_trained_on(model, people) is None
 
 
 @pytest.mark.parametrize("what, word", [

@@ -11,12 +11,12 @@ from model_bodies import worm_model
 
 from model.export.bvh import write_bvh
 from model.export.cli import export
-from model.export.conventions import aimed, for_programs
+from model.export.conventions import aim_bones, for_programs
 from model.export.correctives import motion_correctives
-from model.export.glb import skinned_glb, write_skinned_glb
+from model.export.glb import encode_skinned_glb, write_skinned_glb
 from model.export.names import names_of
 from model.posing.cli import mesh
-from model.rig import carried, joint_places, make_rig, rerooted
+from model.rig import change_root, joint_places, make_rig, transform_rig
 from model.statue.control.files import humanoid, read_control
 from scanprep.command_line import run
 from scanprep.geometry import rotations
@@ -40,7 +40,7 @@ def swaying(rig, frames=6):
 @pytest.mark.parametrize("root", ["part0", "part1", "part2", "part3"])
 def test_another_root_moves_the_same_surface(rig, motion, root):
     poses, trans = motion
-    other, turned, moved = rerooted(rig, poses, trans, root)
+    other, turned, moved = change_root(rig, poses, trans, root)
     assert other.skeleton.names[0] == root and set(other.skeleton.names) == set(rig.skeleton.names)
     assert np.abs(other.vertices(turned, moved) - rig.vertices(poses, trans)).max() < 1e-12
 
@@ -51,18 +51,18 @@ def test_another_root_moves_the_same_surface(rig, motion, root):
     assert links(other) == links(rig), "the joints between parts stay where they are"
     inside = other.skeleton.part_of_vertex(rig.mesh) == 0
     assert np.allclose(other.skeleton.joints[0], rig.mesh.vertices[inside].mean(axis=0), atol=1e-12)
-    back, again, places = rerooted(other, turned, moved, "part0")
+    back, again, places = change_root(other, turned, moved, "part0")
     assert np.abs(rotations.exp(again[:, [back.skeleton.names.index(n) for n in rig.skeleton.names]])
                   - rotations.exp(poses)).max() < 1e-9
     assert np.abs(places + back.skeleton.joints[0] - trans - rig.skeleton.joints[0]).max() < 1e-2     # the centroid
-    still = rerooted(rig, poses[:0], trans[:0], root)
+    still = change_root(rig, poses[:0], trans[:0], root)
     assert still[1].shape == (0, 4, 3) and still[2].shape == (0, 3)
 
 
 def test_body_at_rest_and_motion_are_carried_apart(rig, motion):
     Q, W = rotations.exp(np.array([[0.2, 1, 0], [0.3, -2, 1]]))
     shift, step = np.array([1.0, 2, 3]), np.array([-1.0, 0, 5])
-    moved, poses, trans = carried(rig, *motion, (Q, shift), (W, step))
+    moved, poses, trans = transform_rig(rig, *motion, (Q, shift), (W, step))
     assert np.abs(moved.vertices(poses, trans) - (rig.vertices(*motion) @ W.T + step)).max() < 1e-12
     assert np.abs(moved.mesh.vertices - (rig.mesh.vertices @ Q.T + shift)).max() < 1e-12
 
@@ -71,7 +71,8 @@ def test_bones_of_any_axes_show_the_same(rig, motion):
     axes = rotations.exp(np.random.default_rng(5).normal(size=(4, 3)))
     subject = worm_model().subject(np.array([0.5, -1.0]))
     rig = replace(rig, correctives=motion_correctives(rig, subject, motion[0]))
-    other, plain = Glb(skinned_glb(replace(rig, axes=axes), *motion, 4.0)), Glb(skinned_glb(rig, *motion, 4.0))
+    other, plain = Glb(encode_skinned_glb(replace(rig, axes=axes), *motion, 4.0)), Glb(encode_skinned_glb(rig, *motion,
+                                                                                                          4.0))
     assert np.abs(other.skinned() - plain.skinned()).max() < 1e-6
     U = turn_up(2)
     for t in range(5):
@@ -83,7 +84,7 @@ def test_bones_of_any_axes_show_the_same(rig, motion):
 
 
 def test_bones_point_along_the_limbs(person):
-    rig = aimed(person, 2)
+    rig = aim_bones(person, 2)
     names, joints = rig.skeleton.names, rig.skeleton.joints
     assert np.allclose(np.linalg.det(rig.axes), 1)
     for part, child in (("humanoid_root", "vl5"), ("vl5", "skullbase"), ("l_shoulder", "l_elbow"),
@@ -160,13 +161,13 @@ def test_soles_on_the_ground_and_face_to_the_viewer(person, turn):
     old = before.vertices(turns, trans)
     apart = np.linalg.norm(old[:, :, None, :][:, ::200] - old[:, None, ::200], axis=-1)
     assert np.allclose(np.linalg.norm(shown[:, ::200, None] - shown[:, None, ::200], axis=-1), apart, atol=1e-9)
-    glb = Glb(skinned_glb(rig, new, places))
+    glb = Glb(encode_skinned_glb(rig, new, places))
     assert glb.skinned()[:, 1].min() == pytest.approx(0, abs=1e-6)
 
 
 def test_a_control_mesh_is_read_from_bones_along_the_limbs(person, tmp_path):
     write_skinned_glb(tmp_path / "plain.glb", person)
-    write_skinned_glb(tmp_path / "aimed.glb", aimed(person, 2))
+    write_skinned_glb(tmp_path / "aimed.glb", aim_bones(person, 2))
     plain, other = read_control(tmp_path / "plain.glb"), read_control(tmp_path / "aimed.glb")
     assert np.abs(plain.mesh.vertices - other.mesh.vertices).max() < 1e-6
     assert np.abs(plain.skeleton.joints - other.skeleton.joints).max() < 1e-6
@@ -227,7 +228,7 @@ def test_a_mesh_stands_on_the_ground_and_looks_at_the_viewer(files, model, name)
 
 
 def test_joints_of_a_rerooted_motion_stand_where_they_stood(rig, motion):
-    other, poses, trans = rerooted(rig, *motion, "part3")
+    other, poses, trans = change_root(rig, *motion, "part3")
     now, before = joint_places(other.skeleton, poses, trans), joint_places(rig.skeleton, *motion)
     for j in range(1, 4):
         assert np.abs(now[:, 1:] - before[:, [j]]).max(axis=(0, 2)).min() < 1e-12

@@ -11,7 +11,7 @@ from model_bodies import random_poses, worm_model
 
 from model.export.cli import WRITERS, Writer, export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
-from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
+from model.export.glb import continuous_quaternions, encode_skinned_glb, write_skinned_glb
 from model.motion.onto import BodyMotion
 from model.rig import turn_up
 from scanprep.command_line import run
@@ -24,7 +24,7 @@ from scanprep.geometry.storage import StorageError
 
 @pytest.mark.parametrize("up", [0, 1, 2])
 def test_a_viewer_sees_the_skinned_motion(rig, motion, up):
-    glb = Glb(skinned_glb(rig, *motion, 4.0, up=up))
+    glb = Glb(encode_skinned_glb(rig, *motion, 4.0, up=up))
     assert np.array_equal(glb.faces, rig.mesh.faces)
     for t, expected in enumerate(rig.vertices(*motion)):
         assert np.abs(glb.skinned(t) - expected @ turn_up(up).T).max() < 1e-5
@@ -33,7 +33,7 @@ def test_a_viewer_sees_the_skinned_motion(rig, motion, up):
 
 
 def test_at_rest_nothing_is_moved_and_weights_are_as_gltf_wants_them(rig):
-    glb = Glb(skinned_glb(rig, up=1))
+    glb = Glb(encode_skinned_glb(rig, up=1))
     assert np.abs(glb.skinned() - rig.mesh.vertices).max() < 1e-6
     assert np.abs(glb.morphed([0] * 6) - rig.mesh.vertices).max() < 1e-6
     world = glb.matrices()
@@ -56,7 +56,7 @@ def test_at_rest_nothing_is_moved_and_weights_are_as_gltf_wants_them(rig):
 
 @pytest.mark.parametrize(("k", "sign"), [(0, 1), (1, -1), (2, 1)])
 def test_morph_targets_are_betas(model, rig, k, sign):
-    glb = Glb(skinned_glb(rig, up=1))
+    glb = Glb(encode_skinned_glb(rig, up=1))
     assert glb.json["meshes"][0]["extras"]["targetNames"] == [
         "beta 1 +3", "beta 1 -3", "beta 2 +3", "beta 2 -3", "beta 3 +3", "beta 3 -3"]
     weights, betas = np.zeros(6), np.r_[BETAS, 0]
@@ -71,7 +71,7 @@ def test_correctives_play_with_the_motion(model, rig, motion):
     poses, trans = 0.3 * motion[0], motion[1]
     subject = model.subject(BETAS)
     extra = replace(rig, correctives=motion_correctives(rig, subject, poses, 5))
-    glb = Glb(skinned_glb(extra, poses, trans, 4.0, up=1))
+    glb = Glb(encode_skinned_glb(extra, poses, trans, 4.0, up=1))
     names = glb.json["meshes"][0]["extras"]["targetNames"]
     assert names[6:] == [f"corrective {k}" for k in range(1, 6)]
     weights = np.stack([glb.moved(t)[1] for t in range(5)])
@@ -80,9 +80,9 @@ def test_correctives_play_with_the_motion(model, rig, motion):
     for t in range(5):
         assert np.abs(plain[t] - exact[t]).max() > 10 * np.abs(glb.skinned(t) - exact[t]).max()
     with pytest.raises(ValueError, match="correctives: expected the poses"):
-        skinned_glb(extra)
+        encode_skinned_glb(extra)
     with pytest.raises(ValueError, match="correctives: expected weights of 4 frames, got frame 4"):
-        skinned_glb(extra, poses[:4], trans[:4], 4.0)
+        encode_skinned_glb(extra, poses[:4], trans[:4], 4.0)
 
 
 def test_quaternions_do_not_jump():
@@ -112,7 +112,7 @@ def test_other_readers_find_the_rest_mesh(rig, motion, tmp_path):
     (lambda p, t: (np.where(np.arange(5)[:, None, None] == 3, np.nan, p), t, 4.0), "the first is frame 3")])
 def test_bad_motion_is_refused(rig, motion, change, words):
     with pytest.raises(ValueError, match=words):
-        skinned_glb(rig, *change(*motion))
+        encode_skinned_glb(rig, *change(*motion))
 
 
 def body(arrays, pose, betas, trans):

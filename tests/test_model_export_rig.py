@@ -153,7 +153,7 @@ def test_small_systems_are_solved_as_by_lapack():
     found = correctives._solve_small(np.moveaxis(A, 0, -1), y.T).T
     np.testing.assert_allclose(found, np.linalg.solve(A, y[..., None])[..., 0], atol=1e-9)
     lost = 1 - np.clip(np.abs(np.linalg.det(A)), 0, 1)
-    np.testing.assert_allclose(correctives._lost(np.moveaxis(A, 0, -1)), lost, atol=1e-12)
+    np.testing.assert_allclose(correctives._rotation_loss(np.moveaxis(A, 0, -1)), lost, atol=1e-12)
 
 
 def test_corrections_undo_what_skinning_does(model, rig):

@@ -9,7 +9,7 @@ from model.features import (
     QuadraticLift,
     QuaternionLift,
     RotationLift,
-    restored_features,
+    restore_features,
     twists,
 )
 
@@ -54,7 +54,7 @@ def test_lift_comes_back_from_its_arrays(lift):
     t = np.random.default_rng(4).normal(size=(2, 4, 3))
     features = features_of(lift)
     arrays = {"feature_part": features.part, "feature_mix": features.mix}
-    again = restored_features(features.skeleton, {"lift": lift.kind}, arrays).lift
+    again = restore_features(features.skeleton, {"lift": lift.kind}, arrays).lift
     np.testing.assert_array_equal(again.evaluate(t), lift.evaluate(t))
 
 
@@ -76,4 +76,4 @@ def test_refuses_shapes_that_do_not_agree():
     with pytest.raises(ValueError, match="part"):
         PoseFeatures(features.skeleton, LinearLift(), features.part[::-1], features.mix)
     with pytest.raises(ValueError, match="not known"):
-        restored_features(features.skeleton, {"lift": "cubic"}, {})
+        restore_features(features.skeleton, {"lift": "cubic"}, {})

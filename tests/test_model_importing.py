@@ -11,7 +11,7 @@ from published_bodies import as_smplx, as_star, published_vertices, synthetic_sm
 from scipy.sparse import csc_array, csr_array
 
 from model.export.correctives import write_body_npz
-from model.features import QuaternionLift, RotationLift, lifted, lifted_slopes
+from model.features import QuaternionLift, RotationLift, lift_derivative, lift_twists
 from model.files import load_model
 from model.fitting.vertices import fit_shape
 from model.importing import NAMES, import_model
@@ -83,8 +83,8 @@ def test_lifts_and_their_slopes(lift):
     rng = np.random.default_rng(1)
     for size in (0.0, 1e-4, 0.5, 2.0, 4.0):
         pose = rng.normal(0, size, (3, 3))
-        slopes = differences(lambda step, pose=pose: lifted(lift, pose + step), np.zeros(3))
-        np.testing.assert_allclose(lifted_slopes(lift, pose), slopes, atol=1e-8)
+        slopes = differences(lambda step, pose=pose: lift_twists(lift, pose + step), np.zeros(3))
+        np.testing.assert_allclose(lift_derivative(lift, pose), slopes, atol=1e-8)
     q = QuaternionLift().evaluate(pose := rng.normal(0, 1, (5, 3)))
     R = rotations.exp(pose)
     np.testing.assert_allclose(2 * (q[:, 3] + 1)**2 * 2 - 1, np.trace(R, axis1=1, axis2=2), atol=1e-12)

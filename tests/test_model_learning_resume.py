@@ -134,8 +134,8 @@ def test_killed_twice_in_the_poses(bodies, monkeypatch):
     undisturbed = learned(bodies, "a.npz", refinements=3)
     killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
     killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the second
-    real, calls = scape._refined, []
-    monkeypatch.setattr(scape, "_refined", lambda *given, **named: calls.append(1) or real(*given, **named))
+    real, calls = scape._refine, []
+    monkeypatch.setattr(scape, "_refine", lambda *given, **named: calls.append(1) or real(*given, **named))
     monkeypatch.setattr(scape, "by_edges", None)
     assert learned(bodies, "b.npz", refinements=3) == undisturbed
     assert len(calls) == 1
@@ -165,8 +165,8 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
     killed(restarts, "_search", 1, given("b.npz"))                              # after the first restart
     killed(parts, "_left_out_error", 0, given("b.npz"))                           # after the last
     killed(parts, "_tried", 1, given("b.npz"))                                    # before more parts are tried
-    tried, real = [], parts._tried
-    monkeypatch.setattr(parts, "_tried", lambda *given: tried.append(given[1]) or real(*given))
+    tried, real = [], parts._try_parts
+    monkeypatch.setattr(parts, "_try_parts", lambda *given: tried.append(given[1]) or real(*given))
     monkeypatch.setattr(restarts, "_search", lambda search: pytest.fail("searched again"))
     assert run(learn, "scape learn", given("b.npz")) == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()

@@ -6,7 +6,7 @@ import pytest
 from conformance_bodies import skinned_worm
 from model_bodies import random_poses, worm, worm_skeleton
 
-from model.blend_weights import _onto_simplex, diffused_weights, fit_weights, strongest
+from model.blend_weights import _onto_simplex, diffuse_weights, fit_weights, strongest
 from model.fitting.vertices import fit_pose, fit_shape
 from model.learning import skinning
 from model.learning.skinning import (
@@ -67,7 +67,7 @@ def test_weights_and_joints_are_recovered(monkeypatch):
         found = _with_joints(found, poses, bodies)
     np.testing.assert_allclose(found.joint_regressor @ found.rest, truth.skeleton.joints, atol=1e-5)
     monkeypatch.setattr(skinning, "fit_weights", partial(fit_weights, smoothness=0.0))
-    wide = replace(truth, weights=diffused_weights(truth.template, truth.skeleton, 0.12))
+    wide = replace(truth, weights=diffuse_weights(truth.template, truth.skeleton, 0.12))
     assert np.abs(wide.weights - truth.weights).max() > 0.03
     for _ in range(8):
         wide = _with_weights(wide, poses, bodies, truth.weights > 0, SkinConfig())
@@ -145,7 +145,7 @@ def test_weights_pass_over_the_width_asked_for():
     skeleton = worm_skeleton(template)
     x = template.vertices[:, 0] - 0.3
     for width in (0.04, 0.12):
-        w = diffused_weights(template, skeleton, width)
+        w = diffuse_weights(template, skeleton, width)
         soft = np.abs(x[(w[:, 1] > 0.1) & (w[:, 1] < 0.9)] + 0.35)
         np.testing.assert_allclose(w.sum(axis=1), 1)
         assert 0.5 * width < soft.max() < 3 * width

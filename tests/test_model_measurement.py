@@ -15,8 +15,8 @@ from scipy.stats import norm
 from model import body_with_measurements, find_tapes, load_built_in_model, measure
 from model.measurement import measure as measuring
 from model.measurement import reading
-from model.measurement.catalogue import CATALOGUE, named
-from model.measurement.measure import measured_error
+from model.measurement.catalogue import CATALOGUE, find_measurements
+from model.measurement.measure import measurement_error
 from model.measurement.path import shortest_path
 from model.measurement.reading import Reading, Standing
 from model.measurement.section import Curve, around, bulge, direction, mean_of, section, tape
@@ -278,7 +278,7 @@ def test_stated_errors(person, tapes):
         assert two.errors[name]**2 - slide**2 == pytest.approx(4 * (one.errors[name]**2 - slide**2), rel=1e-6), name
     waist = plain.readings["waist_girth"]
     assert np.abs(waist.along(np.ones_like(person.mesh.vertices)[:, None, :].transpose(0, 2, 1))).max() < 1e-9
-    near = measured_error(waist, 1e-6 * person.mesh.vertices, error)       # all errors the same
+    near = measurement_error(waist, 1e-6 * person.mesh.vertices, error)       # all errors the same
     assert near == pytest.approx(plain.errors["waist_girth"], abs=1e-7)
 
 
@@ -298,7 +298,7 @@ def test_errors_of_near_points_cancel_and_of_far_ones_add_up(apart):
     reading = Reading(apart, ends, np.array([0, 1]), np.array([[-1.0, 0, 0], [1, 0, 0]]), slope=0.5)
     e = 1e-4
     square = 2 * e**2 / 3 * (1 - np.exp(-0.5 * (apart / 0.1)**2)) + (0.5 * 0.003)**2
-    assert measured_error(reading, ends, np.full(2, e))**2 == pytest.approx(square, rel=1e-9)
+    assert measurement_error(reading, ends, np.full(2, e))**2 == pytest.approx(square, rel=1e-9)
 
 
 def test_the_body_with_some_measurements(small_tapes):
@@ -329,9 +329,10 @@ def test_measures_that_no_person_has(given, told, small_tapes):
 
 
 def test_names_as_users_say_them():
-    assert list(named("Waist")) == ["waist_girth"] and list(named("back length")) == ["back_length"]
-    assert list(named("thigh")) == ["thigh_girth_left", "thigh_girth_right"]
-    assert list(named("calf_left")) == ["calf_girth_left"]
+    assert list(find_measurements("Waist")) == ["waist_girth"]
+    assert list(find_measurements("back length")) == ["back_length"]
+    assert list(find_measurements("thigh")) == ["thigh_girth_left", "thigh_girth_right"]
+    assert list(find_measurements("calf_left")) == ["calf_girth_left"]
 
 
 def test_a_cube_weighs_what_its_volume_does():
@@ -348,9 +349,9 @@ def test_errors_of_thousands_of_vertices_are_those_of_cubes_of_them(small_tapes,
     body = model.template
     error = 0.002 * (1 + np.sin(9 * body.vertices[:, 2])) + 0.001 * rng.random(len(body.vertices))
     taken = dataclasses.replace(measure(body, small_tapes, only=["weight"]).readings["weight"], unknown=1e-9)
-    true = measured_error(taken, body.vertices, error)
+    true = measurement_error(taken, body.vertices, error)
     monkeypatch.setattr(measuring, "MANY", 0)
-    assert measured_error(taken, body.vertices, error) == pytest.approx(true, rel=0.04)
+    assert measurement_error(taken, body.vertices, error) == pytest.approx(true, rel=0.04)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from people_bodies import small_people
 from model.export.bvh import write_bvh
 from model.export.conventions import for_programs
 from model.motion.bvh import read_bvh
-from model.motion.error import followed
+from model.motion.error import measure_error
 from model.motion.onto import read_motion, standing_rest
 from model.motion.retarget import Pairing
 from model.motion.trunks import nearest_starts
@@ -89,12 +89,12 @@ def test_the_error_that_is_told_is_that_of_the_joints(tmp_path):
     poses = rng.normal(0, 0.2, (4, 17, 3))
     write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, rate=30.0, body=rig.mesh)
     pair = Pairing(rig.skeleton, rig.vertices, read_bvh(tmp_path / "a.bvh", "cm"))
-    exact = followed(pair, poses, joint_places(rig.skeleton, poses))
+    exact = measure_error(pair, poses, joint_places(rig.skeleton, poses))
     assert exact.angle < 1e-4 and exact.distance < 1e-7 and exact.lean < 1e-4
     bent, elbow = poses.copy(), rig.skeleton.names.index("l_elbow")
     R = rotations.exp(poses[:, elbow]) @ rotations.exp(np.array([0, 0, np.radians(20)]))
     bent[:, elbow] = rotations.log(R)
-    off = followed(pair, bent, joint_places(rig.skeleton, bent))
+    off = measure_error(pair, bent, joint_places(rig.skeleton, bent))
     where = [name for name, angle in zip(off.names, off.angles.max(axis=0), strict=True) if angle > 1e-3]
     bone = rig.skeleton.joints[elbow + 1] - rig.skeleton.joints[elbow]
     assert where == ["l_wrist"] and off.distances[:, off.names.index("l_wrist")].max() > 0.01

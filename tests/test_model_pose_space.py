@@ -3,7 +3,7 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model.features import linear_features
-from model.pose_space import PoseSpace, kept_directions, nearest_joints
+from model.pose_space import PoseSpace, nearest_joints, principal_directions
 from scanprep.geometry import rotations
 
 
@@ -41,10 +41,10 @@ def test_pruning_keeps_the_axes_that_move():
     poses = np.zeros((200, 2, 3))
     axis = np.array([1.0, 2.0, 2.0]) / 3
     poses[:, 1] = rng.normal(0, 0.8, (200, 1)) * axis + rng.normal(0, 0.02, (200, 3))
-    kept = kept_directions(poses, 0.01)
+    kept = principal_directions(poses, 0.01)
     assert kept[0].shape == (3, 0) and kept[1].shape == (3, 1)
     assert abs(kept[1][:, 0] @ axis) > 0.999
-    assert kept_directions(poses, 0.0)[1].shape == (3, 3)
+    assert principal_directions(poses, 0.0)[1].shape == (3, 3)
 
 
 def test_identity_space_is_rigid(model):

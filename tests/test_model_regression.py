@@ -4,7 +4,7 @@ from model_bodies import random_poses, worm_model
 
 from model.features import PoseFeatures, QuadraticLift
 from model.learning.config import LearnConfig
-from model.learning.regression import Design, by_edges, choose_design, compress, left_out
+from model.learning.regression import Design, by_edges, choose_design, compress, predict_left_out
 from model.pose_space import PoseSpace
 
 
@@ -85,7 +85,7 @@ def test_left_out_predictions_are_those_of_leaving_out(model, features):
     poses = random_poses(model, 12, rng)
     Q = model.pose_space.gradients(poses) + rng.normal(0, 0.05, (12, len(model.template.faces), 3, 3))
     design, _ = learn(model, poses, Q, features=features, ridges=(0.05,))
-    predicted = left_out(design, poses, Q)
+    predicted = predict_left_out(design, poses, Q)
     assert design.left_out_error == pytest.approx(edge_error(model, Q)(predicted), rel=1e-9)
     for i in (0, 7):
         rest = np.delete(np.arange(12), i)

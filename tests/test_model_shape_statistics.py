@@ -10,7 +10,7 @@ from completion.__main__ import main
 from model import load_built_in_model, sample_bodies
 from model.measurement.survey import survey
 from model.posing.cli import read_subject
-from model.shape_statistics import SEXES, draw_betas, known_sexes, shape_statistics
+from model.shape_statistics import SEXES, draw_betas, list_sexes, shape_statistics
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_drawn_bodies_are_as_tall_and_as_heavy_as_people(model, sex):
 def test_a_model_that_does_not_tell_women_from_men(tmp_path, capsys):
     """Its betas are standard normal, as they were drawn before; a sex of it is refused, by the command too."""
     worm = worm_model()
-    assert known_sexes(worm) == () and shape_statistics(worm).root.shape == (3, 3)
+    assert list_sexes(worm) == () and shape_statistics(worm).root.shape == (3, 3)
     betas, sexes = draw_betas(worm, 5, np.random.default_rng(4))
     assert np.array_equal(betas, np.random.default_rng(4).normal(size=(5, 3))) and sexes == (None,) * 5
     with pytest.raises(ValueError, match="sex: the model does not tell women from men, so it has no men"):

@@ -9,7 +9,7 @@ import pytest
 from animal_bodies import Animal
 from humanoid_maker import NAMES, freedom, nearest_marks
 
-from model.export.glb import skinned_glb, write_skinned_glb
+from model.export.glb import encode_skinned_glb, write_skinned_glb
 from model.statue.control.chart import (
     Chart,
     automatic_chart,
@@ -366,6 +366,6 @@ def test_two_bodies_in_one_mesh_are_refused(tmp_path):
                   weights=np.vstack([control.weights] * 2), shapes=np.zeros((0, 2 * n, 3)),
                   skeleton=Skeleton(np.tile(control.skeleton.part_of_face, 2), control.skeleton.parents,
                                     control.skeleton.joints, NAMES))
-    (tmp_path / "two.glb").write_bytes(skinned_glb(rig))
+    (tmp_path / "two.glb").write_bytes(encode_skinned_glb(rig))
     with pytest.raises(StorageError, match=r"two\.glb.*2 components"):
         read_control(tmp_path / "two.glb")

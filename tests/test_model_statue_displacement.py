@@ -18,9 +18,9 @@ from model.statue.detail.maps import read_map, write_map
 from model.statue.detail.normal_volume import from_normal_volume, interpolate, limits, not_inverted, to_normal_volume
 from model.statue.detail.reconstruction import (
     Reconstruction,
-    displaced_surface,
+    displace_surface,
+    find_inverted,
     in_folds,
-    inverted_triangles,
     remaining_error,
     surface_error,
 )
@@ -227,7 +227,7 @@ def test_vectors_mend_an_overhang_and_nothing_else(control, with_vectors):
     fine = subdivide(control.mesh, control.chart, 4)
     plain, bent = (Reconstruction(control, m, fine).mesh() for m in (replace(found, vectors=None), found))
     assert surface_error(bent, scan, 50_000).rms < 0.6 * surface_error(plain, scan, 50_000).rms
-    inverted = inverted_triangles(control, control.mesh.vertices, fine, bent.vertices)
+    inverted = find_inverted(control, control.mesh.vertices, fine, bent.vertices)
     folds = in_folds(control, found, fine)
     assert len(inverted) and folds[inverted].all()           # the underside of the cap
     assert in_folds(control, replace(found, vectors=None), fine).mean() < folds.mean() < 0.05
@@ -278,7 +278,7 @@ def test_adaptive_subdivision_splits_where_the_surface_bends_without_a_crack(con
     one_bump = DisplacementMap(
         texels.image(heights.astype(np.float32)),
         texels.image(np.where(texels.inside, MEASURED, OUTSIDE).astype(np.uint8), OUTSIDE))
-    displaced = displaced_surface(control, one_bump)
+    displaced = displace_surface(control, one_bump)
     fine = subdivide_adaptive(control.mesh, control.chart, displaced, 3e-4, 4)
     mesh = fine.mesh(control.mesh)
     assert mesh.is_closed and mesh.is_edge_manifold
@@ -342,17 +342,17 @@ def test_detail_turns_and_moves_with_the_control_mesh(control, with_vectors):
     turn, shift = Rotation.from_rotvec([0.3, -1, 2]), np.array([1, 2, 3.0])
     rest, v = build(control.mesh.vertices), np.array(control.mesh.vertices)
     np.testing.assert_allclose(build(turn.apply(v) + shift), turn.apply(rest) + shift, atol=1e-9)
-    np.testing.assert_allclose(rest, displaced_surface(control, with_vectors)(fine.parent, fine.bary), atol=1e-9)
+    np.testing.assert_allclose(rest, displace_surface(control, with_vectors)(fine.parent, fine.bary), atol=1e-9)
 
 
 def test_triangles_that_are_turned_over_are_found(control, baked):
     fine = subdivide(control.mesh, control.chart, 2)
     x = Reconstruction(control, baked, fine)(control.mesh.vertices)
-    assert not len(inverted_triangles(control, control.mesh.vertices, fine, x))
+    assert not len(find_inverted(control, control.mesh.vertices, fine, x))
     turned = x.copy()
     a, b, c = fine.faces[1000]
     turned[a] += 2.2 * (0.5 * (x[b] + x[c]) - x[a])
-    assert 1000 in inverted_triangles(control, control.mesh.vertices, fine, turned)
+    assert 1000 in find_inverted(control, control.mesh.vertices, fine, turned)
 
 
 def test_files_give_back_the_map(tmp_path, with_vectors):

@@ -7,7 +7,7 @@ from derivatives import differences
 from trimesh.remesh import subdivide_to_size
 
 from model.statue.control.files import humanoid
-from model.statue.fit import StatueConfig, posed_automatically, posed_by_features
+from model.statue.fit import StatueConfig, pose_automatically, pose_by_features
 from model.statue.registration import automatic
 from model.statue.registration.articulated import Articulated, Points
 from model.statue.registration.automatic import Features, find_features, likely_unit
@@ -203,15 +203,15 @@ def test_features_that_were_found_pose_and_warp_as_those_that_were_clicked(contr
     """[Statues] Eq. 4, 5 without a click: the published way; ours begins on the scan where it shows the body."""
     joints, points = features_of(control, model, drawn(model, np.random.default_rng(5)))
     points["nose tip"] = points["nose tip"] + [0.0, -0.02, 0.0]
-    clicked = posed_by_features(control, joints, points)
+    clicked = pose_by_features(control, joints, points)
     on_scan = control.mesh.with_vertices(clicked.features.vertices + [0.0, 0.0, 0.01])
     found = Features(joints, points, (), on_scan, clicked.features, None)
-    published = posed_automatically(control, found, StatueConfig.published().start == "registered")
+    published = pose_automatically(control, found, StatueConfig.published().start == "registered")
     np.testing.assert_array_equal(published.start, clicked.start)
     assert published.face == len(FACE) and np.abs(published.start - clicked.features.vertices).max() > 0.01
-    usual = posed_automatically(control, found, StatueConfig().start == "registered")
+    usual = pose_automatically(control, found, StatueConfig().start == "registered")
     np.testing.assert_array_equal(usual.start, on_scan.vertices)
-    hidden = posed_automatically(control, Features(joints, points, ("skullbase",), on_scan, clicked.features, None))
+    hidden = pose_automatically(control, Features(joints, points, ("skullbase",), on_scan, clicked.features, None))
     head = head_share(control) == 1
     np.testing.assert_allclose(hidden.start[head], clicked.start[head], atol=1e-12)
     assert (usual.face, hidden.face) == (0, len(FACE)) and hidden.hidden[head].all()

@@ -18,7 +18,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.roles import find_roles, trunk
-from scanprep.synthetic.people import PARTS, Person, named_pose, walk
+from scanprep.synthetic.people import PARTS, Person, find_pose, walk
 
 GENERIC = np.zeros((17, 3))
 NAMES = humanoid().skeleton.names
@@ -30,7 +30,7 @@ SHARED = {"humanoid_root": 0, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_
 def scanned(turn=(0, 0, 0)):
     """The humanoid as fitted to a scan in another pose and place, and how its parts were turned."""
     control = humanoid()
-    pose = people_motion(control, GENERIC, named_pose("lunge_left")[None]).poses[0]
+    pose = people_motion(control, GENERIC, find_pose("lunge_left")[None]).poses[0]
     pose[0] = rotations.log(rotations.exp(np.array(turn, float)) @ rotations.exp(pose[0]))
     trans = np.array([2.0, -1.0, 0.5])
     return control.fitted(control.rig.vertices(pose, trans), joint_places(control.skeleton, pose, trans)), pose
@@ -66,7 +66,7 @@ def test_a_motion_of_its_own_parts(tmp_path):
 
 def test_parts_turn_in_the_world_as_those_of_the_people():
     control, person = humanoid(), Person()
-    poses = np.stack([named_pose("lunge_left"), named_pose("surrender")])
+    poses = np.stack([find_pose("lunge_left"), find_pose("surrender")])
     poses[1, 2] = 0                                             # the trunk turns in one joint
     found = people_motion(control, GENERIC, poses)
     R, theirs = world(control, found), person.skeleton.part_rotations(poses)
@@ -78,7 +78,7 @@ def test_parts_turn_in_the_world_as_those_of_the_people():
 
 
 def test_a_trunk_of_two_joints_carries_the_shoulders_nearly_as_far():
-    person, poses = Person(), named_pose("left_arm_up")[None].copy()
+    person, poses = Person(), find_pose("left_arm_up")[None].copy()
     poses[:, [0, *range(3, 16)]] = 0
     poses[:, 1:3] *= 2                                          # 24 degrees aside
     R = world(humanoid(), people_motion(humanoid(), GENERIC, poses))[0, 1]
@@ -91,7 +91,7 @@ def test_a_trunk_of_two_joints_carries_the_shoulders_nearly_as_far():
 
 def test_clavicles_rise_with_arms_above_the_horizontal():
     control = humanoid()
-    poses = np.stack([named_pose(name) for name in ("rest", "t_pose", "arms_up")])
+    poses = np.stack([find_pose(name) for name in ("rest", "t_pose", "arms_up")])
     found = {share: people_motion(control, GENERIC, poses, girdle=share) for share in (0.0, 0.2)}
     for side in "lr":
         clavicle, arm, elbow = (NAMES.index(f"{side}_{n}") for n in ("sternoclavicular", "shoulder", "elbow"))
@@ -115,7 +115,7 @@ def test_the_pose_of_the_scan_does_not_matter(turn):
     ways = joint_places(control.skeleton, found.poses, found.trans)
     expected = joint_places(humanoid().skeleton, plain.poses, plain.trans)
     steps, R = np.diff(expected, axis=0), rotations.exp(np.array(turn, float))
-    lunge = people_motion(humanoid(), GENERIC, named_pose("lunge_left")[None]).poses[0, 0]
+    lunge = people_motion(humanoid(), GENERIC, find_pose("lunge_left")[None]).poses[0, 0]
     heading = rotations.exp(lunge) @ [0, -1, 0]                 # walks where the scan faces
     about = np.arctan2(heading[0], -heading[1])
     R = R @ rotations.exp(np.array([0, 0, about]))

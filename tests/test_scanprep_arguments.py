@@ -12,7 +12,7 @@ from scanprep import command_line
 from scanprep.console import Outcome
 from scanprep.judgement import Judgement
 
-PATHS = command_line.listed(COMMANDS, "scape")
+PATHS = command_line.list_commands(COMMANDS, "scape")
 
 
 def parsed(path):

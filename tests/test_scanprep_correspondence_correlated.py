@@ -16,7 +16,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, target_of
-from scanprep.synthetic.people import Person, named_pose
+from scanprep.synthetic.people import Person, find_pose
 
 SMALL = CorrelatedConfig(points=100, keep=80, levels=(BeliefLevel(1200, 60), BeliefLevel(10**6, 40)))
 
@@ -45,7 +45,7 @@ def person() -> Person:
 
 @pytest.fixture(scope="module")
 def kicking(person) -> Mesh:
-    return person.mesh.with_vertices(person.posed(named_pose("kick_left")))
+    return person.mesh.with_vertices(person.posed(find_pose("kick_left")))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from scanprep.batch.opening import workspace
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task
 from scanprep.console import Metric, judgement_row
-from scanprep.folders import PICTURE, FolderCommand, figure, judgement_on, kept_results
+from scanprep.folders import PICTURE, FolderCommand, figure, judgement_on, load_results
 from scanprep.judgement import Judgement
 from scanprep.pictures.scene import SCENE
 from scanprep.pictures.sheets import save_png
@@ -58,7 +58,7 @@ def test_each_has_the_way_to_its_page_and_what_can_be_shown(tmp_path):
 def test_a_command_works_through_them(tmp_path, failing):
     with workspace(tmp_path / "out") as space:
         outcome = SHEEP.carry_out("counting", space, Counting(failing), [Task(n, n, n) for n in "ab"], Workers(1))
-        again = kept_results(space, ["a", "b", "new"])
+        again = load_results(space, ["a", "b", "new"])
     assert outcome.failures == [f"{name}: no sheep" for name in failing]
     assert outcome.judgement.verdict == ("check" if failing else "good")
     assert outcome.metrics == [Metric("sheep", 2)] and outcome.settings == {"count": 1}

@@ -6,7 +6,7 @@ import pytest
 
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.files import MeshFileError
-from scanprep.geometry.landmark_names import TEN, known_landmarks, landmark_name, paired_names
+from scanprep.geometry.landmark_names import TEN, landmark_name, pair_names, translate_landmarks
 from scanprep.geometry.landmarks import (
     LANDMARK_ENDINGS,
     landmarks_beside,
@@ -14,7 +14,7 @@ from scanprep.geometry.landmarks import (
     read_landmark_vertices,
     read_landmarks,
     read_template_landmarks,
-    shared_landmarks,
+    try_match_landmarks,
     write_landmarks,
 )
 from scanprep.geometry.mesh import Mesh
@@ -304,21 +304,21 @@ def test_the_ten_of_the_readme_are_what_everything_wants():
     readme = ["crown", "navel", *(f"{side} {name}" for name in ("hand", "foot", "elbow", "knee")
                                   for side in ("left", "right"))]
     assert [landmark_name(name) for name in readme] == list(TEN)
-    assert len(paired_names(TEN, readme)) == 10
+    assert len(pair_names(TEN, readme)) == 10
 
 
 def test_a_name_spelt_alike_comes_before_a_synonym():
-    assert known_landmarks({"crown": 1, "top of head": 2, "l_knee": 3, "left knee cap": 4}) == {
+    assert translate_landmarks({"crown": 1, "top of head": 2, "l_knee": 3, "left knee cap": 4}) == {
         "top of head": 2, "left knee": 3, "left knee cap": 4}
-    assert paired_names(["left hand", "left wrist"], ["left wrist", "left hand", "left middle finger"]) == [
+    assert pair_names(["left hand", "left wrist"], ["left wrist", "left hand", "left middle finger"]) == [
         ("left hand", "left hand"), ("left wrist", "left wrist")]
-    assert paired_names(["left hand", "left middle finger"], ["LeftHand"]) == [("left hand", "LeftHand")]
+    assert pair_names(["left hand", "left middle finger"], ["LeftHand"]) == [("left hand", "LeftHand")]
 
 
 def test_names_nobody_shares_are_said_and_left(tmp_path):
     with pytest.warns(UserWarning, match="marks.json: .*template: navel, crotch; scan: p1, p2; going on without"):
-        assert shared_landmarks(tmp_path / "marks.json", {"navel": 1, "crotch": 2},
-                                {"p1": np.zeros(3), "p2": np.ones(3)}) is None
+        assert try_match_landmarks(tmp_path / "marks.json", {"navel": 1, "crotch": 2},
+                                   {"p1": np.zeros(3), "p2": np.ones(3)}) is None
 
 
 @pytest.mark.parametrize("cloud", [False, True])

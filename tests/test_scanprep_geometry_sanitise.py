@@ -8,7 +8,7 @@ from scanprep.cleaning.clean_scan import clean_scan
 from scanprep.geometry.files import read_scan, write_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.places import distinct_places, distinct_rows, spacing
-from scanprep.geometry.sanitise import _agree_with_camera, inverted, sanitise
+from scanprep.geometry.sanitise import _agree_with_camera, invert_triangles, sanitise
 from scanprep.geometry.surface import Rays
 from scanprep.geometry.target import target_of
 from scanprep.geometry.thinning import thin_scan
@@ -56,7 +56,7 @@ def test_what_is_right_stays_the_very_same(person, half):
 
 def test_all_inside_out_is_turned(person, half):
     for right in (person, half):
-        turned = Mesh(right.vertices, inverted(right.faces, np.ones(len(right.faces), dtype=bool)))
+        turned = Mesh(right.vertices, invert_triangles(right.faces, np.ones(len(right.faces), dtype=bool)))
         assert wrong_share(told(turned, "faced inward and were turned"), right) < 0.005
 
 
@@ -66,7 +66,7 @@ def test_patches_that_face_different_ways_are_turned(person, half):
         middle = right.corners.mean(axis=1)
         seeds = middle[rng.integers(len(middle), size=12)]
         patches = (np.linalg.norm(middle[:, None] - seeds, axis=2) < 0.1).any(axis=1)
-        mixed = Mesh(right.vertices, inverted(right.faces, patches))
+        mixed = Mesh(right.vertices, invert_triangles(right.faces, patches))
         assert wrong_share(told(mixed, rf"of {len(patches)} triangles faced inward"), right) < 0.01
 
 
@@ -74,7 +74,7 @@ def test_what_one_camera_saw_faces_it_whatever_its_noise_hides(person, half):
     """On a Kinect's view of a person the rays turned two thirds of the surface, and other parts when read again."""
     middle = half.corners.mean(axis=1) - half.vertices.mean(axis=0)
     patch = np.where(middle[:, 2] < 0, 0, np.where(middle[:, 0] > 0, 1, 2))
-    mixed = Mesh(half.vertices, inverted(half.faces, patch == 1))
+    mixed = Mesh(half.vertices, invert_triangles(half.faces, patch == 1))
     np.testing.assert_array_equal(_agree_with_camera(mixed, Rays(mixed), patch, np.array([True, False, False])),
                                   [False, True, False])
     whole = np.zeros(len(person.faces), dtype=int)                      # seen from all sides: the rays decide

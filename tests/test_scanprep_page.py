@@ -28,7 +28,7 @@ from scanprep.registration.figures import (
     write_figures,
 )
 from scanprep.registration.limbs import Doubt
-from scanprep.registration.nonrigid import principal_stretches, share_stretched, uncovered_share
+from scanprep.registration.nonrigid import principal_stretches, share_stretched, share_uncovered
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
 
@@ -194,7 +194,7 @@ def test_stretches_of_a_known_map(template):
 
 def test_missed_points(template):
     points = np.vstack([template.vertices * 1.001, template.vertices[:214] + [3, 0, 0]])
-    assert uncovered_share(points, template, 0.01, samples=len(points)) == pytest.approx(214 / 856)
+    assert share_uncovered(points, template, 0.01, samples=len(points)) == pytest.approx(214 / 856)
 
 
 def test_tables_keep_their_numbers(tmp_path):

@@ -6,7 +6,7 @@ from glb_reader import Glb
 
 from scanprep.geometry.format_glb import turn_up
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.gltf import animated_glb, write_animated_glb
+from scanprep.pictures.gltf import encode_animated_glb, write_animated_glb
 from scanprep.pictures.shading import sphere
 from scanprep.pictures.sheets import gif_bytes, write_gif
 
@@ -32,7 +32,7 @@ def at(glb, time):
 
 def test_every_frame_is_shown_at_its_time(motion):
     faces, frames = motion
-    glb = Glb(animated_glb(faces, frames, rate=4.0, up=1))
+    glb = Glb(encode_animated_glb(faces, frames, rate=4.0, up=1))
     indices = glb.array(glb.json["meshes"][0]["primitives"][0]["indices"])
     assert np.array_equal(indices.reshape(-1, 3), faces)
     for t, frame in enumerate(frames):
@@ -46,7 +46,7 @@ def test_every_frame_is_shown_at_its_time(motion):
 @pytest.mark.parametrize("up", [0, 1, 2])
 def test_the_body_stands_upright(motion, up):
     faces, frames = motion
-    glb = Glb(animated_glb(faces, frames, rate=4.0, up=up))
+    glb = Glb(encode_animated_glb(faces, frames, rate=4.0, up=up))
     U = turn_up(up)
     assert np.allclose(U @ np.eye(3)[up], [0, 1, 0]) and "rotation" not in glb.json["nodes"][0]
     assert np.abs(at(glb, 0.5)[0] - frames[2] @ U.T).max() < 1e-6
@@ -55,14 +55,14 @@ def test_the_body_stands_upright(motion, up):
 def test_colours_are_stored_as_light(motion):
     faces, frames = motion
     colors = np.tile([1.0, 0.5, 0.0], (frames.shape[1], 1))
-    glb = Glb(animated_glb(faces, frames, 4.0, colors))
+    glb = Glb(encode_animated_glb(faces, frames, 4.0, colors))
     stored = glb.array(glb.json["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"])
     assert np.allclose(stored, [1.0, 0.2140, 0.0], atol=1e-4)
 
 
 def test_one_frame_is_a_still(motion):
     faces, frames = motion
-    still = Glb(animated_glb(faces, frames[:1], 4.0))
+    still = Glb(encode_animated_glb(faces, frames[:1], 4.0))
     assert "animations" not in still.json and "targets" not in still.json["meshes"][0]["primitives"][0]
 
 
@@ -84,7 +84,7 @@ def test_bad_motion_is_refused(motion):
                              ((faces, frames[:0], 4.0), "at least one frame"),
                              ((faces, frames, 4.0, None, 3), "up: expected")):
         with pytest.raises(ValueError, match=words):
-            animated_glb(*arguments)
+            encode_animated_glb(*arguments)
 
 
 def test_gif_plays_all_pictures(tmp_path):

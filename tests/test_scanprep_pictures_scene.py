@@ -10,9 +10,9 @@ from scanprep.pictures import scene as scenes
 from scanprep.pictures.camera import Camera, look_around, stance
 from scanprep.pictures.low_rank import TOLERANCE, low_rank
 from scanprep.pictures.page import Page
-from scanprep.pictures.scene import Pane, framed_alike, pack_scene, picture_panes, small_scene, worst_that_turn
+from scanprep.pictures.scene import Pane, match_camera_scales, pack_scene, picture_panes, small_scene, worst_that_turn
 from scanprep.pictures.shading import Bones, Dots, Heat, Moving, Solid, sphere
-from scanprep.pictures.thinning import MOST, thinned
+from scanprep.pictures.thinning import MOST, thin_solid
 
 
 @pytest.fixture
@@ -180,8 +180,8 @@ def test_large_meshes_are_thinned_and_keep_their_colours():
     mesh = Mesh(*sphere(5))
     parts = np.where(mesh.corners.mean(axis=1)[:, :1] > 0, (1.0, 0, 0), (0, 0, 1.0))
     solid = Solid(mesh, parts, shades={"height": Heat(mesh.vertices[:, 2], -1, 1), "plain": np.array([0.5, 0.5, 0.5])})
-    small = thinned(solid, 3000)
-    assert 2500 < len(small.mesh.faces) <= 3000 and thinned(small, 3000) is small
+    small = thin_solid(solid, 3000)
+    assert 2500 < len(small.mesh.faces) <= 3000 and thin_solid(small, 3000) is small
     assert np.abs(np.linalg.norm(small.mesh.vertices, axis=1) - 1).max() < 0.02
     np.testing.assert_allclose(small.shades["height"].values, small.mesh.vertices[:, 2], atol=0.05)
     far = np.abs(small.mesh.vertices[:, 0]) > 0.1
@@ -199,7 +199,7 @@ def test_no_shape_has_more_triangles_than_can_be_shown():
 
 def test_panes_beside_each_other_are_of_one_scale(body):
     small = body.with_vertices(body.vertices.mean(axis=0) + 0.5 * (body.vertices - body.vertices.mean(axis=0)))
-    cameras = [p.camera for p in framed_alike([Pane([m], Camera.around(m)) for m in (body, small)])]
+    cameras = [p.camera for p in match_camera_scales([Pane([m], Camera.around(m)) for m in (body, small)])]
     assert cameras[0].height == cameras[1].height and cameras[0].distance == cameras[1].distance
     picture = picture_panes([Pane([m], c) for m, c in zip((body, small), cameras, strict=True)], 100)
     inked = [(half.min(axis=2) < 240).sum() for half in np.array_split(picture, 2, axis=1)]

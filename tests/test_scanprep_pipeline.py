@@ -67,10 +67,10 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
         return dataclasses.replace(fit, rolled=parts is person)
 
     told = (Doubt(1.5, "the head is rolled by 90 degrees against the chest"),)
-    monkeypatch.setattr(unmarked, "repaired", repaired)
+    monkeypatch.setattr(unmarked, "repair_limbs", repaired)
     small = Doubt(1.0, "the person is 1.20 m tall: a child, or the wrong scale?")
     monkeypatch.setattr(one_scan, "limb_doubts", lambda body, parts, vertices: told)
-    monkeypatch.setattr(one_scan, "exchanged_sides", lambda body, parts, vertices: None)
+    monkeypatch.setattr(one_scan, "find_exchanged_sides", lambda body, parts, vertices: None)
     monkeypatch.setattr(one_scan, "size_doubts", lambda body, parts, vertices: (small,))
     monkeypatch.setattr(one_scan, "with_soles", lambda body, scan, fit, parts: stood.append((fit.rolled, parts)) or fit)
     task = find_scans(scans)[0]

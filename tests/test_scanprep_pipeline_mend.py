@@ -8,7 +8,7 @@ from scan_folders import MARKS, WITH_PICTURES, ball, contents, write_scans
 
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
 from scanprep.batch.calls import RUN
-from scanprep.batch.opening import locked, workspace
+from scanprep.batch.opening import lock_output, workspace
 from scanprep.batch.ownership import HOME
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.storage import StorageError
@@ -119,7 +119,7 @@ def test_another_run_on_the_set_is_told_and_nothing_is_lost(place):
     app = MendApp(place / "set", ENDING)
     mend(app, place)
     before = contents(place / "set")
-    with locked(place / "set" / HOME / "lock", place / "set"):
+    with lock_output(place / "set" / HOME / "lock", place / "set"):
         sent(app, "register")
         wait(app)
     assert "another run is at work" in app.note and app.greet()[-1].fields["changed"] == ["body1"]

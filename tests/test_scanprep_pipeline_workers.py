@@ -75,12 +75,12 @@ def test_a_cluster_changes_nothing(six, template, tmp_path, processes, seen, mon
     with LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
         with Client(local, set_as_default=False) as client:
             here = [task.scan for task in find_scans(scans)]
-            assert cluster._seen_there(client, here) and cluster._seen_there(client, [tmp_path / "none"])
+            assert cluster._has_same_files(client, here) and cluster._has_same_files(client, [tmp_path / "none"])
             monkeypatch.setattr(Path, "absolute", lambda path: Path("/elsewhere") / path.name)
-            assert not cluster._seen_there(client, here)
+            assert not cluster._has_same_files(client, here)
             monkeypatch.undo()
         if not seen:
-            monkeypatch.setattr(cluster, "_seen_there", lambda client, given: False)
+            monkeypatch.setattr(cluster, "_has_same_files", lambda client, given: False)
         config = dataclasses.replace(WITH_PICTURES, workers=Workers(local.scheduler_address))
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
     assert contents(tmp_path / "set") == contents(whole)

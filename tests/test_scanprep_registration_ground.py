@@ -5,11 +5,11 @@ import pytest
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import target_of
-from scanprep.registration.ground import find_floor, foot_of_vertex, grounded, soles_row, with_soles
+from scanprep.registration.ground import find_floor, foot_of_vertex, put_on_floor, soles_row, with_soles
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import BodyShape, Person, named_pose
+from scanprep.synthetic.people import BodyShape, Person, find_pose
 
 UP = np.array([0, 0, 1.0])
 R, T = rotations.exp(np.array([0.9, -0.4, 1.3])), np.array([0.5, -2.0, 0.7])
@@ -84,7 +84,7 @@ def other(person):
 
 def on(scan, reference, body, foot):
     target = target_of(scan)
-    return grounded(reference, body, foot, target.points, target.normals)
+    return put_on_floor(reference, body, foot, target.points, target.normals)
 
 
 def test_the_feet_are_the_last_parts_of_the_legs(person, foot):
@@ -136,7 +136,7 @@ def views(person):
     yield "ankles", whole, cut(whole, 0.1)
     yield "front", whole, cut(whole.submesh(whole.face_normals[:, 1] < 0)[0], 0.004)
     yield "no feet", whole, whole.submesh((x[whole.faces, 2] > 0.9).all(axis=1))[0]
-    jump = whole.with_vertices(person.posed(named_pose("kick_left")))
+    jump = whole.with_vertices(person.posed(find_pose("kick_left")))
     yield "kick", jump, jump.submesh(jump.face_normals[:, 2] > -0.9)[0]
     head = x[:, 2].max() - 0.01
     yield "crown", whole, whole.submesh((x[whole.faces, 2] < head).all(axis=1))[0]

@@ -12,7 +12,7 @@ from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import NAMED_POSES, PARTS, named_pose
+from scanprep.synthetic.people import NAMED_POSES, PARTS, find_pose
 
 rng = np.random.default_rng(4)
 
@@ -51,7 +51,7 @@ def test_angles_are_those_that_a_joint_was_given(person):
 
 @pytest.mark.parametrize("name", NAMED_POSES[::7])
 def test_what_people_do_is_not_doubted(person, parts, name):
-    turned = person.posed(named_pose(name)) @ rotations.exp(np.array([0.3, -2.0, 0.5])).T
+    turned = person.posed(find_pose(name)) @ rotations.exp(np.array([0.3, -2.0, 0.5])).T
     assert not words(person, parts, turned)
 
 

@@ -10,16 +10,16 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration import person as person_module
 from scanprep.registration.deformation_graph import build_graph, deform, motion_of
 from scanprep.registration.graph_fit import start_fit
-from scanprep.registration.limbs import beyond_people, exchanged_sides, frames, joint_angles, limb_doubts
+from scanprep.registration.limbs import beyond_people, find_exchanged_sides, frames, joint_angles, limb_doubts
 from scanprep.registration.matches import prepare
 from scanprep.registration.nonrigid import Registration, measure_fit
 from scanprep.registration.person import PersonParts, average_person, person_parts
-from scanprep.registration.repair import better, repaired, rolled
+from scanprep.registration.repair import better, repair_limbs, roll_parts
 from scanprep.registration.rolls import CHANGE, LIMBS, STEPS, best_rolls, other_rolls, step
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import MIRROR_PART
-from scanprep.synthetic.people import PARENTS, PARTS, named_pose
+from scanprep.synthetic.people import PARENTS, PARTS, find_pose
 
 FOREARM, SHIN, HEAD = (PARTS.index(name) for name in ("forearm_left", "shin_right", "head"))
 QUICK = RegistrationConfig((GraphStage(300, 0.09, 0.7, 0.01, 0.08, 0.0, rounds=3),
@@ -77,7 +77,7 @@ def test_rolls_are_the_best_of_all():
 @pytest.mark.parametrize("part, angle", [*product((FOREARM, SHIN, HEAD), (150, -120))])
 def test_a_rolled_limb_is_asked_to_roll_back(person, parts, part, angle):
     """What hangs on it came along, and needs to roll back as well; all bones lie where they should."""
-    R = person.part_rotations(named_pose("run"))
+    R = person.part_rotations(find_pose("run"))
     below = person.skeleton.descends[:, part]
     for p in np.flatnonzero(below):
         R[p] = R[p] @ rotations.exp(np.radians(angle) * frames()[p, 0])
@@ -90,10 +90,10 @@ def test_a_rolled_limb_is_asked_to_roll_back(person, parts, part, angle):
 
 
 def test_where_no_joint_tells_a_doubted_limb_is_turned_by_quarters(person, parts):
-    tries = other_rolls(parts, person.part_rotations(named_pose("run")), [HEAD], 9)
+    tries = other_rolls(parts, person.part_rotations(find_pose("run")), [HEAD], 9)
     assert sorted(step(rolls[HEAD]) for rolls in tries) == [STEPS // 4, STEPS // 2, 3 * STEPS // 4]
-    assert len(other_rolls(parts, person.part_rotations(named_pose("run")), [HEAD], 2)) == 2
-    assert other_rolls(parts, person.part_rotations(named_pose("run")), [], 9) == []
+    assert len(other_rolls(parts, person.part_rotations(find_pose("run")), [HEAD], 2)) == 2
+    assert other_rolls(parts, person.part_rotations(find_pose("run")), [], 9) == []
 
 
 def test_a_motion_is_found_from_where_it_took_the_template(person):
@@ -110,12 +110,12 @@ def test_a_motion_is_found_from_where_it_took_the_template(person):
 
 def test_a_limb_rolls_about_its_bone_and_nothing_else_moves(person, parts):
     graph = build_graph(person.mesh, 300)
-    body = person.posed(named_pose("run"))
+    body = person.posed(find_pose("run"))
     start, angles = motion_of(graph, body), np.zeros(len(PARTS))
-    np.testing.assert_allclose(rolled(graph, start, person.mesh, parts, body, angles).positions, start.positions,
+    np.testing.assert_allclose(roll_parts(graph, start, person.mesh, parts, body, angles).positions, start.positions,
                                atol=1e-12)
     angles[FOREARM] = 1.2
-    after = rolled(graph, start, person.mesh, parts, body, angles)
+    after = roll_parts(graph, start, person.mesh, parts, body, angles)
     part = person.part_of_vertex[graph.node_vertices]
     near = np.isin(part, [FOREARM, PARENTS[FOREARM], *np.flatnonzero(np.array(PARENTS) == FOREARM)])
     np.testing.assert_allclose(after.positions[~near], start.positions[~near], atol=1e-12)
@@ -130,11 +130,11 @@ def test_a_limb_rolls_about_its_bone_and_nothing_else_moves(person, parts):
 
 @pytest.mark.parametrize("part, angle", [(FOREARM, np.pi), (SHIN, 2.5)])
 def test_a_limb_rolled_in_a_registration_is_put_right(person, parts, part, angle):
-    body = person.posed(named_pose("run"))
+    body = person.posed(find_pose("run"))
     scan = person.mesh.with_vertices(body)
     before = registration(person, scan, with_rolled_skin(person, body, part, angle))
     told = []
-    after = repaired(person.mesh, scan, before, parts, config=QUICK, progress=lambda *given: told.append(given))
+    after = repair_limbs(person.mesh, scan, before, parts, config=QUICK, progress=lambda *given: told.append(given))
     mine = person.part_of_vertex == part
     off = [np.linalg.norm(fit.mesh.vertices - body, axis=1)[mine].mean() for fit in (before, after)]
     assert off[0] > 0.05 and off[1] < 0.3 * off[0], off
@@ -143,26 +143,26 @@ def test_a_limb_rolled_in_a_registration_is_put_right(person, parts, part, angle
 
 
 def test_shins_rolled_on_both_sides_mean_that_left_and_right_are_exchanged(person, parts):
-    body = person.posed(named_pose("run"))
+    body = person.posed(find_pose("run"))
     one = with_rolled_skin(person, body, SHIN, 2.3)
     both = with_rolled_skin(person, one, MIRROR_PART[SHIN], -2.3)
-    assert exchanged_sides(person.mesh, parts, body) is exchanged_sides(person.mesh, parts, one) is None
-    assert "the left shin by" in (told := exchanged_sides(person.mesh, parts, both)) and "exchanged" in told
+    assert find_exchanged_sides(person.mesh, parts, body) is find_exchanged_sides(person.mesh, parts, one) is None
+    assert "the left shin by" in (told := find_exchanged_sides(person.mesh, parts, both)) and "exchanged" in told
 
 
 def test_what_needs_no_repair_stays(person, parts):
-    body = person.posed(named_pose("run"))
+    body = person.posed(find_pose("run"))
     scan = person.mesh.with_vertices(body)
     right, wrong = (registration(person, scan, x) for x in (body, with_rolled_skin(person, body, FOREARM, np.pi)))
-    assert repaired(person.mesh, scan, right, parts, config=QUICK) is right
-    assert repaired(person.mesh, scan, wrong, None, config=QUICK) is wrong                  # an animal, say
-    assert repaired(person.mesh, scan, wrong, parts, config=replace(QUICK, rolls=0)) is wrong
+    assert repair_limbs(person.mesh, scan, right, parts, config=QUICK) is right
+    assert repair_limbs(person.mesh, scan, wrong, None, config=QUICK) is wrong                  # an animal, say
+    assert repair_limbs(person.mesh, scan, wrong, parts, config=replace(QUICK, rolls=0)) is wrong
     assert not RegistrationConfig.published().rolls and RegistrationConfig().rolls
 
 
 def test_fewer_doubts_are_not_bought(person, parts):
     """Not with the scan, the landmarks or the shape of the body."""
-    body = person.posed(named_pose("run"))
+    body = person.posed(find_pose("run"))
     scan = person.mesh.with_vertices(body)
     right, wrong = (registration(person, scan, x) for x in (body, with_rolled_skin(person, body, FOREARM, np.pi)))
     marked = [replace(fit, landmark_rms=0.002) for fit in (right, wrong)]

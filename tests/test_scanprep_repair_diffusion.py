@@ -6,7 +6,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import SeenSpace, Surface
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
-from scanprep.repair.volumetric_diffusion import diffuse_surface, signed_distance
+from scanprep.repair.volumetric_diffusion import diffuse_surface, measure_signed_distance
 
 
 def pierced(mesh, centre, radius):
@@ -24,7 +24,7 @@ def dented():
 def test_signed_distances_of_a_ball_and_where_they_end():
     holed = pierced(ball(5), [0, 0, 0.1], 0.05)
     points = np.random.default_rng(0).uniform(-0.13, 0.13, size=(500, 3))
-    distance, sure = signed_distance(holed, points)
+    distance, sure = measure_signed_distance(holed, points)
     assert np.abs(distance - (np.linalg.norm(points, axis=1) - 0.1))[sure].max() < 0.001
     above = points[:, 2] > 0.98 * np.linalg.norm(points, axis=1)
     assert not sure[above & (np.linalg.norm(points, axis=1) > 0.05)].any()
@@ -75,7 +75,7 @@ def test_what_was_seen_to_be_empty_is_outside():
     inside = np.array([[0, 0, 0.08], [0.01, 0, 0.085], [0, -0.01, 0.09]])
     for seen, sign in ((None, -1), (Pit(), 1)):
         found = diffuse_surface(holed, holed.boundary_vertices, seen)
-        assert (np.sign(signed_distance(found, inside)[0]) == sign).all()
+        assert (np.sign(measure_signed_distance(found, inside)[0]) == sign).all()
 
 
 def test_seen_space_stays_empty():

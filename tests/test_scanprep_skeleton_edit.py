@@ -16,7 +16,7 @@ from scanprep.skeleton.edit import (
 )
 from scanprep.skeleton.labels import pieces
 from scanprep.synthetic.people import Person
-from scanprep.synthetic.poses import named_pose
+from scanprep.synthetic.poses import find_pose
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def person():
 
 @pytest.fixture(scope="module")
 def poses(person):
-    return np.stack([person.posed(named_pose(name)) for name in ("sitting", "twist_left", "bow", "run", "boxer")])
+    return np.stack([person.posed(find_pose(name)) for name in ("sitting", "twist_left", "bow", "run", "boxer")])
 
 
 def faces(skeleton, name):

@@ -15,7 +15,7 @@ from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.sides import Sides, cover, mirror_pairs
 from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirror_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
-from scanprep.synthetic.people import Person, mirrored_pose
+from scanprep.synthetic.people import Person, mirror_pose
 
 CONFIG = SkeletonConfig(restarts=1, patches=120, start=20)
 
@@ -76,7 +76,7 @@ def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
     poses = np.stack([body.mesh.vertices, body.posed(bent)])
     template = body.mesh.with_vertices(poses[1]) if crooked else body.mesh
     found = mirror_poses(template, poses, find_symmetry(template, poses))
-    wanted = np.stack([body.mesh.vertices, body.posed(mirrored_pose(bent))])
+    wanted = np.stack([body.mesh.vertices, body.posed(mirror_pose(bent))])
     for one, other in zip(found, wanted, strict=True):
         R, t = rotations.procrustes(one, other)
         assert np.linalg.norm(one @ R.T + t - other, axis=1).max() < 0.01

@@ -133,13 +133,13 @@ def test_left_and_right_are_mirror_images(bodies):
 
 def test_mirrored_pose_gives_the_mirrored_body(man):
     twin = topology.load().mirror
-    pose = people.named_pose("throw_right")
-    assert np.abs(man.posed(people.mirrored_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 1e-9
+    pose = people.find_pose("throw_right")
+    assert np.abs(man.posed(people.mirror_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 1e-9
 
 
 def test_joints_lie_inside_the_body(bodies):
     for person in bodies:
-        pose = people.named_pose("run")
+        pose = people.find_pose("run")
         for mesh, joints in ((person.mesh, person.joints),
                              (person.mesh.with_vertices(person.posed(pose)), person.posed_joints(pose))):
             inside = igl.fast_winding_number(mesh.vertices, mesh.faces, np.ascontiguousarray(joints))
@@ -193,7 +193,7 @@ def test_pose_zero_is_rest(bodies):
 
 
 def test_turning_the_root_turns_the_body(man):
-    pose = people.named_pose("boxer")
+    pose = people.find_pose("boxer")
     turned = pose.copy()
     R = rotations.exp(np.array([0.4, -0.9, 1.3]))
     turned[0] = rotations.log(R @ rotations.exp(pose[0]))
@@ -205,14 +205,14 @@ def test_turning_the_root_turns_the_body(man):
 
 def test_root_part_stays_centred(man):
     for name in ("squat", "run"):
-        v = man.posed(people.named_pose(name))
+        v = man.posed(people.find_pose(name))
         assert np.abs(v[man.part_of_vertex == 0].mean(axis=0) - man.joints[0]).max() < 1e-9
 
 
 def test_parts_follow_their_rotations(man):
     """Away from the joints every part turns as the pose says."""
     for name in ("run", "point_right", "kick_left"):
-        pose = people.named_pose(name)
+        pose = people.find_pose(name)
         R = man.part_rotations(pose)
         fitted = man.skeleton.fit_rotations(man.mesh, man.posed(pose))
         angle = np.degrees(np.linalg.norm(rotations.log(np.swapaxes(R, 1, 2) @ fitted), axis=1))
@@ -221,7 +221,7 @@ def test_parts_follow_their_rotations(man):
 
 def test_posing_is_not_linear_blend_skinning(man):
     """What the best linear blend of the parts' rigid motions leaves over, vertex by vertex."""
-    poses = [people.named_pose(name) for name in NAMED_POSES]
+    poses = [people.find_pose(name) for name in NAMED_POSES]
     posed = np.stack([man.posed(pose) for pose in poses])
     affine = np.empty((len(poses), 16, 3, 4))
     for k, pose in enumerate(poses):
@@ -253,14 +253,14 @@ def test_muscles_bulge_with_strength():
 
 
 def test_raised_arms_raise_the_shoulders(man):
-    rest, up = man.posed_joints(np.zeros((16, 3))), man.posed_joints(people.named_pose("arms_up"))
+    rest, up = man.posed_joints(np.zeros((16, 3))), man.posed_joints(people.find_pose("arms_up"))
     assert 0.03 < up[4, 2] - rest[4, 2] < 0.10
     assert up[4, 2] == pytest.approx(up[7, 2], abs=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMED_POSES)
 def test_named_poses_keep_the_volume_and_do_not_collapse(man, name):
-    mesh = man.mesh.with_vertices(man.posed(people.named_pose(name)))
+    mesh = man.mesh.with_vertices(man.posed(people.find_pose(name)))
     assert abs(mesh.volume / man.mesh.volume - 1) < 0.09
     stretch = mesh.edge_lengths / man.mesh.edge_lengths
     assert np.percentile(stretch, 0.5) > 0.25 and np.percentile(stretch, 99.9) < 3.0
@@ -276,7 +276,7 @@ def inside(mesh: Mesh) -> np.ndarray:
 def test_poses_are_many_and_unknown_ones_refused():
     assert len(NAMED_POSES) >= 24
     with pytest.raises(ValueError, match="no pose 'cartwheel'"):
-        people.named_pose("cartwheel")
+        people.find_pose("cartwheel")
     with pytest.raises(ValueError, match="pose: expected finite"):
         Person().posed(np.zeros((15, 3)))
 

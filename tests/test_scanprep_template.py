@@ -16,7 +16,7 @@ from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.surfaces.cloud import mesh_of_cloud, mesh_of_view, spacing_of
-from scanprep.surfaces.template import carry_landmarks, left_share, template_of_scan, views_without_cameras
+from scanprep.surfaces.template import carry_landmarks, share_on_left, template_of_scan, views_without_cameras
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.people import Person
 
@@ -74,7 +74,7 @@ def test_the_best_scan_becomes_a_template_in_one_command(place, body, tmp_path, 
     assert len(made.vertices) - len(made.edges) + len(made.faces) == 2                  # a sphere: no handles
     there, back = off(made, body)
     assert there.mean() < 0.0015 and there.max() < 0.02 and np.percentile(back, 97) < 0.008
-    assert abs(left_share(made) - 0.5) < 0.03
+    assert abs(share_on_left(made) - 0.5) < 0.03
     marks = read_landmark_vertices(tmp_path / "template.landmarks.json", made)
     assert list(marks) == list(TEN)
     for name, vertex in marks.items():

@@ -74,11 +74,11 @@ def test_the_number_of_the_user_wins(monkeypatch, name):
         assert pools() == {2}
     assert search_threads(10**6) == 2
     monkeypatch.setenv(name, "3,1")
-    assert threads.asked() == 3
+    assert threads.threads_asked() == 3
     monkeypatch.setenv(name, "many")
-    assert threads.asked() == 1
+    assert threads.threads_asked() == 1
     monkeypatch.setenv(name, "")
-    assert threads.asked() is None
+    assert threads.threads_asked() is None
 
 
 def test_a_search_takes_the_cores_for_many_points_only(monkeypatch):

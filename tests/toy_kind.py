@@ -8,7 +8,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.features import linear_features
-from model.linear import picked
+from model.linear import combination_weights
 from model.products import ShapedProducts, Terms
 from model.resolution.transfer import Follower
 from scanprep.geometry import storage
@@ -41,7 +41,7 @@ class ToyModel(BodyModel):
         own, *longer = (self._carried(x * scale) for scale in (np.ones(3), *0.05 * np.eye(3)))
         whole = ShapedProducts(Terms(self.features, np.arange(J), self.features.starts), own, own, np.array(longer),
                                self.skeleton.joints[0])
-        return whole.first(n_betas).combined(picked(len(x), vertex_ids, weights))
+        return whole.first(n_betas).combined(combination_weights(len(x), vertex_ids, weights))
 
     def _carried(self, x):
         """(J, 3, N) what each part carries of vertices (N, 3), about joints that follow them, the root's in place."""

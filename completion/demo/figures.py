@@ -15,7 +15,7 @@ from scanprep.pipeline.page import judge_set, judge_whole
 
 from ..mocap.pose.judgement import motion_doubts
 from .chain import Demo
-from .truth import adjusted_rand, distance, joint_errors, mean_over_area, surface_error
+from .truth import distance, joint_errors, mean_over_area, rand_index, surface_error
 
 NAMED = ("head", "hand_left", "hand_right", "foot_left", "foot_right")     # without which motions cannot be exported
 # Half as much again as seed 0 gives: mean errors of a vertex, millimetres
@@ -50,7 +50,7 @@ def figures(demo: Demo) -> list[Metric]:
     slid = [mean_over_area(off, template) for _, off in demo.off.values()]
     worst = max(means, key=means.__getitem__)
     skeleton = demo.model.skeleton
-    agreement = adjusted_rand(skeleton.part_of_face, at.part_of_face, template.face_areas)
+    agreement = rand_index(skeleton.part_of_face, at.part_of_face, template.face_areas)
     return [*rows, Metric(f"registration: {len(means)} scans, mean distance to the true surface",
                           MM * float(np.mean(list(means.values()))), "mm"),
             Metric(f"registration: the same, worst scan ({worst})", MM * means[worst], "mm"),

@@ -18,10 +18,10 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import CLAY, Heat, Solid, part_colors
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.thinning import thinned
+from scanprep.pictures.thinning import thin_solid
 
 from ..mocap.files.motion_files import write_glb
-from ..motion_pictures import chart_residuals, dotted_pane
+from ..motion_pictures import chart_residuals, pane_with_dots
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
 from .chain import Demo
 from .truth import distance, mean_over_area, surface_error
@@ -67,7 +67,7 @@ def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Ca
 
 def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str, turn: float = 25.0) -> Pane:
     solid = shape if isinstance(shape, Solid) else Solid(shape)
-    return Pane([thinned(solid, SMALL)], look_around(demo.template, fits, (turn,))[0], label)
+    return Pane([thin_solid(solid, SMALL)], look_around(demo.template, fits, (turn,))[0], label)
 
 
 def _in_rows(page: Page, panes: Sequence[Pane], caption: str) -> None:
@@ -166,7 +166,7 @@ def _animation(demo: Demo, page: Page, to: Path) -> None:
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
                  "that follows them.")
     write_glb(to / "animation" / "walk.glb", motion, subject)
-    page.bodies([dotted_pane(motion, subject, sequence.positions, "measured markers", sequence.labels)],
+    page.bodies([pane_with_dots(motion, subject, sequence.positions, "measured markers", sequence.labels)],
                 "the walk with the measured markers", 480)
     page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.text("animation/walk.glb, beside this page, plays in any viewer of glTF.")

@@ -47,7 +47,7 @@ def mean_over_area(values: np.ndarray, mesh: Mesh, where: np.ndarray | None = No
     return float(values @ weights / weights.sum())
 
 
-def adjusted_rand(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> float:
+def rand_index(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> float:
     """Agreement of two labellings (n,) with weights (n,): 1 the same partition, 0 as by chance."""
     table = np.zeros((one.max() + 1, other.max() + 1))
     np.add.at(table, (one, other), weights / weights.sum())

@@ -17,7 +17,7 @@ from scanprep.cli import Unit
 from scanprep.console import bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, name_of, read_mesh
-from scanprep.geometry.landmark_names import known_landmarks
+from scanprep.geometry.landmark_names import translate_landmarks
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import beyond_people
@@ -25,7 +25,7 @@ from scanprep.registration.person import find_landmarks
 from scanprep.words import number_of
 
 from ..partial.completion import load_completion
-from ..viewing.kinds import reported_model
+from ..viewing.kinds import model_of_report
 
 COMPLETED, PERSON, MOTION = "completion.npz", "subject.json", "motion.npz"      # files that tell what a folder is
 
@@ -70,7 +70,7 @@ def model_of(paths: Sequence[Path]) -> Path | None:
     for path in paths:
         folders = [path, *(p.parent for p in sorted(path.glob("*/report.json")))] if path.is_dir() else [path.parent]
         for folder in folders:
-            name = reported_model(folder / "report.json")
+            name = model_of_report(folder / "report.json")
             if name is not None:
                 return name
     return None
@@ -147,7 +147,7 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
         known = landmarks()
 
     # those that tapes begin at besides
-    lacking = [name for name in MEASURED if name not in known_landmarks(known)]
+    lacking = [name for name in MEASURED if name not in translate_landmarks(known)]
     if not lacking:
         return template, known
     with bar("looking for the other landmarks") as progress:

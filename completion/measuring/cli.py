@@ -14,7 +14,7 @@ from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, measure, stands
 from model.measurement.survey import ordinal, percentiles
 from model.measurement.tapes import Tapes
-from model.measurement.wanted import WantedBody, body_with_measurements, checked_wanted
+from model.measurement.wanted import WantedBody, body_with_measurements, check_wanted
 from model.people import stature_and_volume
 from model.posing.transfer import own_body
 from model.shape_statistics import WORDS, Sex, shape_statistics
@@ -69,7 +69,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     if to:
         if bodies:
             raise UsageError("--to makes a body from measurements: expected no BODY with it")
-        return _wanted(to, output, *read_model(model), landmarks, sex)
+        return _make_body(to, output, *read_model(model), landmarks, sex)
     if not bodies:
         raise ValueError("BODY: expected at least one body to measure, or --to with measurements of one to make")
     if output.suffix.lower() != ".csv":
@@ -85,7 +85,7 @@ def measure_bodies(bodies: BodiesArg = (), *, output: Output, model: ModelOrNone
     write_measures(output, names, found, sex)
     measures_page(names, stood, found, tapes, sex).write(output.with_suffix(".html"))
     return Outcome(output, _figures(names, found, sex), {"model": None if named is None else str(named)},
-                   judgement=judged(names, found, [tapes.template.with_vertices(body) for body in stood]))
+                   judgement=judge_bodies(names, found, [tapes.template.with_vertices(body) for body in stood]))
 
 
 def _measure(bodies: Sequence[Body], model: BodyModel | None, tapes: Tapes
@@ -124,7 +124,7 @@ def write_measures(path: Path, names: Sequence[str], found: Sequence[Measurement
                        "note"], map(line, names, found))
 
 
-def judged(names: Sequence[str], found: Sequence[Measurements], bodies: Sequence[Mesh]) -> Judgement:
+def judge_bodies(names: Sequence[str], found: Sequence[Measurements], bodies: Sequence[Mesh]) -> Judgement:
     """Whether bodies were measured as people are: in the standard pose, completely, and in the right unit."""
     absurd, doubts = list[str](), list[str]()
     for name, mine, body in zip(names, found, bodies, strict=True):
@@ -179,10 +179,10 @@ def _row(name: str, value: float, sex: Sex | None, more: str = "", detail: bool 
     return Metric(name.replace("_", " ") + more, round(factor * value, 1), unit + compared, detail)
 
 
-def _wanted(to: Sequence[str], output: Path, model: BodyModel, name: str, landmarks: Path | None, sex: Sex | None
-            ) -> Outcome:
+def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, landmarks: Path | None, sex: Sex | None
+               ) -> Outcome:
     """The most probable body with some measurements: its mesh, betas and page."""
-    wanted = checked_wanted(read_measurements(to))
+    wanted = check_wanted(read_measurements(to))
     shape_statistics(model, sex)                                       # a sex that it does not know is told at once
     tapes = find_tapes(*landmarks_of(landmarks, [], model))
     made = body_with_measurements(model, tapes, wanted, sex)

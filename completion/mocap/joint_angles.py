@@ -13,7 +13,7 @@ import numpy as np
 
 from model.linear import Subject
 from scanprep.geometry import rotations
-from scanprep.skeleton.roles import above, numbered_roles
+from scanprep.skeleton.roles import above, find_numbered_roles
 
 from ..motion import Motion
 
@@ -97,7 +97,7 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
     ValueError
         Parts that have not the names of a person's.
     """
-    roles = numbered_roles(names, joints)
+    roles = find_numbered_roles(names, joints)
     pair = next((p for p in (("l_hip", "r_hip"), ("l_shoulder", "r_shoulder")) if {*p} <= roles.keys()), None)
     low = [roles[r] for r in ("l_ankle", "r_ankle", "l_hip", "r_hip") if r in roles]
     high = [roles[r] for r in ("l_shoulder", "r_shoulder", "skullbase") if r in roles]

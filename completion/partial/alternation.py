@@ -95,7 +95,7 @@ class Alternation:
         [SCAPE] Eq. 11
         """
         e = self.posed(now.R) @ np.swapaxes(now.R[self.part] @ self.shape(now.betas), -1, -2)
-        t = damped_twists(self.skeleton, self.part, e, edges(now.Y, self.model.template.faces), w_T)
+        t = solve_twists(self.skeleton, self.part, e, edges(now.Y, self.model.template.faces), w_T)
         return Blocks(rotations.exp(t) @ now.R, now.Y, now.betas)
 
     def stretched(self, now: Blocks, markers: Markers) -> Blocks:
@@ -134,7 +134,7 @@ class Alternation:
                      + (markers.weights * (off**2).sum(axis=1)).sum())
 
 
-def damped_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.ndarray, w_T: float) -> np.ndarray:
+def solve_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.ndarray, w_T: float) -> np.ndarray:
     """Twists (J, 3) that turn the edges e of every part onto v, neighbours alike.
 
     Minimises Σ |(I + t̂) e - v|² + w_T Σ_adj |t_a - t_b|².

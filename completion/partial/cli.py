@@ -10,7 +10,7 @@ from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, say
-from scanprep.folders import do_one, kept_results
+from scanprep.folders import do_one, load_results
 from scanprep.geometry.landmarks import landmarks_beside
 from scanprep.judgement import judge_many
 from scanprep.pipeline.scans import find_scans
@@ -95,7 +95,7 @@ def _mend(call: FolderCall, space: Workspace) -> Outcome:
 
     app = CompletionsApp(call, space.folder)
     serve(app)
-    results = kept_results(space, list(app.tasks))
+    results = load_results(space, list(app.tasks))
     saved = Metric("bodies saved", len(app.fresh))
     if not results.values and not results.failures:
         return Outcome(None, [saved], judgement=None)

@@ -116,7 +116,8 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
         No view has colours.
     """
     config = config or ColorConfig()
-    colors, weight = blend(colored_views(scan, viewpoint, metres, textures), body.vertices, body.vertex_normals, config)
+    colors, weight = blend(views_with_colors(scan, viewpoint, metres, textures), body.vertices, body.vertex_normals,
+                           config)
     near = body.vertex_adjacency
     closed = seen | (near @ seen.astype(float) > 0.5 * near.sum(axis=1))     # single gaps amid what was seen
     known = closed & (weight > 0)
@@ -124,8 +125,8 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
     return np.clip(sparse.harmonic(near, out, known), 0, 1) if config.fill and known.any() else out
 
 
-def colored_views(scan: View | Sequence[View], viewpoint: object = None, metres: float = 1.0,
-                  textures: Sequence[Texture | None] = ()) -> list[ColoredView]:
+def views_with_colors(scan: View | Sequence[View], viewpoint: object = None, metres: float = 1.0,
+                      textures: Sequence[Texture | None] = ()) -> list[ColoredView]:
     """The views that have colours, or a texture."""
     views = [in_metres(view, metres) for view in as_views(scan)]
     cameras = check_viewpoints(viewpoint, len(views), metres)

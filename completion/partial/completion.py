@@ -24,12 +24,12 @@ from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
-from scanprep.registration.ground import foot_of_vertex, grounded
+from scanprep.registration.ground import foot_of_vertex, put_on_floor
 from scanprep.skeleton.roles import in_words, joint_in_words
 from scanprep.threads import one_thread
 
 from .alternation import turns_of
-from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
+from .confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from .free_surface import distance_to, free_surface
 from .inputs import in_metres
 from .scale import ScaledBody
@@ -172,11 +172,11 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     cloud = fit.without_ignored(given.cloud, predicted)
     completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
     foot = foot_of_vertex(predicted, person.skeleton)
-    standing = grounded(predicted, completed, foot, cloud.points, cloud.normals)
+    standing = put_on_floor(predicted, completed, foot, cloud.points, cloud.normals)
     completed = completed if standing is None else completed.with_vertices(standing.vertices)
     if cloud.person is not None:                # what it shows is clothes, and noisier than the model is inexact
         completed, rms = predicted, distance_to(predicted, cloud.points[used])
-    error = expected_error(open_error, distance_to_seen(predicted, seen), rms, person.left_out_error)
+    error = estimate_error(open_error, distance_to_seen(predicted, seen), rms, person.left_out_error)
     tell(total, total)
     pose, trans, betas = person.split(x)
     shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
@@ -186,8 +186,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
     problems = [problem for problem in (completion_problem(done, given.cloud.points, config.free_scale),
-                                        contorted(fit, solved.x, float(seen.mean()), len(off) > 0)) if problem]
-    found = doubts(fit, solved.x, error, seen) + left_over(fit, done.explained) + ambiguous(fit, solved.x, rival)
+                                        find_contortion(fit, solved.x, float(seen.mean()), len(off) > 0)) if problem]
+    found = doubts(fit, solved.x, error, seen) + find_unexplained(fit, done.explained) + ambiguous(fit, solved.x, rival)
     found += beyond_closed(scan, completed) if isinstance(scan, Mesh) and not config.free_scale else []
     judgement = Judgement.of(problems, found)
     if isinstance(body, BodyModel):
@@ -195,7 +195,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     return replace(done, judgement=judgement)
 
 
-def contorted(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> str | None:
+def find_contortion(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> str | None:
     """Why the pose of unknowns (P,) is none that a body takes; None where it may be.
 
     `seen` is the share of the body with data, `marked` whether there were landmarks.
@@ -213,7 +213,7 @@ def contorted(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> str | N
 def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
     """Why the body of unknowns (P,) is to be looked at before it is used: what is not known of it, and what is wrong.
 
-    `error` (N,), metres, as `expected_error`; `seen` (N,) bool, the vertices with data. What is beyond the border of a
+    `error` (N,), metres, as `estimate_error`; `seen` (N,) bool, the vertices with data. What is beyond the border of a
     picture is a guess, and no reason to doubt what is within.
     """
     names, found, shown = fit.body.skeleton.names, [], ~fit.beyond(x)
@@ -229,11 +229,11 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
               "to be held" for j in np.argsort(-strange) if strange[j] > STRANGE]
     if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE:
         found.append(f"the model was {1000 * left_out:.0f} mm off in poses that it was not learned from: it needs more")
-    return found + strayed(fit, x)
+    return found + find_stray(fit, x)
 
 
-def left_over(fit: ScanFit, explained: float) -> list[str]:
-    """What of a scan no body is near, where that is a limb's worth; of a picture `strayed` tells."""
+def find_unexplained(fit: ScanFit, explained: float) -> list[str]:
+    """What of a scan no body is near, where that is a limb's worth; of a picture `find_stray` tells."""
     if fit.cloud.person is not None or 1 - explained <= LEFT_OVER:
         return []
     cause = "a second person, or clutter?" if explained < CROWDED else "clutter, or a limb elsewhere"
@@ -262,7 +262,7 @@ def ambiguous(fit: ScanFit, x: np.ndarray, rival: np.ndarray | None) -> list[str
         if apart > DOUBTFUL else []
 
 
-def strayed(fit: ScanFit, x: np.ndarray) -> list[str]:
+def find_stray(fit: ScanFit, x: np.ndarray) -> list[str]:
     """What of the body of unknowns (P,) a camera speaks against, and what of a picture's person no part is near."""
     if fit.cloud.person is None:
         return []

@@ -40,7 +40,7 @@ def distance_to_seen(mesh: Mesh, seen: np.ndarray) -> np.ndarray:
     return SurfaceGraph(mesh).nearest(np.flatnonzero(seen))[0]
 
 
-def expected_error(posterior: np.ndarray, away: np.ndarray, rms: float, left_out: float | None = None) -> np.ndarray:
+def estimate_error(posterior: np.ndarray, away: np.ndarray, rms: float, left_out: float | None = None) -> np.ndarray:
     """Root mean square distance (N,), metres, of vertices from the truth.
 
     Where the scan was, that is the distance to the true surface, and as large as the scan's own from the completed

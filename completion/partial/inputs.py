@@ -7,7 +7,7 @@ import numpy as np
 
 from model.fitting.bodies import FixedBody
 from model.fitting.scan import Scan, ScanPoints, all_points, check_mask, prepare_picture, prepare_scan
-from scanprep.correspondence.correspondences import checked_pairs
+from scanprep.correspondence.correspondences import check_pairs
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
@@ -64,7 +64,7 @@ def _of_picture(body: FixedBody, picture: DepthPicture, landmarks: tuple[np.ndar
 
 def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Landmark vertices (L,) and points (L, 3) as arrays."""
-    vertices, points = checked_pairs(template, *landmarks, "landmarks")
+    vertices, points = check_pairs(template, *landmarks, "landmarks")
     extent, whole = (float(np.ptp(p, axis=0).max()) for p in (points, template.vertices))
     if not whole / 100 < extent < 5 * whole:
         raise ValueError(f"landmarks: they extend over {extent:.3g} m, the template over {whole:.3g} m; "

@@ -32,7 +32,7 @@ from .clicked_landmarks import doubts, far_apart_first, helpful, on_scan, pairs_
 from .completion import Completion, complete
 from .report import completion_panes
 from .work import Inputs, ScanFiles, Work, figures, person_in, read_masks, read_picture, read_views, write_results
-from .worn import labels_of, worn_markers, write_worn
+from .worn import extra_markers, labels_of, write_worn
 
 ENDING = ".landmarks.json"           # of landmark files
 COMPLETED = "completed.ply"
@@ -138,7 +138,7 @@ class CompleteApp(PickApp):
     def more(self) -> dict[str, Any]:
         """What the completion says of itself, and what would help it."""
         made = self.made.get(self.scan.path) if self.scan else None
-        markers = worn_markers(self.scan.places, self.work.marks) if self.scan else {}
+        markers = extra_markers(self.scan.places, self.work.marks) if self.scan else {}
         out: dict[str, Any] = {"known": self.known, "can_choose": self.can_choose, "completed": None,
                                "markers": len(markers), "fewest": FEWEST}
         if made is None or self.scan is None:
@@ -313,7 +313,7 @@ class CompleteApp(PickApp):
         """All files of a completion into a folder; the figures."""
         rows = write_results(replace(self.work, body=self._body(made.known)), self._inputs(scan), made.files,
                              made.completion, pairs_of(made.places, self.work.marks), made.masked, folder)
-        rows += write_worn(folder, made.completion, worn_markers(scan.places, self.work.marks))
+        rows += write_worn(folder, made.completion, extra_markers(scan.places, self.work.marks))
         rows += [Metric("completed", "in the browser"), Metric("shape", "known" if made.known else "found")]
         outcome = Outcome(folder, rows, {"complete": self.work.config}, judgement=made.completion.judgement)
         write_report(outcome, "scape complete --interactive", made.seconds)

@@ -42,16 +42,16 @@ def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> 
     path = Path(path)
     ending = path.suffix.lower()
     if ending == ".npy":
-        return _marked(path, storage.load_array(path), len(points))
+        return _read_marked(path, storage.load_array(path), len(points))
     if ending == ".json":
         found = storage.read_json(path, "booleans or numbers of points")
         if not isinstance(found, list):
             raise ValueError(f"{path}: expected a list of booleans or of numbers of points, "
                              f"found {type(found).__name__}")
-        return _marked(path, _plain(path, found, "element"), len(points))
+        return _read_marked(path, _plain(path, found, "element"), len(points))
     if ending == ".txt":
-        return _marked(path, _words(path), len(points))
-    return _painted(path, points, unit)
+        return _read_marked(path, _words(path), len(points))
+    return _find_painted(path, points, unit)
 
 
 def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
@@ -80,7 +80,7 @@ def _words(path: Path) -> np.ndarray:
     return _plain(path, values, "word")
 
 
-def _marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:
+def _read_marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:
     if values.ndim != 1:
         raise ValueError(f"{path}: expected one row of values, found an array of shape {values.shape}")
     if values.dtype == bool or (len(values) == count and len(values) > 2 and set(np.unique(values)) <= {0, 1}):
@@ -98,7 +98,7 @@ def _marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:
     return out
 
 
-def _painted(path: Path, points: np.ndarray, unit: str | None) -> np.ndarray:
+def _find_painted(path: Path, points: np.ndarray, unit: str | None) -> np.ndarray:
     """The points nearest to the coloured ones of a file."""
     cloud = read_points(path, unit)
     if cloud.colors is None:

@@ -13,7 +13,7 @@ from model.linear import Subject
 from scanprep.batch.opening import workspace
 from scanprep.batch.workspace import HOME, Workspace
 from scanprep.console import keep_report
-from scanprep.folders import judgement_on, kept_results
+from scanprep.folders import judgement_on, load_results
 from scanprep.judgement import Judgement
 from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.app import Send
@@ -50,7 +50,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
         self.call, self.tasks, self.fresh = call, call.tasks(), set[str]()
         self.told = call.description(output, self.plain.model)
         self._space = Workspace(output, output / HOME)                      # only looked at here
-        self.results = kept_results(self._space, list(self.tasks))
+        self.results = load_results(self._space, list(self.tasks))
         self._name_of = {task.given.scans[0]: name for name, task in self.tasks.items()}
         worst = self.told.worst_first(self.results, self.tasks)
         super().__init__(model, self.plain, [self.tasks[name].given.scans[0] for name in worst], output)
@@ -150,7 +150,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
                 (staged.folder / name).mkdir()
                 staged.value = self._write(scan, made, staged.folder / name)
             self.fresh.add(name)
-            self.results = kept_results(space, list(self.tasks))
+            self.results = load_results(space, list(self.tasks))
             keep_report(space, self.told.write(space, self.results, len(self.tasks)),
                         f"{self.plain.command} --interactive", made.seconds)
         self.saved[scan.path] = self.output / name

@@ -19,7 +19,7 @@ from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, common_unit, read_view
 from scanprep.geometry.format_common import UNITS
-from scanprep.geometry.landmarks import read_landmarks, shared_landmarks
+from scanprep.geometry.landmarks import read_landmarks, try_match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
@@ -27,12 +27,12 @@ from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
 from scanprep.registration.ground import soles_row
 
-from .colors import ColorConfig, blend, carry_colors, colored_views
+from .colors import ColorConfig, blend, carry_colors, views_with_colors
 from .completion import Completion, complete, save_completion
 from .masks import read_mask
 from .report import completion_page, completion_panes, picture_completion
 from .settings import CompletionConfig
-from .worn import worn_markers, write_worn
+from .worn import extra_markers, write_worn
 
 EXPECTED, EXPLAINED = "expected error of the body, mean", "share of the scan that lies on the body"
 MEASURED = "share of the body that was measured"
@@ -100,7 +100,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     files = read_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
     surface = files.mesh or (all_points(files.views) if files.views else None)
     named = read_landmarks(inputs.landmarks, surface, unit) if inputs.landmarks else {}
-    landmarks = shared_landmarks(inputs.landmarks, work.marks, named) if inputs.landmarks else None
+    landmarks = try_match_landmarks(inputs.landmarks, work.marks, named) if inputs.landmarks else None
     masked = read_masks(inputs.masks, files, unit) if depth is None else None
     if depth is not None:
         if inputs.masks:
@@ -110,7 +110,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
     return [*write_results(work, inputs, files, done, landmarks, masked, room.folder),
-            *write_worn(room.folder, done, worn_markers(named, work.marks))]
+            *write_worn(room.folder, done, extra_markers(named, work.marks))]
 
 
 def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion,
@@ -121,7 +121,7 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
     if files.colored:
         colors = carry_colors(mesh, done.seen, views, work.colors, viewpoint, done.scale, files.textures)
         if any(texture is not None for texture in files.textures):
-            known = colored_views(views, viewpoint, done.scale, files.textures)
+            known = views_with_colors(views, viewpoint, done.scale, files.textures)
             write_textured(output / "completed.glb", bake(
                 mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
         done = replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))

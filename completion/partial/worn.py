@@ -17,7 +17,7 @@ from .completion import Completion
 LAYOUT = "layout.json"
 
 
-def worn_markers(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> dict[str, np.ndarray]:
+def extra_markers(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> dict[str, np.ndarray]:
     """Of all that was clicked on a scan what is no landmark of the model."""
     return {name: place for name, place in places.items() if name not in marks}
 

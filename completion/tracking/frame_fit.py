@@ -90,8 +90,8 @@ class FrameFit:
         return self.refine(fit, reinitialise_limbs(few, best) if scratch else best)
 
 
-def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, betas: np.ndarray,
-                 config: TrackConfig) -> tuple[np.ndarray, np.ndarray]:
+def fit_shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, betas: np.ndarray,
+                     config: TrackConfig) -> tuple[np.ndarray, np.ndarray]:
     """Betas (K,) that explain frames together, and pose and trans (n, P) of each, from such near the truth."""
     # each with a body of its own, which keeps what it has worked out for the pose of its frame
     fits = [scan_fit(ShapedBody(body.model), cloud, *NOTHING, config.scan) for cloud in clouds]

@@ -52,7 +52,7 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
     read = [view for view in read if len(view.points) > max(NEIGHBOURS, neighbours)]
     if sum(len(view.points) for view in read) < 60:  # points below which a frame shows nothing
         return None
-    parts = [_oriented(view, count // len(read), neighbours, skin) for view in read]
+    parts = [_orient(view, count // len(read), neighbours, skin) for view in read]
     points, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     dense = np.concatenate([part[2] for part in parts])
     border, spacing = _borders(points, normals, dense, neighbours)
@@ -104,8 +104,8 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
     return 2 * near.sum() > len(seen) and float(agree.mean()) >= AGREE
 
 
-def _oriented(view: _Points, count: int, neighbours: int, skin: _Skin | None
-              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
+            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some points of a view, their normals, and the denser points that these were made from."""
     many = spread(view.points, DENSER * count) if len(view.points) > DENSER * count else np.arange(len(view.points))
     dense = view.points[many]

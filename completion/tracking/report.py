@@ -11,7 +11,7 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots
 
 from ..motion import Motion
-from ..motion_pictures import chart_residuals, moving_pane, played
+from ..motion_pictures import chart_residuals, frames_to_play, moving_pane
 
 
 def track_page(motion: Motion, subject: Subject, cloud: Callable[[int], np.ndarray], name: str, numbers: list[int],
@@ -20,7 +20,7 @@ def track_page(motion: Motion, subject: Subject, cloud: Callable[[int], np.ndarr
     page = Page(f"{name}, tracked", "The body, and some of the points that were measured in each frame. Where it is "
                 "grey the frame was lost.")
     # some of the points of each frame, at most 300,000 of all together
-    frames, _ = played(motion)
+    frames, _ = frames_to_play(motion)
     count = int(np.clip(300_000 // len(frames), 100, 1000))
     points = np.full((len(frames), count, 3), np.nan)
     for row, t in enumerate(frames):

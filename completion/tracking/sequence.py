@@ -18,8 +18,8 @@ from scanprep.threads import one_thread
 from ..motion import Motion, Progress
 from ..partial.completion import complete
 from ..partial.free_surface import free_surface
-from ..smoothing import inertia, predicted, smooth
-from .frame_fit import FrameFit, Refined, shared_shape, spread_poses
+from ..smoothing import inertia, predict, smooth
+from .frame_fit import FrameFit, Refined, fit_shared_shape, spread_poses
 from .frames import Frame, as_views, prepare_frame
 from .settings import TrackConfig
 
@@ -182,7 +182,7 @@ class Tracker:
     def push(self, frame: Frame) -> list[TrackedFrame]:
         """Take the next frame; returns those that are done, which may be none or several."""
         config, state = self.config, self.state
-        expected = predicted(state.past[0], state.past[-1], LOST if state.lost else MOMENTUM) if state.past else None
+        expected = predict(state.past[0], state.past[-1], LOST if state.lost else MOMENTUM) if state.past else None
         cloud = prepare_frame(frame, config.frame_points, config.normal_points, self.viewpoints,
                               None if expected is None else self._mesh(expected))
         if expected is None and cloud is None:
@@ -253,8 +253,8 @@ class Tracker:
         if not seen:
             return
         chosen = spread_poses(np.stack([self._known().vertices(x) for x, _ in seen]), self.config.shape_views)
-        betas, _ = shared_shape(self.person, [seen[i][1] for i in chosen], np.stack([seen[i][0] for i in chosen]),
-                                before, self.config)
+        betas, _ = fit_shared_shape(self.person, [seen[i][1] for i in chosen], np.stack([seen[i][0] for i in chosen]),
+                                    before, self.config)
         self._has_shape(betas)
         kept = tuple(self._refined(f) for f in self.state.kept)
         self.state = replace(self.state, kept=kept, past=tuple(f.x for f in kept[:-3:-1]),

@@ -9,7 +9,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera
-from scanprep.pictures.scene import Pane, framed_alike
+from scanprep.pictures.scene import Pane, match_camera_scales
 from scanprep.pictures.shading import CLAY, Moving, Shape, Solid
 
 from .contents import Content, Stance
@@ -29,7 +29,7 @@ def side_by_side(contents: Sequence[Content], up: np.ndarray | None = None) -> t
     free = [i for i, content in enumerate(contents) if content.stance.seen is None]
     sizes = [panes[i].camera.distance for i in free]
     if free and max(sizes) < 3 * min(sizes):           # else one of them is in another unit
-        for i, pane in zip(free, framed_alike([panes[i] for i in free]), strict=True):
+        for i, pane in zip(free, match_camera_scales([panes[i] for i in free]), strict=True):
             panes[i] = pane
     return [pane.camera for pane in panes], panes
 

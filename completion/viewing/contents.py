@@ -18,7 +18,7 @@ from scanprep.pictures.camera import Camera, stance
 from scanprep.pictures.colors import part_colors
 from scanprep.pictures.scene import NO_INDEX
 from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
-from scanprep.pictures.thinning import thinned
+from scanprep.pictures.thinning import thin_solid
 from scanprep.viewer.clicked import camera_before
 
 from ..partial.completion import Completion
@@ -98,7 +98,7 @@ def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray
         size, every = float(np.linalg.norm(np.ptp(stands.extent, axis=0))), max(1, len(mesh.vertices) // 150_000)
         return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stands,
                        f"{len(mesh.vertices):,} points")
-    shown = thinned(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), 120_000)
+    shown = thin_solid(Solid(mesh, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {}), 120_000)
     few = len(shown.mesh.faces) < len(mesh.faces)
     notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * few
     return Content(name, [shown, *marks], stands, sizes(mesh), notes=notes)
@@ -156,7 +156,7 @@ def of_completion(name: str, done: Completion) -> Content:
     return Content(name, shapes, Stance.of(mesh), str(done.judgement))
 
 
-def told(make: Callable[[], Content]) -> Content:
+def collect_warnings(make: Callable[[], Content]) -> Content:
     """What is made, with the warnings on the way as its notes; they are given again."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

@@ -23,8 +23,8 @@ from scanprep.viewer.dropped import with_camera
 from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion
 from ..partial.completion import load_completion
-from .contents import Content, from_camera, mark_places, of_completion, of_mesh, of_model, told
-from .kinds import kind_of, layout_places, reported_model, worst_first
+from .contents import Content, collect_warnings, from_camera, mark_places, of_completion, of_mesh, of_model
+from .kinds import kind_of, layout_places, model_of_report, worst_first
 from .motions import of_markers, of_motion, read_recording
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import read_statue
@@ -142,10 +142,10 @@ class Files:
         kind = kind_of(path)
         loads: dict[str, Callable[[], Content]] = {
             "model": lambda: of_model(name, self.read_model(path)),
-            "motion": lambda: told(lambda: self._motion(path, name)),
+            "motion": lambda: collect_warnings(lambda: self._motion(path, name)),
             "completion": lambda: of_completion(name, load_completion(path.parent)),
-            "markers": lambda: told(lambda: of_markers(name, read_recording(path, self.unit, self.rate))),
-            "surface": lambda: told(lambda: self._surface(path, name)),
+            "markers": lambda: collect_warnings(lambda: of_markers(name, read_recording(path, self.unit, self.rate))),
+            "surface": lambda: collect_warnings(lambda: self._surface(path, name)),
             "picture": lambda: from_camera(self._surface(path, name))}
         if kind not in loads:
             raise ValueError(f"{path}: expected a mesh, points, markers, a model, a motion, landmarks, a depth picture "
@@ -195,10 +195,12 @@ class Files:
         elif (folder / COMPLETION).is_file():
             yield Entry(name, lambda: of_completion(name, load_completion(folder)), True, folder, "completion", folder)
         elif (folder / MOTION).is_file():
-            yield Entry(name, lambda: told(lambda: self._motion(folder / MOTION, name)), True, folder / MOTION,
+            yield Entry(name, lambda: collect_warnings(lambda: self._motion(folder / MOTION, name)), True,
+                        folder / MOTION,
                         "motion", folder)
             if (folder / "onto.npz").is_file():
-                yield Entry(f"{name}, other person", lambda: told(lambda: self._motion(folder / "onto.npz", name)),
+                yield Entry(f"{name}, other person",
+                            lambda: collect_warnings(lambda: self._motion(folder / "onto.npz", name)),
                             True, folder / "onto.npz", "motion", folder)
         else:
             for path in sorted(folder.iterdir()):
@@ -269,7 +271,7 @@ class Files:
         if self.model is not None:
             return self.read_model(self.model)
         for folder in list(path.resolve().parents)[:DEEP]:
-            name = reported_model(folder / "report.json")
+            name = model_of_report(folder / "report.json")
             if name is not None:
                 return self.read_model(name)
         fitting = [m for m in map(self.read_model, self.known["model"])

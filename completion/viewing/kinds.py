@@ -37,7 +37,7 @@ def kind_of(path: Path) -> str:
     return "surface" if ending_of(path) in ENDINGS else f"'{path.suffix or path.name}'"
 
 
-def reported_model(path: Path) -> Path | None:
+def model_of_report(path: Path) -> Path | None:
     """The model that a command's report names, where it is still there; None otherwise."""
     try:
         settings: Any = storage.read_json(path, "a report").get("settings", {})

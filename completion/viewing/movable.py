@@ -11,7 +11,7 @@ from collections import OrderedDict
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import PointOperator, picked
+from model.linear import PointOperator, combination_weights
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.roles import in_words
 
@@ -66,7 +66,7 @@ class MovableBody:
     def point(self, vertex: int, betas: np.ndarray | None) -> PointOperator:
         """One vertex of the body with these betas, as a function of the pose."""
         self._settle(betas)
-        return self.operator.combined(picked(self.operator.count, *self._below(vertex))).astype(np.float64)
+        return self.operator.combined(combination_weights(self.operator.count, *self._below(vertex))).astype(np.float64)
 
     def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
         """The vertex of the model that it is, as for `Subject.points`."""

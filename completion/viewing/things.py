@@ -79,8 +79,8 @@ class Things:
             changed = {self.entries[i].path for i in self.shown if i not in place}
             new = [i for i in fresh if entries[i].path in changed] or [i for i in fresh if entries[i].first] \
                 or fresh[:1]
-            self.problems, self.about = _renumbered(self.problems, place), _renumbered(self.about, place)
-            self.contents, self.bodies = _renumbered(self.contents, place), _renumbered(self.bodies, place)
+            self.problems, self.about = _renumber(self.problems, place), _renumber(self.about, place)
+            self.contents, self.bodies = _renumber(self.contents, place), _renumber(self.bodies, place)
             self.entries = entries
             read = self.read(sorted([*(place[i] for i in self.shown if i in place), *new][-MOST:]))
             if not set(new) & set(read):
@@ -92,5 +92,5 @@ class Things:
         self.put(read)
 
 
-def _renumbered(known: dict[int, T], place: dict[int, int]) -> dict[int, T]:
+def _renumber(known: dict[int, T], place: dict[int, int]) -> dict[int, T]:
     return {place[i]: one for i, one in known.items() if i in place}

@@ -13,7 +13,7 @@ from scanprep.cli import Output, Person, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.landmarks import read_landmarks, shared_landmarks, write_landmarks
+from scanprep.geometry.landmarks import read_landmarks, try_match_landmarks, write_landmarks
 from scanprep.geometry.tables import write_table
 from scanprep.judgement import Judgement
 from scanprep.pipeline.scan import mesh_file
@@ -57,7 +57,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     for task in tasks:
         try:
             scan, known = read_scan(task.scan, unit), loaded.info.get("landmarks")
-            marks.append(shared_landmarks(task.landmarks, known, read_landmarks(task.landmarks, scan, unit))
+            marks.append(try_match_landmarks(task.landmarks, known, read_landmarks(task.landmarks, scan, unit))
                          if task.landmarks and known else None)
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())

@@ -145,17 +145,17 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
     before: list[np.ndarray | None] = list(starts) if starts is not None else [None for _ in scans]
     own, history = _own(subjects, n), list[Round]()
     good, registrations, failures = np.zeros(n, dtype=bool), list[ModelRegistration | None](), dict[str, str]()
-    with kept_or_not(space) as kept:
-        while len(history) < config.rounds and not _settled(history, model, config):
+    with workspace_or_temporary(space) as kept:
+        while len(history) < config.rounds and not _has_settled(history, model, config):
             turn, last = len(history), registrations
             ready = [OneScan(scans[i], marks[i], before[i], bool(own[i])) for i in range(n)]
-            registrations, failures = _registered(kept, model, ready, labels, config, turn, progress)
+            registrations, failures = _register_round(kept, model, ready, labels, config, turn, progress)
             good = np.array([r is not None and r.explained >= 1 - config.failed for r in registrations], dtype=bool)
             lessons = _lessons(registrations, good, own, subjects, failures)
             history.append(_summary(registrations, good, last))
             model = _taught(kept, model, lessons, config, turn)
             before = [start if r is None else r.mesh.vertices for r, start in zip(registrations, before, strict=True)]
-    return Coregistration(tuple(registrations), good, model, len(history), _settled(history, model, config),
+    return Coregistration(tuple(registrations), good, model, len(history), _has_settled(history, model, config),
                           tuple(history), failures)
 
 
@@ -165,7 +165,7 @@ def task_name(turn: int, name: str) -> str:
 
 
 @contextlib.contextmanager
-def kept_or_not(space: Workspace | None) -> Iterator[Workspace]:
+def workspace_or_temporary(space: Workspace | None) -> Iterator[Workspace]:
     """A workspace, or one that is gone at the end."""
     with contextlib.ExitStack() as stack:
         yield space or stack.enter_context(workspace(stack.enter_context(tempfile.TemporaryDirectory())))
@@ -188,9 +188,9 @@ def _own(subjects: Sequence[str] | None, n: int) -> np.ndarray:
     return np.array([subject == most for subject in subjects])
 
 
-def _registered(space: Workspace, model: BodyModel, scans: Sequence[OneScan], names: Sequence[str],
-                config: CoregistrationConfig, turn: int, progress: Progress | None
-                ) -> tuple[list[ModelRegistration | None], dict[str, str]]:
+def _register_round(space: Workspace, model: BodyModel, scans: Sequence[OneScan], names: Sequence[str],
+                    config: CoregistrationConfig, turn: int, progress: Progress | None
+                    ) -> tuple[list[ModelRegistration | None], dict[str, str]]:
     """One round of registrations, in the order of the scans, and by name why some could not be registered."""
     def tell(done: int, total: int) -> None:
         if progress is not None:
@@ -235,7 +235,7 @@ def _summary(registrations: Sequence[ModelRegistration | None], good: np.ndarray
                  float(np.median([r.apart for r in there])), float(np.mean(moved)) if moved else np.nan)
 
 
-def _settled(history: Sequence[Round], model: BodyModel, config: CoregistrationConfig) -> bool:
+def _has_settled(history: Sequence[Round], model: BodyModel, config: CoregistrationConfig) -> bool:
     size = float(np.sqrt(model.template.face_areas.sum()))
     return bool(history and history[-1].change <= config.tolerance * size)
 

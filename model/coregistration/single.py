@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanprep.correspondence.correspondences import checked_pairs
+from scanprep.correspondence.correspondences import check_pairs
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, orient, target_of
@@ -111,19 +111,19 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     config = config or CoregistrationConfig()
     tell = progress or (lambda done, total: None)
     given: Landmarks = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-    vertices, points = checked_pairs(body.template, *given, "landmarks", 0)
+    vertices, points = check_pairs(body.template, *given, "landmarks", 0)
     target = target_of(scan)
     size, person = float(np.sqrt(body.template.face_areas.sum())), as_body(body)
     fit, factor = prepare_scan_fit(person, scan, vertices, points, config.fit)
     # 1. pose, place and betas by matches alone
-    x, tried = _pose_and_shape(fit, None if start is None else _given(fit, start, factor))
+    x, tried = _pose_and_shape(fit, None if start is None else _unknowns_of_start(fit, start, factor))
     tell(1, 2)
     # 2. the template as the model predicts it is aligned with the scan
-    aligned = register(_predicted(person, fit, x), scan, None, config.registration)
+    aligned = register(_predict_own_mesh(person, fit, x), scan, None, config.registration)
     # 3. pose and betas from where there are data
     x = meet_vertices(fit, x, factor * aligned.mesh.vertices, aligned.confidence)
     tell(2, 2)
-    predicted, mesh, seen = _predicted(person, fit, x), aligned.mesh, aligned.seen
+    predicted, mesh, seen = _predict_own_mesh(person, fit, x), aligned.mesh, aligned.seen
     pose, trans, betas = person.split(fit.body.in_metres(x)[0])
     off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
     off_marks = np.linalg.norm(mesh.vertices[vertices] - points, axis=1)
@@ -150,7 +150,7 @@ def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray,
     return solve_jointly(fit, few, best, lambda done: None).x, tried
 
 
-def _given(fit: ScanFit, start: np.ndarray, factor: float) -> np.ndarray:
+def _unknowns_of_start(fit: ScanFit, start: np.ndarray, factor: float) -> np.ndarray:
     """Unknowns (1, P) of a start given as vertices of the template or as a pose."""
     start, body = np.asarray(start, dtype=np.float64), fit.body
     shapes = body.template.vertices.shape, body.pose_mean.shape
@@ -164,7 +164,7 @@ def _given(fit: ScanFit, start: np.ndarray, factor: float) -> np.ndarray:
     return (meet_vertices(fit, x, onto, np.ones(len(onto))) if registered else x)[None]
 
 
-def _predicted(person: FixedBody, fit: ScanFit, x: np.ndarray) -> Mesh:
+def _predict_own_mesh(person: FixedBody, fit: ScanFit, x: np.ndarray) -> Mesh:
     """A person's own mesh, of unknowns (P,) of a fit that may be of another size."""
     return person.template.with_vertices(person.vertices(fit.body.in_metres(x)[0]))
 

@@ -18,7 +18,7 @@ from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
 from ..cli import ModelArg, read_bodies
-from ..digests import digest, trained_on
+from ..digests import digest, was_trained_on
 from ..files import load_model
 from ..posing.cli import read_subject
 from ..shape_statistics import SEXES, WORDS, Sex
@@ -126,7 +126,7 @@ def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None
         return ["these are the very bodies that the model was trained on, so the errors are not held-out errors"]
     notes = []
     for name, bodies in (("poses", posed), ("people", people)):
-        known = None if bodies is None else trained_on(model, bodies)
+        known = None if bodies is None else was_trained_on(model, bodies)
         if known is not None and known.any():
             notes.append(f"{known.sum()} of the {len(known)} {name} trained the model, so the errors are not "
                          "held-out errors")

@@ -12,7 +12,7 @@ import numpy as np
 from scanprep.judgement import HAND, extent, size, unit_problem
 
 from ..body import BodyModel, Progress
-from ..digests import checked_bodies
+from ..digests import check_bodies
 from ..fitting.vertices import FitConfig, PoseFit, PoseFitter, ShapeFit, ShapeFitter
 from ..linear import Subject
 
@@ -106,7 +106,7 @@ def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = 
     ValueError
         Bodies of another count of vertices or not finite.
     """
-    bodies = checked_bodies(model.template, bodies, "bodies")
+    bodies = check_bodies(model.template, bodies, "bodies")
     subject = subject or model.subject()
     fitter, fits = PoseFitter(subject, config), list[PoseFit]()
     for body in bodies:
@@ -141,7 +141,7 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
     ValueError
         People of another count of vertices or not finite, a count below 1, a model without shape components.
     """
-    people, wanted = checked_bodies(model.template, people, "people"), checked_counts(model, counts)
+    people, wanted = check_bodies(model.template, people, "people"), check_counts(model, counts)
     largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))
     fitters = [largest.first(count) for count in wanted]
     held, fits = [], list[list[ShapeFit]]()
@@ -159,7 +159,7 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
 
     return ShapeErrors(
         np.array(wanted), errors([f.vertices for f in row] for row in by_count), errors(zip(*held, strict=True)),
-        None if train is None else errors(_by_components(checked_bodies(model.template, train, "train"), people,
+        None if train is None else errors(_by_components(check_bodies(model.template, train, "train"), people,
                                                          wanted)),
         *(np.array([[getattr(f, name) for f in row] for row in by_count])
           for name in ("betas", "pose", "trans", "converged")))
@@ -211,7 +211,7 @@ def compactness(model: BodyModel) -> np.ndarray:
     return np.asarray(model.explained, dtype=np.float64)
 
 
-def checked_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:
+def check_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:
     """Numbers of components, rising, those beyond what the model has cut down to it, or ValueError."""
     if not len(counts) or min(counts) < 1:
         raise ValueError(f"counts: expected numbers from 1 on, got {', '.join(map(str, counts)) or 'none'}")

@@ -9,10 +9,10 @@ import numpy as np
 from model.priors import sample_poses
 
 from ..body import BodyModel, Progress
-from ..digests import checked_bodies
+from ..digests import check_bodies
 from ..fitting.vertices import FitConfig, ShapeFitter
 from ..shape_statistics import Sex, draw_betas
-from .errors import checked_counts
+from .errors import check_counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
     """Distance of random bodies of the model to the nearest training person.
 
     Random bodies are drawn as `sample_bodies` does, and stand at rest. The people are brought to rest
-    by `unposed`, and all bodies are centred, before vertices are compared.
+    by `unpose_people`, and all bodies are centred, before vertices are compared.
 
     Parameters
     ----------
@@ -119,15 +119,15 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
         Fewer than two people, a count below 1, a model without shape components.
     """
     rng = rng or np.random.default_rng(0)
-    people, wanted = checked_bodies(model.template, people, "people"), checked_counts(model, counts)
+    people, wanted = check_bodies(model.template, people, "people"), check_counts(model, counts)
     if count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")
     if len(people) < 2:
         raise ValueError(f"people: expected at least 2, got {len(people)}")
-    real = _centred(unposed(model, people, config, progress)).astype(np.float32)
+    real = _centre(unpose_people(model, people, config, progress)).astype(np.float32)
     rest = np.zeros((len(model.skeleton.parents), 3))
-    mean = _centred(model.vertices(rest, np.zeros(wanted[-1]))[None])[0]
-    change = np.moveaxis(_centred(np.moveaxis(model.shape_jacobian(rest), -1, 0)), 0, -1)
+    mean = _centre(model.vertices(rest, np.zeros(wanted[-1]))[None])[0]
+    change = np.moveaxis(_centre(np.moveaxis(model.shape_jacobian(rest), -1, 0)), 0, -1)
     betas = draw_betas(model, count, rng)[0]
     distances, nearest = np.empty((len(wanted), count)), np.empty((len(wanted), count), dtype=np.int64)
     for c, k in enumerate(wanted):
@@ -139,8 +139,9 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
     return Specificity(np.array(wanted), distances, nearest, float(np.mean(others)))
 
 
-def unposed(model: BodyModel, people: np.ndarray, config: FitConfig | None = None, progress: Progress | None = None
-            ) -> np.ndarray:
+def unpose_people(model: BodyModel, people: np.ndarray, config: FitConfig | None = None,
+                  progress: Progress | None = None
+                  ) -> np.ndarray:
     """People (S, N, 3) at rest: `fit_shape` with all components, then the fitted body at zero pose.
 
     What the fit leaves at every vertex is rotated back with the vertex's part and added, so that it is the person, not
@@ -159,7 +160,7 @@ def unposed(model: BodyModel, people: np.ndarray, config: FitConfig | None = Non
     return out
 
 
-def _centred(bodies: np.ndarray) -> np.ndarray:
+def _centre(bodies: np.ndarray) -> np.ndarray:
     return bodies - bodies.mean(axis=1, keepdims=True)
 
 

@@ -62,7 +62,7 @@ def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = N
     lines = ["HIERARCHY", *_hierarchy(skeleton, scale * skeleton.joints @ U, scale * part_ends(skeleton, body) @ U),
              "MOTION", f"Frames: {len(poses)}", f"Frame Time: {1 / rate:.9f}"]
     places = scale * (skeleton.joints[0] + trans) @ U
-    angles = euler_degrees(poses @ U)[:, _written(skeleton)]
+    angles = euler_degrees(poses @ U)[:, _file_order(skeleton)]
     frames = np.concatenate([places, angles.reshape(len(poses), -1)], axis=1)
     lines += _numbers(frames)
     with writing(path) as beside:
@@ -94,7 +94,7 @@ def part_ends(skeleton: Skeleton, body: Mesh | None = None) -> np.ndarray:
     return ends
 
 
-def _written(skeleton: Skeleton) -> list[int]:
+def _file_order(skeleton: Skeleton) -> list[int]:
     """The joints in the order of the file: every joint is followed by all that hangs below it."""
     order: list[int] = []
     waiting = [0]
@@ -109,7 +109,7 @@ def _hierarchy(skeleton: Skeleton, joints: np.ndarray, ends: np.ndarray) -> list
     lines: list[str] = []
     level = np.zeros(len(joints), dtype=int)
     open_joints: list[int] = []
-    for j in _written(skeleton):
+    for j in _file_order(skeleton):
         parent = int(skeleton.parents[j])
         while open_joints and open_joints[-1] != parent:
             lines.append("  " * level[open_joints.pop()] + "}")

@@ -184,7 +184,7 @@ def _folder(order: Order) -> list[Metric]:
 def _bvh(order: Order) -> list[Metric]:
     """The skeleton and its motion."""
     rig = make_rig(order.model, order.person)
-    where, poses, frames = _measured_poses(order)
+    where, poses, frames = _poses_to_measure(order)
     off = joint_places(rig.skeleton, poses[frames]) - order.model.subject(order.person).joints(poses[frames])
     told = _write_rig(order, rig, lambda ready, poses, trans, rate, up: write_bvh(
         order.output, ready.skeleton, poses, trans, rate, order.unit, up, ready.mesh))
@@ -201,7 +201,7 @@ def _skin(order: Order, write: Callable[..., None]) -> list[Metric]:
     rig, subject = make_rig(order.model, order.person, shapes), order.model.subject(order.person)
     if moves is None and order.correctives:
         raise UsageError("--correctives: expected the motion that they belong to; name it with --motion")
-    where, poses, frames = _measured_poses(order)
+    where, poses, frames = _poses_to_measure(order)
     if moves is not None and order.correctives != 0:
         rig = replace(rig, correctives=motion_correctives(rig, subject, moves.poses, order.correctives))
     extra = 0 if rig.correctives is None else len(rig.correctives.shapes)
@@ -210,7 +210,7 @@ def _skin(order: Order, write: Callable[..., None]) -> list[Metric]:
             Metric("corrective targets", extra), where, *_distances("exact body", off)]
 
 
-def _measured_poses(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
+def _poses_to_measure(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
     """Where a rig is compared with the exact body: of which poses (T, J, 3), and in which frames (n,) of them."""
     if order.moves is None:
         poses = sample_poses(order.model, MEASURED, np.random.default_rng(0))

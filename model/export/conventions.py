@@ -10,9 +10,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sides import side_of
 from scanprep.pictures.camera import stance, upright
 
-from ..rig import Rig, carried, rerooted, turn_up
+from ..rig import Rig, change_root, transform_rig, turn_up
 from .bvh import part_ends
-from .names import Names, renamed
+from .names import Names, rename_bones
 
 FRAMES = 200                         # of a motion, in which its lowest point is looked for
 
@@ -23,7 +23,7 @@ def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: 
     """The same body and motion as animation programs expect them; what GLB and BVH files are written from.
 
     The surface moves as before, but for `ground` and `front`, which place the whole anew. Bones get axes along the
-    limbs (`aimed`).
+    limbs (`aim_bones`).
 
     Parameters
     ----------
@@ -43,14 +43,14 @@ def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: 
         The body at rest, and the motion by its mean heading, turned to the viewer: to +z where y is up, to -y where
         z is up.
     """
-    rig, poses, trans = placed(rig, poses, trans, up, ground, front)
+    rig, poses, trans = place_on_ground(rig, poses, trans, up, ground, front)
     if root is not None:
-        rig, poses, trans = rerooted(rig, poses, trans, root)
-    rig = aimed(rig, up)
-    return (rig if names is None else renamed(rig, names)), poses, trans
+        rig, poses, trans = change_root(rig, poses, trans, root)
+    rig = aim_bones(rig, up)
+    return (rig if names is None else rename_bones(rig, names)), poses, trans
 
 
-def aimed(rig: Rig, up: int) -> Rig:
+def aim_bones(rig: Rig, up: int) -> Rig:
     """The rig with bones that point along the limbs: y of every bone to the next joint.
 
     Where bones branch the next joint is that of the largest branch nearest the middle of the body, so that a pelvis
@@ -73,8 +73,8 @@ def aimed(rig: Rig, up: int) -> Rig:
     return replace(rig, axes=axes)
 
 
-def placed(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool, front: bool
-           ) -> tuple[Rig, np.ndarray, np.ndarray]:
+def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool, front: bool
+                    ) -> tuple[Rig, np.ndarray, np.ndarray]:
     """The rig and its motion (T may be 0) on the ground and with the face to the viewer, as `for_programs` says."""
     Q = W = np.eye(3)
     if front:
@@ -82,7 +82,7 @@ def placed(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool
         if len(poses):
             turned = rig.skeleton.part_rotations(poses)[:, 0]
             W = to_viewer(*stance(rig.mesh, turned, np.eye(3)[up]), up)
-    rig, poses, trans = carried(rig, poses, trans, (Q, np.zeros(3)), (W, np.zeros(3)))
+    rig, poses, trans = transform_rig(rig, poses, trans, (Q, np.zeros(3)), (W, np.zeros(3)))
     if not ground:
         return rig, poses, trans
     vertical = np.eye(3)[up]
@@ -92,7 +92,7 @@ def placed(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, ground: bool
         # twenty bodies are held at a time
         step = -min(float(rig.vertices(poses[some], trans[some])[..., up].min())
                     for some in np.array_split(chosen, -(-len(chosen) // 20))) * vertical
-    return carried(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
+    return transform_rig(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
 
 
 def standing(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool, turned: np.ndarray | None = None

@@ -36,7 +36,7 @@ def rest_corrections(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarr
         # opposite rotations can cancel; the damped inverse leaves alone what they blot out
         # share of a blended rotation below which it is not undone
         square = np.einsum("kin,kjn->ijn", M, M)
-        square += 0.1**2 * _lost(M) * np.eye(3)[..., None]
+        square += 0.1**2 * _rotation_loss(M) * np.eye(3)[..., None]
         out[t] = _solve_small(square, np.einsum("kin,kn->in", M, off)).T
     return out
 
@@ -51,7 +51,7 @@ def _solve_small(A: np.ndarray, y: np.ndarray) -> np.ndarray:
                      r * y[0] + t * y[1] + u * y[2]]) / determinant
 
 
-def _lost(M: np.ndarray) -> np.ndarray:
+def _rotation_loss(M: np.ndarray) -> np.ndarray:
     """(N,) how far mean rotations (3, 3, N) are from a rotation: 0 for one, 1 where all has cancelled."""
     (a, b, c), (d, e, f), (g, h, i) = M
     return 1 - np.clip(np.abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)), 0, 1)
@@ -80,7 +80,7 @@ def motion_correctives(rig: Rig, subject: Subject, poses: np.ndarray, count: int
         some = poses[start:start + AT_ONCE]
         lacking = rest_corrections(few, some, points.evaluate(some)) - mean[ids]
         weights[start:start + AT_ONCE] = lacking.reshape(len(some), -1) @ solve
-    return _scaled(mean, basis, weights, np.arange(len(poses)))
+    return _scale_to_unit(mean, basis, weights, np.arange(len(poses)))
 
 
 def body_correctives(rig: Rig, poses: np.ndarray, trans: np.ndarray, bodies: Callable[[np.ndarray], np.ndarray],
@@ -94,7 +94,7 @@ def body_correctives(rig: Rig, poses: np.ndarray, trans: np.ndarray, bodies: Cal
                               for some in np.array_split(frames, -(-len(frames) // SEEN))])
     mean, basis = _directions(lacking[spread_indices(len(frames), SEEN)], None)
     weights = (lacking - mean).reshape(len(frames), -1) @ basis.reshape(len(basis), mean.size).T
-    return _scaled(mean, basis, weights, frames)
+    return _scale_to_unit(mean, basis, weights, frames)
 
 
 def off_exact(rig: Rig, poses: np.ndarray, trans: np.ndarray | None, exact: np.ndarray,
@@ -121,7 +121,7 @@ def _directions(lacking: np.ndarray, count: int | None) -> tuple[np.ndarray, np.
     return mean, basis.reshape(len(basis), *mean.shape)
 
 
-def _scaled(mean: np.ndarray, basis: np.ndarray, weights: np.ndarray, frames: np.ndarray) -> Correctives:
+def _scale_to_unit(mean: np.ndarray, basis: np.ndarray, weights: np.ndarray, frames: np.ndarray) -> Correctives:
     """Correctives with weights from 0 to 1 for those (n, C - 1) of a basis about a mean."""
     low, span = weights.min(axis=0), np.maximum(np.ptp(weights, axis=0), 1e-12)
     shapes = np.concatenate([(mean + np.tensordot(low, basis, axes=1))[None], basis * span[:, None, None]])

@@ -63,13 +63,13 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
         A motion of other parts, empty, not finite or of another length than the correctives; a rate that is
         not positive; an axis that does not exist.
     """
-    data = skinned_glb(rig, poses, trans, rate, up, material)
+    data = encode_skinned_glb(rig, poses, trans, rate, up, material)
     with writing(path) as beside:
         beside.write_bytes(data)
 
 
-def skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None, rate: float = 30.0,
-                up: int = 2, material: Material | None = None) -> bytes:
+def encode_skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None, rate: float = 30.0,
+                       up: int = 2, material: Material | None = None) -> bytes:
     """The bytes of `write_skinned_glb`."""
     U = turn_up(up).T
     rig, glb = rig.turned(up), Glb()

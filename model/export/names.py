@@ -4,7 +4,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from scanprep.skeleton.roles import numbered_roles
+from scanprep.skeleton.roles import find_numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 from ..rig import Rig
@@ -31,7 +31,7 @@ def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
     """What another program calls the parts of a person, of those that it has a name for.
 
     The trunk is named from the pelvis upwards, as many parts as there are; of a limb whose pieces are numbered those
-    that begin at hip, knee and ankle, or shoulder, elbow and wrist, have names (`numbered_roles`).
+    that begin at hip, knee and ankle, or shoulder, elbow and wrist, have names (`find_numbered_roles`).
 
     Raises
     ------
@@ -44,7 +44,7 @@ def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
     found = dict(zip(rising, _TRUNK[kind], strict=False))
     if kind in _CHEST and rising[1:]:
         found[rising[-1]] = _CHEST[kind]
-    roles = numbered_roles(parts, skeleton.joints)
+    roles = find_numbered_roles(parts, skeleton.joints)
     if "neck" in parts and kind in _NECK:
         found["neck"] = _NECK[kind]
     if "head" in parts:
@@ -59,7 +59,7 @@ def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
     return {part: _PREFIX.get(kind, "") + name for part, name in found.items()}
 
 
-def renamed(rig: Rig, kind: Names) -> Rig:
+def rename_bones(rig: Rig, kind: Names) -> Rig:
     """The rig with another program's names; parts that have no counterpart there keep theirs."""
     found = names_of(rig.skeleton, kind)
     names = tuple(found.get(name, name) for name in rig.skeleton.names)

@@ -59,7 +59,7 @@ def above_skin(supports: MovingPoints, distance: np.ndarray) -> MovingPoints:
     return MovingPoints(p[..., 0, :] + lift * n, J[..., 0, :, :] + lift[..., None] * (tangent @ dc))
 
 
-def lifted(supports: np.ndarray, distance: np.ndarray) -> np.ndarray:
+def rise_above_skin(supports: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """The positions (..., L, 3) of `above_skin` alone, from supports (..., 3L, 3), metres."""
     p = supports.reshape(*supports.shape[:-2], -1, 3, 3)
     c = np.cross(p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :])

@@ -70,7 +70,7 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
         limb = next((limb for limb in limbs_amiss(held, moved) if limb not in tried), None)
         if limb is None:
             break
-        before, moved = moved, _reinitialised(held, moved, limb)
+        before, moved = moved, _reinitialise(held, moved, limb)
         tried = [limb] if moved is not before else [*tried, limb]
     return np.concatenate([moved, x[free:]])
 
@@ -101,7 +101,7 @@ def amiss(fit: ScanFit, x: np.ndarray, limb: list[int], wrong: np.ndarray, lost:
     return float(EVIDENCE / fit.config.scan_sd**2 * (wrong[mine].sum() + share))
 
 
-def _reinitialised(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
+def _reinitialise(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
     """Unknowns (P,) with a limb as it is, or as the draw that explains most after a few rounds."""
     best, search = fit.misfit(x), LimbSearch.around(fit, x, limb)
     drawn = search.best(draws(fit, x, limb, DRAWS * fit.config.random_starts))
@@ -217,7 +217,7 @@ class InsideBody:
         return np.where(within, self.deep[cell[..., 0], cell[..., 1], cell[..., 2]], 0.0)
 
 
-def unbranched(parents: np.ndarray) -> list[list[int]]:
+def unbranched_runs(parents: np.ndarray) -> list[list[int]]:
     """The limbs of a tree of parts: longest runs without a branch, the root in none."""
     children = [np.flatnonzero(np.asarray(parents) == j) for j in range(len(parents))]
     runs = []
@@ -234,7 +234,7 @@ def unbranched(parents: np.ndarray) -> list[list[int]]:
 def limbs(skeleton: Skeleton) -> list[list[int]]:
     """Runs of parts without a branch that end in a part from which nothing hangs, the largest first."""
     parents = skeleton.parents
-    return sorted((run for run in unbranched(parents) if run[-1] not in parents), key=len, reverse=True)
+    return sorted((run for run in unbranched_runs(parents) if run[-1] not in parents), key=len, reverse=True)
 
 
 def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.random.Generator) -> np.ndarray:

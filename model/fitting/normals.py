@@ -41,7 +41,7 @@ def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     return axes[:, :, 0]
 
 
-def completed_normals(given: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
+def complete_normals(given: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Unit normals (n, 3): those given, and where one is zero or not finite that of the neighbours' plane."""
     length = np.linalg.norm(given, axis=1)
     good = np.isfinite(length) & (length > 1e-9)

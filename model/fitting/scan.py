@@ -16,7 +16,7 @@ from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
 from scanprep.threads import search_threads
 
-from .normals import completed_normals, one_sign, plane_normals, spread, turn_outward
+from .normals import complete_normals, one_sign, plane_normals, spread, turn_outward
 
 NEIGHBOURS = 16                      # points that make one normal
 
@@ -46,7 +46,7 @@ class ScanPoints:
     @property
     def everything(self) -> ScanPoints:
         """All points, masked or not."""
-        return self if self.masked is None else _joined([replace(self, masked=None), self.masked])
+        return self if self.masked is None else _concatenate([replace(self, masked=None), self.masked])
 
     def some(self, keep: np.ndarray) -> ScanPoints:
         """Some of the points, by number or mask (n,); the masked ones stay."""
@@ -81,7 +81,7 @@ def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.
         part = _prepare_view(view, None if from_where is None else from_where[number], name)
         parts.append(replace(part, view=np.full(len(part.points), number), index=part.index + start))
         start += point_count(view)
-    whole = parts[0] if len(parts) == 1 else _without_inner_borders(_joined(parts))
+    whole = parts[0] if len(parts) == 1 else _without_inner_borders(_concatenate(parts))
     whole = replace(whole, viewpoints=from_where)
     return whole if masked is None else _set_apart(whole, check_mask(masked, start))
 
@@ -179,7 +179,7 @@ def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPo
     spacing = float(np.median(distance[:, 1:5].mean(axis=1)))
     if meshed and given is not None:
         return ScanPoints(points, given, border, spacing, 0 * index, index)
-    normals = plane_normals(points, near) if given is None else completed_normals(given, points, near)
+    normals = plane_normals(points, near) if given is None else complete_normals(given, points, near)
     if viewpoint is not None:
         normals = normals * np.where(np.einsum("nd,nd->n", normals, viewpoint - points) < 0, -1, 1)[:, None]
     elif given is None or not one_sign(normals, near):
@@ -202,7 +202,7 @@ def _split(scan: View, name: str) -> tuple[np.ndarray, np.ndarray | None]:
     return points, None if given is None else np.asarray(given, dtype=np.float64)
 
 
-def _joined(parts: Sequence[ScanPoints]) -> ScanPoints:
+def _concatenate(parts: Sequence[ScanPoints]) -> ScanPoints:
     points, normals, border, view, index = (np.concatenate([getattr(part, name) for part in parts])
                                             for name in ("points", "normals", "border", "view", "index"))
     return ScanPoints(points, normals, border, float(np.median([part.spacing for part in parts])), view, index)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.nonrigid import register, share_stretched, uncovered_share
+from scanprep.registration.nonrigid import register, share_stretched, share_uncovered
 from scanprep.threads import one_thread
 
 from ..body import BodyModel
@@ -92,7 +92,7 @@ def find_bodies(model: BodyModel, scan: Mesh | np.ndarray, landmarks: Landmarks 
 
     first = mesh_of(_solve(fit, few, starts[0]))
     # what is left uncovered so far off is a limb that is elsewhere; nobody needs to look at such a body
-    lost = uncovered_share(scan, first, FAR * size) > LOST
+    lost = share_uncovered(scan, first, FAR * size) > LOST
     if not lost:
         yield first
     for x in _solve_with_limbs(fit, few, starts):

@@ -157,10 +157,10 @@ def starting_poses(fit: ScanFit) -> np.ndarray:
         return typical_poses(body.pose_mean, body.pose_covariance, AXES)
     mean = body.pose_mean.copy()
     mean[0] = 0
-    return varied(np.concatenate([mean[None], body.known_poses]), POSES)
+    return pick_varied(np.concatenate([mean[None], body.known_poses]), POSES)
 
 
-def varied(poses: np.ndarray, count: int) -> np.ndarray:
+def pick_varied(poses: np.ndarray, count: int) -> np.ndarray:
     """Those `count` of the poses (M, J, 3), the first among them, that differ most from one another."""
     return poses if len(poses) <= count else poses[farthest_points(poses.reshape(len(poses), -1), count, 0)]
 
@@ -179,7 +179,7 @@ def all_rotations(count: int) -> np.ndarray:
 def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body = fit.body
-    poses, (turns, lift, up) = starting_poses(fit), placed_turns(fit)
+    poses, (turns, lift, up) = starting_poses(fit), candidate_rotations(fit)
     scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.posed_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.data.cameras]).reshape(-1, 3)
@@ -203,7 +203,7 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     cost = np.where(best, whole, np.inf)
     order = np.argsort(cost, axis=None, kind="stable")[:POOL]
     which, turn = np.unravel_index(order, cost.shape)
-    x = np.array([body.join(_rotated(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
+    x = np.array([body.join(_rotate_root(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
     stand = body.subject.origin
     x[:, body.n_angles:body.n_angles + 3] = (turns[turn] @ stand) + shift[which, turn] - stand
     return x, cost.ravel()[order]
@@ -233,7 +233,7 @@ def distance_cost(places: np.ndarray, normals: np.ndarray, turns: np.ndarray, sh
     return cost
 
 
-def placed_turns(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def candidate_rotations(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Rotations (T, 3, 3) to try, how high the body is placed in each (T,), and along which direction (T, 3).
 
     Its upper end is laid on that of the scan at 0, its lower end at 1. Of a body that stands as much as nothing may be
@@ -296,7 +296,7 @@ def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarra
     return np.minimum(nearest, CAP**2).reshape(len(turns), len(scan.points)).mean(axis=1)
 
 
-def _rotated(pose: np.ndarray, R: np.ndarray) -> np.ndarray:
+def _rotate_root(pose: np.ndarray, R: np.ndarray) -> np.ndarray:
     out = pose.copy()
     out[0] = rotations.log(R @ rotations.exp(pose[0]))
     return out

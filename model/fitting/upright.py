@@ -7,7 +7,7 @@ import numpy as np
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.skeleton.roles import LIMBS, numbered_roles
+from scanprep.skeleton.roles import LIMBS, find_numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 TILT = 0.35                          # radians that trunks of people who stand lean, standard deviation
@@ -53,7 +53,7 @@ class Upright:
 def standing_axis(template: Mesh, skeleton: Skeleton) -> np.ndarray | None:
     """The axis (3,) of a template's frame that points most from its legs to its head; None without head or legs."""
     part = skeleton.part_of_vertex(template)
-    roles = numbered_roles(skeleton.names, skeleton.joints)
+    roles = find_numbered_roles(skeleton.names, skeleton.joints)
     legs = [p for role, p in roles.items() if role[2:] in LIMBS["leg"]]
     if not legs or "skullbase" not in roles:
         return None

@@ -100,12 +100,12 @@ class PoseFitter:
     def fit(self, vertices: np.ndarray, start: np.ndarray | None = None) -> PoseFit:
         """Pose and place from all vertices (N, 3), from a start that is sought unless a pose (J, 3) is given."""
         subject, config, chosen = self.subject, self.config, self._chosen
-        vertices = _checked_vertices(vertices, subject.n_vertices)
+        vertices = _check_vertices(vertices, subject.n_vertices)
         J = len(subject.skeleton.parents)
         best: Minimum[np.ndarray] | None = None
-        for x in _starts(subject, vertices) if start is None else [_placed(subject, vertices, start)]:
-            found = _solved(_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
-                            config.tolerance)
+        for x in _starts(subject, vertices) if start is None else [_unknowns_of_pose(subject, vertices, start)]:
+            found = _minimise(_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
+                              config.tolerance)
             if best is None or found.energy[0] < best.energy[0]:
                 best = found
             if np.sqrt(found.energy[0] / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
@@ -113,7 +113,7 @@ class PoseFitter:
         assert best is not None
         steps = best.iterations
         if len(chosen) < subject.n_vertices and config.polish:
-            best = _solved(_equations(self._everything, vertices), best.x, J, config.polish, config.tolerance)
+            best = _minimise(_equations(self._everything, vertices), best.x, J, config.polish, config.tolerance)
             steps += best.iterations
         pose, trans = best.x[0, :3 * J].reshape(J, 3), best.x[0, 3 * J:]
         fitted = np.asarray(subject.vertices(pose, trans), dtype=np.float64)
@@ -167,16 +167,16 @@ class ShapeFitter:
     def fit(self, vertices: np.ndarray, start: PoseFit | None = None) -> ShapeFit:
         """Shape, pose and place from all vertices (N, 3), from a start that is sought unless a fit is given."""
         model, config, K = self.model, self.config, self.n_betas
-        vertices = _checked_vertices(vertices, len(model.template.vertices))
+        vertices = _check_vertices(vertices, len(model.template.vertices))
         J = len(model.skeleton.parents)
         start = start or self._mean_person.fit(vertices)
         betas = start.betas[:K] if isinstance(start, ShapeFit) else np.zeros(K)
         x = np.concatenate([start.pose.ravel(), start.trans, betas])
-        best = _solved(_equations(self._points, vertices[self._chosen], self._share), x[None], J,
-                       config.iterations, config.tolerance)
+        best = _minimise(_equations(self._points, vertices[self._chosen], self._share), x[None], J,
+                         config.iterations, config.tolerance)
         x, converged, steps = best.x[0], bool(best.converged[0]), best.iterations
         if len(self._chosen) < len(vertices) and config.polish:
-            x, converged, more = _polished(model, vertices, x, best.equations.hessian[0], config)
+            x, converged, more = _refine_all_vertices(model, vertices, x, best.equations.hessian[0], config)
             steps += more
         pose, trans, betas = twists(x[:3 * J].reshape(J, 3)), x[3 * J:3 * J + 3], np.zeros(model.n_betas)
         betas[:K] = x[3 * J + 3:]
@@ -203,18 +203,18 @@ def _starts(subject: Subject, vertices: np.ndarray) -> list[np.ndarray]:
     stiff = np.broadcast_to(R[0], R.shape)
     starts = []
     for rotations in (R, stiff):
-        starts.append(_placed(subject, vertices, subject.skeleton.pose_of(rotations.copy())))
+        starts.append(_unknowns_of_pose(subject, vertices, subject.skeleton.pose_of(rotations.copy())))
     return starts
 
 
-def _placed(subject: Subject, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def _unknowns_of_pose(subject: Subject, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Unknowns (3J + 3,) for a pose, standing where it fits best."""
     posed = np.asarray(subject.vertices(pose), dtype=np.float64)
     return np.concatenate([pose.ravel(), (vertices - posed).mean(axis=0)])
 
 
-def _solved(equations: Callable[[np.ndarray], Dense], x: np.ndarray, J: int, iterations: int, tolerance: float
-            ) -> Minimum[np.ndarray]:
+def _minimise(equations: Callable[[np.ndarray], Dense], x: np.ndarray, J: int, iterations: int, tolerance: float
+              ) -> Minimum[np.ndarray]:
     """Unknowns (1, P) whose first are a pose, which is kept below π."""
     def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
         out = x + step
@@ -238,8 +238,8 @@ def _equations(points: PointOperator | ShapedPoints, target: np.ndarray, weights
     return equations
 
 
-def _polished(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.ndarray, config: FitConfig
-              ) -> tuple[np.ndarray, bool, int]:
+def _refine_all_vertices(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.ndarray, config: FitConfig
+                         ) -> tuple[np.ndarray, bool, int]:
     """The unknowns (P,) at the minimum over all vertices, near that of a sample with a Gauss-Newton matrix (P, P).
 
     By gradients alone, the matrix is where BFGS begins: whether it converged, and how many steps it took.
@@ -268,7 +268,7 @@ def _distances(fitted: np.ndarray, vertices: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt((far**2).mean())), float(far.mean())
 
 
-def _checked_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
+def _check_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
     vertices = np.asarray(vertices, dtype=np.float64)
     if vertices.shape != (count, 3):
         raise ValueError(f"vertices: expected shape ({count}, 3), got {vertices.shape}")

@@ -19,7 +19,7 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
-from ..digests import body_digests, checked_bodies, digest
+from ..digests import body_digests, check_bodies, digest
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
@@ -97,7 +97,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
                          f"{config.regressor!r} and {config.refinements}")
     check_template(template)
     check_skeleton(template, skeleton)
-    bodies = checked_bodies(template, bodies, "bodies", 2)
+    bodies = check_bodies(template, bodies, "bodies", 2)
     who, parts = number_people(subjects, len(bodies)), BlendedTemplate(template, skeleton, rigid_weights(skeleton))
     mix, inputs = Mix(parts, bodies, who, config), (parts, bodies, who, config)
 
@@ -227,7 +227,7 @@ def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
     """
     designs = (make_design(template, skeleton, poses, config, pruning, ridge)
                for pruning, ridge in product(config.prunings, config.ridges))
-    return min((replace(design, left_out_error=_left_out_error(design, poses, Q, who)) for design in designs),
+    return min((replace(design, left_out_error=_leave_out_error(design, poses, Q, who)) for design in designs),
                key=attrgetter("left_out_error"))
 
 
@@ -248,7 +248,7 @@ def _operator(X: np.ndarray, ridge: float) -> np.ndarray:
     return np.linalg.solve(X.T @ X + np.diag(penalty), X.T)
 
 
-def _left_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> float:
+def _leave_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> float:
     """Root mean square error in metres of the edges of left-out people, apart from what is their own."""
     within = Within(who)
     delta, total = within(design.features.evaluate(poses)), 0.0

@@ -76,8 +76,8 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     def tried(parts: int | None) -> tuple[Skeleton, float] | None:
         name = "best parts" if parts is None else f"{parts} parts"
         return step(name, (template, poses, settings, parts, QUICK, VERTICES, known),
-                    lambda: _tried(finder, parts, coarse, poses[:, vertices],
-                                   None if known is None else known[:, vertices]))
+                    lambda: _try_parts(finder, parts, coarse, poses[:, vertices],
+                                       None if known is None else known[:, vertices]))
 
     first = tried(None)
     assert first is not None, "what goes wrong without a count of parts is raised"
@@ -98,15 +98,15 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     return ChosenSkeleton(best, errors)
 
 
-def _tried(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray, known: np.ndarray | None
-           ) -> tuple[Skeleton, float] | None:
+def _try_parts(finder: SkeletonFinder, parts: int | None, coarse: Mesh, poses: np.ndarray, known: np.ndarray | None
+               ) -> tuple[Skeleton, float] | None:
     """A skeleton and its error on coarse bodies (M, n, 3), with those of a prior (K, n, 3).
 
     None where there is no tree of so many parts, or parts are too small to compare.
     """
     try:
         found = finder.skeleton(finder.runs[0] if parts is None else finder.first, parts)[0]
-        return found, _left_out_error(poses, coarse_skeleton(found, finder.template, coarse), coarse, known)
+        return found, _leave_out_error(poses, coarse_skeleton(found, finder.template, coarse), coarse, known)
     except ValueError:
         if parts is None:
             raise
@@ -137,7 +137,7 @@ def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleto
     return Skeleton(part, skeleton.parents, joints)
 
 
-def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, known: np.ndarray | None) -> float:
+def _leave_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, known: np.ndarray | None) -> float:
     """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
     parts, prior = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton)), None
     if known is not None:

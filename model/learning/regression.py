@@ -11,7 +11,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from ..features import PoseFeatures, QuadraticLift, linear_features, part_features
-from ..pose_space import PoseSpace, faces_of_part, kept_directions, nearest_joints
+from ..pose_space import PoseSpace, faces_of_part, nearest_joints, principal_directions
 from .config import LearnConfig
 
 
@@ -145,7 +145,7 @@ def make_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: L
     """One design: for every part a constant, the twist directions of its joints that vary in the poses, and where they
     are asked for the products of these.
     """
-    kept = kept_directions(poses, pruning)
+    kept = principal_directions(poses, pruning)
     features = linear_features(skeleton, kept) if config.features == "linear" else part_features(
         skeleton, QuadraticLift(), [QuadraticLift.of_directions(each) for each in kept])
     return Design(template, features, _groups(template, features), config.regressor, pruning, ridge)
@@ -171,7 +171,7 @@ def ridge_operator(centred: np.ndarray, penalty: float) -> np.ndarray:
     return centred.T @ np.linalg.inv(centred @ centred.T + (penalty + 1e-12) * np.eye(M))
 
 
-def _left_out_operator(design: Design, delta: np.ndarray, used: np.ndarray) -> np.ndarray:
+def _leave_out_operator(design: Design, delta: np.ndarray, used: np.ndarray) -> np.ndarray:
     """(M, M) from what is regressed on features `used` of the poses' (M, A) to how far each pose is off where ridge
     regression on the others predicts it, in closed form.
     """
@@ -180,14 +180,14 @@ def _left_out_operator(design: Design, delta: np.ndarray, used: np.ndarray) -> n
     return (np.eye(len(X)) - hat) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
 
 
-def left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
+def predict_left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """Q (M, F, 3, 3) of every pose as ridge regression on the other poses predicts it."""
     delta, out = design.features.evaluate(poses), np.empty_like(Q)
     known = 0.0 if design.prior is None else design.prior.gradients(poses)
     Q = Q - known
     for _, used, faces in design.groups:
         target = Q[:, faces].reshape(len(Q), -1)
-        predicted = target - _left_out_operator(design, delta, used) @ target
+        predicted = target - _leave_out_operator(design, delta, used) @ target
         out[:, faces] = predicted.reshape(len(Q), len(faces), 3, 3)
     return out + known
 
@@ -208,7 +208,7 @@ def by_edges(template: Mesh, poses: np.ndarray, Q: np.ndarray) -> Judge:
                 products.append(edges @ edges.T)
         delta, total = design.features.evaluate(poses), 0.0
         for (_, used, _), product in zip(design.groups, products, strict=True):
-            off = _left_out_operator(design, delta, used)
+            off = _leave_out_operator(design, delta, used)
             total += float(((off @ product) * off).sum())
         return float(np.sqrt(max(total, 0.0) / (len(Q) * 2 * len(template.faces))))
 

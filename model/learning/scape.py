@@ -22,11 +22,11 @@ from scanprep.threads import one_thread
 from ..blend_weights import face_weights
 from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel, Progress
-from ..digests import body_digest, body_digests, checked_bodies, digest
+from ..digests import body_digest, body_digests, check_bodies, digest
 from ..features import twists
 from ..fitting.vertices import FitConfig, PoseFitter
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients, shape_gradients
-from ..human_poses import mixed, with_human_poses
+from ..human_poses import mix_moments, with_human_poses
 from ..linear import Subject
 from ..pose_space import PoseSpace
 from ..priors import CRUDE, STIFF, stiff_joints
@@ -34,7 +34,7 @@ from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, add_people, body_volumes, learn_shape_space
 from .config import LearnConfig
 from .prior import TemplatePrior
-from .regression import Design, by_edges, choose_design, compress, left_out
+from .regression import Design, by_edges, choose_design, compress, predict_left_out
 
 T = TypeVar("T")
 POSES = 2 / 3                        # of the time of learning, where there are people as well
@@ -110,7 +110,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
-    return ScapeModel(template, skeleton, **_learned(parts, poses, shapes, config, Work(progress, step), prior))
+    return ScapeModel(template, skeleton, **_learn_spaces(parts, poses, shapes, config, Work(progress, step), prior))
 
 
 @one_thread()
@@ -134,23 +134,23 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     [BlendSCAPE]
     """
-    checked_training(template, skeleton, poses, shapes, prior)
+    check_training(template, skeleton, poses, shapes, prior)
     # a share of the template's diagonal: so far a rotation blends over the border of its part
     blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
-    learned = _learned(parts, poses, shapes, config, Work(progress, step), prior)
+    learned = _learn_spaces(parts, poses, shapes, config, Work(progress, step), prior)
     return BlendScapeModel(template, skeleton, **learned, blend=blend)
 
 
-def _learned(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig | None,
-             work: Work, prior: TemplatePrior | None) -> dict[str, Any]:
+def _learn_spaces(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig | None,
+                  work: Work, prior: TemplatePrior | None) -> dict[str, Any]:
     """Pose space, shape space, pose prior and info of a SCAPE model of either kind."""
     config = config or LearnConfig()
-    poses, shapes = checked_training(parts.template, parts.skeleton, poses, shapes, prior)
+    poses, shapes = check_training(parts.template, parts.skeleton, poses, shapes, prior)
     learned = learn_pose_with(prior, parts, poses, config, work)                           # [SCAPE] Eq. 3, Eq. 4, Eq. 5
     people = learn_people(parts, learned.space, shapes, config, work, prior)               # [SCAPE] Eq. 7, Eq. 8
     return {"pose_space": learned.space, "shape_space": people,
-            **seen_in_training(parts.template, parts.skeleton, learned, poses, shapes, config, prior)}
+            **training_metadata(parts.template, parts.skeleton, learned, poses, shapes, config, prior)}
 
 
 def learn_pose_with(prior: TemplatePrior | None, parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig,
@@ -200,7 +200,7 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
         learned = inner.step("first fit", inputs, share, first)
         for k in range(config.refinements):
             learned = inner.step(f"refinement {k}", inputs, share,
-                                 partial(_refined, parts, system, bodies, config, learned, k == 0))
+                                 partial(_refine, parts, system, bodies, config, learned, k == 0))
         # features are joined to the few mixtures that matter, in the poses seen and in those of the prior
         tolerance = config.detail * template.mean_edge
         seen = learned.poses if prior is None else np.concatenate([learned.poses, prior.poses])
@@ -210,8 +210,8 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
     return work.step("pose space" if prior is None else "pose space with the prior", inputs, share, learn)
 
 
-def _refined(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig,
-             learned: LearnedPose, choosing: bool, work: Work) -> LearnedPose:
+def _refine(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig,
+            learned: LearnedPose, choosing: bool, work: Work) -> LearnedPose:
     """The part rotations fitted anew, and Q regressed again on what the stitched model leaves.
 
     Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So what the stitched model
@@ -231,7 +231,7 @@ def _refined(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray,
             def by_vertices(tried: Design, Q: np.ndarray = Q) -> float:
                 """The mean distance of the stitched vertices of left-out poses, well placed, metres."""
                 off = np.stack([parts.stitched(predicted, pose) - body for body, pose, predicted in
-                                zip(bodies, poses, left_out(tried, poses, Q), strict=True)])
+                                zip(bodies, poses, predict_left_out(tried, poses, Q), strict=True)])
                 return float(np.linalg.norm(off - off.mean(axis=1, keepdims=True), axis=2).mean())
 
             design = choose_design(parts.template, parts.skeleton, poses, config, by_vertices, design, design.prior)
@@ -311,9 +311,9 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
     return S
 
 
-def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, poses: np.ndarray,
-                     shapes: np.ndarray | None, config: LearnConfig, prior: TemplatePrior | None = None
-                     ) -> dict[str, Any]:
+def training_metadata(template: Mesh, skeleton: Skeleton, learned: LearnedPose, poses: np.ndarray,
+                      shapes: np.ndarray | None, config: LearnConfig, prior: TemplatePrior | None = None
+                      ) -> dict[str, Any]:
     """What a model keeps of its making: the pose prior, its examples, and settings, choices, sizes and digests."""
     design, examples = learned.design, pose_examples(template, skeleton, learned.poses, shapes)
     mean, covariance = pose_prior(template, skeleton, examples, len(poses))
@@ -369,7 +369,7 @@ def pose_prior(template: Mesh, skeleton: Skeleton, examples: np.ndarray, count: 
         return kind.mean(axis=0).reshape(-1, 3), off.T @ off / max(1, len(kind) - one_kind)
 
     taken = with_human_poses(template, skeleton, count, *moments(flat[:count]))
-    return taken if one_kind else mixed(taken, moments(flat[count:]), 0.5)
+    return taken if one_kind else mix_moments(taken, moments(flat[count:]), 0.5)
 
 
 def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None = None
@@ -385,16 +385,16 @@ def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes:
     return out
 
 
-def checked_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None,
-                     prior: TemplatePrior | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+def check_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None,
+                   prior: TemplatePrior | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """Poses (M, N, 3) and people (P, N, 3) that a model can be learned from, or ValueError."""
     if prior is not None and prior.poses.shape[1:] != template.vertices.shape:
         raise ValueError(f"prior: it was brought to a template of {prior.poses.shape[1]} vertices, not to this one of "
                          f"{len(template.vertices)}")
     check_template(template)
     check_skeleton(template, skeleton)
-    return (checked_bodies(template, poses, "poses", 2 if prior is None else 1),
-            None if shapes is None else checked_bodies(template, shapes, "shapes", 2))
+    return (check_bodies(template, poses, "poses", 2 if prior is None else 1),
+            None if shapes is None else check_bodies(template, shapes, "shapes", 2))
 
 
 def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:

@@ -20,7 +20,7 @@ from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from ..shape_statistics import PLANE, SEXES
 from .config import LearnConfig
 from .prior import TemplatePrior
-from .scape import POSES, Progress, Work, checked_training, learn_pose_with, seen_in_training, shape_deformations
+from .scape import POSES, Progress, Work, check_training, learn_pose_with, shape_deformations, training_metadata
 
 
 @one_thread()
@@ -53,7 +53,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
     config = config or LearnConfig()
-    poses, people = checked_training(template, skeleton, poses, shapes, prior)
+    poses, people = check_training(template, skeleton, poses, shapes, prior)
     assert people is not None
     sex, groups = np.array(list(sexes), dtype=object), _groups(sexes, len(people))
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))
@@ -72,7 +72,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
 
     spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
                                                    list(sexes)), 1 - POSES, learn)
-    kept = seen_in_training(template, skeleton, learned, poses, people, config, prior)
+    kept = training_metadata(template, skeleton, learned, poses, people, config, prior)
     if prior is not None:
         kept["info"]["prior_people"] = 0.0                 # shapes are those of the people alone
     models = {}

@@ -13,15 +13,15 @@ from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
-from ..blend_weights import diffused, diffused_weights, fit_weights, strongest
+from ..blend_weights import diffuse, diffuse_weights, fit_weights, strongest
 from ..digests import body_digest, digest
 from ..features import LinearLift, PoseFeatures, part_features
 from ..fitting.vertices import FitConfig, PoseFitter, ShapeFitter
-from ..pose_space import kept_directions
+from ..pose_space import principal_directions
 from ..shape_space import body_volumes, learn_shape_space
-from ..skinning import SkinningModel, unblended
+from ..skinning import SkinningModel, invert_blended
 from .regression import ridge_operator
-from .scape import POSES, Progress, Work, checked_training, fit_poses, pose_examples, pose_prior
+from .scape import POSES, Progress, Work, check_training, fit_poses, pose_examples, pose_prior
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
 PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
@@ -72,7 +72,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
         As `learn_scape`.
     """
     config = config or SkinConfig()
-    poses, shapes = checked_training(template, skeleton, poses, shapes)
+    poses, shapes = check_training(template, skeleton, poses, shapes)
     kinds, work = (False, True) if config.correctives else (False,), Work(progress, step)
 
     def learn(inner: Work) -> tuple[SkinningModel, np.ndarray]:
@@ -99,7 +99,7 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
     """The template itself, with weights that pass smoothly from part to part, and no correctives."""
     J, N = len(skeleton.parents), len(template.vertices)
     constants = corrective_features(skeleton, np.zeros((1, J, 3)), False)
-    weights = strongest(diffused_weights(template, skeleton, config.width), config.parts, 1e-3)
+    weights = strongest(diffuse_weights(template, skeleton, config.width), config.parts, 1e-3)
     return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
                          template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
@@ -108,7 +108,7 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
 def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, share: float,
                 work: Work) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
-    allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
+    allowed = diffuse_weights(model.template, model.skeleton, 2 * config.width) > 0
     model = replace(model, info={"left_out_error": np.inf})
     for k in range(config.rounds):
         tried, fitted = work.step(f"correctives {config.correctives}, round {k}", (model, poses, bodies, config),
@@ -131,7 +131,7 @@ def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, all
     return _with_correctives(tried, fitted, bodies, config), fitted
 
 
-def _carried(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
+def _carry_by_each_part(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
     """(J, N, 3) where each part alone would carry each vertex, the whole standing where the body stands."""
     R, turns = model.skeleton.part_rotations(pose), model.joint_turns(pose)
     offset = np.einsum("pj,jde,je->pd", model.skeleton.descends.astype(float), turns,
@@ -143,7 +143,7 @@ def _carried(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.nda
 def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray,
                   config: SkinConfig) -> SkinningModel:
     """The model with weights fitted to the bodies at their poses."""
-    carried = [_carried(model, p, y) for p, y in zip(poses, bodies, strict=True)]
+    carried = [_carry_by_each_part(model, p, y) for p, y in zip(poses, bodies, strict=True)]
     weights = fit_weights(carried, bodies, model.template, model.weights, allowed)
     return replace(model, weights=strongest(weights, config.parts, 1e-3))
 
@@ -182,7 +182,7 @@ def _with_joints_at(model: SkinningModel, wanted: np.ndarray) -> SkinningModel:
 def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig
                       ) -> SkinningModel:
     """The model with rest vertices and correctives regressed on the unposed bodies."""
-    unposed = np.stack([_unposed(model, p, y) for p, y in zip(poses, bodies, strict=True)])
+    unposed = np.stack([_unpose(model, p, y) for p, y in zip(poses, bodies, strict=True)])
     features = corrective_features(model.skeleton, poses, config.correctives)
     joints = _acting_joints(model)
     ridges = RIDGES if features.count > len(features.starts) else RIDGES[:1]
@@ -193,11 +193,11 @@ def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarra
                    info={"ridge": ridge, "left_out_error": error})
 
 
-def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
+def _unpose(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
     """(N, 3) rest vertices, correctives included, that the model with its joints carries onto a body."""
     y = model.vertices(pose)
     left = body - y
-    moved = np.einsum("nij,nj->ni", unblended(model.blended(pose)), left - left.mean(axis=0))
+    moved = np.einsum("nij,nj->ni", invert_blended(model.blended(pose)), left - left.mean(axis=0))
     return model.rest + model.corrections(pose) + moved
 
 
@@ -205,7 +205,7 @@ def corrective_features(skeleton: Skeleton, poses: np.ndarray, correctives: bool
     """For every joint a constant, and its kept twist directions where there are correctives."""
     J = len(skeleton.parents)
     # rad²: twist directions of smaller variance correct nothing
-    directions = kept_directions(poses, 0.01) if correctives else [np.zeros((3, 0))] * J
+    directions = principal_directions(poses, 0.01) if correctives else [np.zeros((3, 0))] * J
     return part_features(skeleton, LinearLift(), directions, [[j] for j in range(J)])
 
 
@@ -219,7 +219,7 @@ def _acting_joints(model: SkinningModel) -> np.ndarray:
         # two joints correct a vertex: those of its heaviest part that are nearest to it
         acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :2]]] = 1
     # over 5 cm of surface a joint's correctives give way to another's; vertices of one of eight levels share a solve
-    return np.round(8 * diffused(model.template, acting, 0.05)) / 8
+    return np.round(8 * diffuse(model.template, acting, 0.05)) / 8
 
 
 def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float
@@ -252,13 +252,13 @@ def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, wor
         quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
         fitter = ShapeFitter(model, quick) if k else PoseFitter(model.subject(), quick)
         people = np.stack([work.step(f"round {k}, person {body_digest(body)}", (model, quick, k, body), share,
-                                     partial(_unposed_person, model, fitter, body)) for body in shapes])
+                                     partial(_unpose_person, model, fitter, body)) for body in shapes])
         space = learn_shape_space(people, components, body_volumes(model.template, people))
         model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
                         shape_variances=space.variances, shape_total=space.total_variance)
     return model
 
 
-def _unposed_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray, _: Work) -> np.ndarray:
+def _unpose_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray, _: Work) -> np.ndarray:
     """(N, 3) rest vertices of a person whose pose is fitted."""
     return model.unposed(body, fitter.fit(body).pose)

@@ -87,7 +87,7 @@ def plain(name: str) -> str:
     return name.removesuffix("_left").removesuffix("_right")
 
 
-def named(word: str) -> Sequence[str]:
+def find_measurements(word: str) -> Sequence[str]:
     """The measurements that a user's word means: `waist` the waist girth, `thigh` both thighs' girths.
 
     Raises

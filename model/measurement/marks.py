@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanprep.geometry.landmark_names import known_landmarks
+from scanprep.geometry.landmark_names import translate_landmarks
 from scanprep.geometry.mesh import Mesh
 
 FEET = tuple(f"{side} {name}" for side in ("left", "right") for name in ("toe", "heel"))
@@ -52,7 +52,7 @@ def places_of(mesh: Mesh, landmarks: Mapping[str, int]) -> Places:
     ValueError
         No toes and heels, or nothing above: then nothing tells which way is up, and where the front is.
     """
-    known = known_landmarks(landmarks)
+    known = translate_landmarks(landmarks)
     lacking = [name for name in FEET if name not in known]
     if lacking or not set(ABOVE) & set(known):
         raise ValueError(f"landmarks: expected at least {', '.join(FEET)}, and one of {', '.join(ABOVE)}; there is no "

@@ -96,9 +96,9 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
             readings[name] = read(tapes.found[name], standing, tapes)
         except NotMeasured as problem:
             missing[name] = str(problem)
-    errors = {name: reading.unknown if expected_error is None else measured_error(reading, vertices, expected_error)
+    errors = {name: reading.unknown if expected_error is None else measurement_error(reading, vertices, expected_error)
               for name, reading in readings.items() if expected_error is not None or reading.unknown}
-    return Measurements(readings, missing, turned_limbs(tapes, standing), axes, errors)
+    return Measurements(readings, missing, find_turned_limbs(tapes, standing), axes, errors)
 
 
 def laid_on(template: Mesh, vertices: np.ndarray) -> np.ndarray:
@@ -116,10 +116,10 @@ def stands(vertices: np.ndarray, tapes: Tapes) -> bool:
     """Whether a body (N, 3) stands so nearly as its template that it need not be brought into that pose."""
     mesh = tapes.template.with_vertices(vertices)
     # half of what changes little is not worth the millimetres that another pose costs
-    return not turned_limbs(tapes, Standing(mesh, tapes.axes @ laid_on(tapes.template, vertices).T), 0.5)
+    return not find_turned_limbs(tapes, Standing(mesh, tapes.axes @ laid_on(tapes.template, vertices).T), 0.5)
 
 
-def turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple[str, ...]:
+def find_turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple[str, ...]:
     """Limbs that point elsewhere than on the template, by more than a share of what changes little, in words."""
     found = []
     for name, (first, second) in tapes.limbs.items():
@@ -132,7 +132,7 @@ def turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple[str,
     return tuple(found)
 
 
-def measured_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray) -> float:
+def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarray) -> float:
     """Expected error, root mean square, of a measurement, in its unit.
 
     The derivative by the vertices is applied to errors that are alike in all directions and go together over some

@@ -72,11 +72,11 @@ def read(found: Found, body: Standing, tapes: Tapes) -> Reading:
 
 @read.register
 def _girth(found: Girth, body: Standing, tapes: Tapes) -> Reading:
-    cut = _taped(found, body, tapes)
+    cut = _cut_girth(found, body, tapes)
     points = cut.points[cut.hull]
     apart = np.abs(cut.hull - np.roll(cut.hull, 1))
     value, pull = around(points, (apart == 1) | (apart == len(cut.points) - 1))       # next to each other on the skin
-    return Reading(value, np.concatenate([points, points[:1]]), *_moved(found, cut, cut.hull, pull, body))
+    return Reading(value, np.concatenate([points, points[:1]]), *_section_derivative(found, cut, cut.hull, pull, body))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def _plane(found: Girth, body: Standing) -> tuple[np.ndarray, np.ndarray]:
     return found.centre.at(body.vertices), normal
 
 
-def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
+def _cut_girth(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     """The section of a girth, cut anew by its carried plane; NotMeasured where it is not closed.
 
     A thigh or an upper arm is measured as near to the trunk as it is on its own: its plane moves on in twelve steps, of
@@ -127,8 +127,8 @@ def _taped(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
     raise NotMeasured("its plane runs out of the part it goes around")
 
 
-def _moved(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: Standing
-           ) -> tuple[np.ndarray, np.ndarray, float]:
+def _section_derivative(found: Girth, cut: _Cut, chosen: np.ndarray, pull: np.ndarray, body: Standing
+                        ) -> tuple[np.ndarray, np.ndarray, float]:
     """What vertices add where they pull at points of a section, the plane moving with them.
 
     `chosen` (m,) points of the section, `pull` (m, 3) the derivative by them; vertices (k,), their force (k, 3), and
@@ -164,11 +164,11 @@ def _plane_pull(found: Girth, out: np.ndarray, apart: np.ndarray, normal: np.nda
 def _span(found: Span, body: Standing, tapes: Tapes) -> Reading:
     girth = tapes.found[found.girth]
     assert isinstance(girth, Girth)
-    cut, way = _taped(girth, body, tapes), body.axes[found.axis]
+    cut, way = _cut_girth(girth, body, tapes), body.axes[found.axis]
     along = cut.points[cut.hull] @ way
     ends = cut.hull[[along.argmin(), along.argmax()]]
     drawn = _through(cut.points[ends].mean(axis=0), cut.points[ends], way)
-    return Reading(float(np.ptp(along)), drawn, *_moved(girth, cut, ends, np.stack([-way, way]), body))
+    return Reading(float(np.ptp(along)), drawn, *_section_derivative(girth, cut, ends, np.stack([-way, way]), body))
 
 
 def _through(middle: np.ndarray, points: np.ndarray, way: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..body import BodyModel
-from ..shape_statistics import Sex, known_sexes, shape_statistics
-from .catalogue import CATALOGUE, named, plain
+from ..shape_statistics import Sex, list_sexes, shape_statistics
+from .catalogue import CATALOGUE, find_measurements, plain
 from .measure import measure
 from .reading import DENSITY_SPREAD
 from .tapes import Tapes
@@ -83,7 +83,7 @@ def alike(wanted: Mapping[str, float]) -> list[list[str]]:
     return list(groups.values())
 
 
-def checked_wanted(given: Mapping[str, float]) -> dict[str, float]:
+def check_wanted(given: Mapping[str, float]) -> dict[str, float]:
     """Metres and kilograms by names of the catalogue, of a user's words.
 
     Raises
@@ -98,7 +98,7 @@ def checked_wanted(given: Mapping[str, float]) -> dict[str, float]:
     """
     wanted = dict[str, float]()
     for word, value in given.items():
-        for name in named(word):
+        for name in find_measurements(word):
             usual = CATALOGUE[name]
             if not usual.low <= value <= usual.high:
                 unit = "metres" if usual.unit == "m" else "kilograms"
@@ -152,14 +152,14 @@ def body_with_measurements(model: BodyModel, tapes: Tapes, given: Mapping[str, f
     """
     if not model.n_betas:
         raise ValueError("model: it has no shape components, so it has one body only")
-    wanted = checked_wanted(given)
+    wanted = check_wanted(given)
     lacking = [f"{name}: {tapes.missing.get(name, 'not found on the template')}" for name in wanted
                if name not in tapes.found]
     if lacking:
         raise ValueError(f"cannot be measured on this template: {'; '.join(lacking)}")
     pose = np.zeros((len(model.skeleton.parents), 3))
     base, moves = model.vertices(pose, np.zeros(model.n_betas)), model.shape_jacobian(pose)
-    of = [sex] if sex is not None or len(known_sexes(model)) < 2 else list(known_sexes(model))
+    of = [sex] if sex is not None or len(list_sexes(model)) < 2 else list(list_sexes(model))
     found = []
     for one in of:
         people = shape_statistics(model, one)

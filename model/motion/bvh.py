@@ -49,11 +49,11 @@ def read_bvh(path: str | Path, unit: str, rate: float | None = None) -> MovingSk
     metre = metres_of(unit)
     data = read_bytes(path, "a BVH file")
     with taking_apart(path, "a BVH file"):
-        lines = tables.decoded(data).splitlines()
+        lines = tables.decode_text(data).splitlines()
     words = _Words(path, lines)
     joints, ends = _read_hierarchy(words)
     table, own_rate = _read_motion(words, joints, rate)
-    R, places = _posed(joints, table, metre)
+    R, places = _forward_kinematics(joints, table, metre)
     names, parents, offsets, _ = zip(*joints, strict=True)
     return MovingSkeleton(names, np.array(parents), metre * np.array(offsets),
                           {j: metre * np.array(end) for j, end in ends.items()}, R, places, own_rate)
@@ -182,7 +182,7 @@ def _read_joint(words: _Words, parent: int, names: set[str]) -> _Joint:
     return _Joint(name, parent, offset, channels)
 
 
-def _posed(joints: list[_Joint], table: np.ndarray, metre: float) -> tuple[np.ndarray, np.ndarray]:
+def _forward_kinematics(joints: list[_Joint], table: np.ndarray, metre: float) -> tuple[np.ndarray, np.ndarray]:
     """World rotations (T, J, 3, 3) and places (T, J, 3), metres, of the joints by their channels (T, C).
 
     Channels of position are the offset itself or its change. Bones tell which: their length is that of the offset. The

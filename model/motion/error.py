@@ -39,7 +39,7 @@ class Followed:
         return float(self.distances.mean())
 
 
-def followed(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
+def measure_error(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
     """The error of a body in poses (T, J, 3), with its joints at centres (T, J, 3), against the motion of the pair.
 
     Bones differ in length, so the joints of the motion are set out anew from the middle of the hips: in the directions

@@ -93,17 +93,17 @@ def read_motion_file(path: str | Path, more: Collection[str] = (), parts: int | 
             continue
     if "poses" not in a and _whole_body(a):
         with storage.taking_apart(path, "a whole motion"):
-            a["poses"] = _joined(a)
+            a["poses"] = _join_poses(a)
     places = [a[name] for name in _PLACES if name in a]
     lacking = [name for name, found in (("poses", "poses" in a), ("trans", places)) if not found]
     if lacking:
         raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
     a["trans"] = places[0]
     with storage.taking_apart(path, "a whole motion"):
-        return _restored(path, a, more, parts, rate)
+        return _restore_motion(path, a, more, parts, rate)
 
 
-def _joined(a: dict[str, np.ndarray]) -> np.ndarray:
+def _join_poses(a: dict[str, np.ndarray]) -> np.ndarray:
     """(T, 3J) poses of their pieces: the body, and the face and hands where all of these are there as rotations.
 
     Hands as a few components of a hand model, which only that model can expand, are left out.
@@ -118,8 +118,8 @@ def _joined(a: dict[str, np.ndarray]) -> np.ndarray:
     return flat if flat.shape[1] // 3 in JOINTS else np.concatenate([found[0][0], body], axis=1)
 
 
-def _restored(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts: int | None,
-              rate: float | None) -> StoredMotion:
+def _restore_motion(path: Path, a: dict[str, np.ndarray], more: Collection[str], parts: int | None,
+                    rate: float | None) -> StoredMotion:
     made_for = storage.text(a, "surface_model_type", "")
     if not made_for.lower().startswith((*OURS, *FAMILY)) and made_for:
         raise StorageError(f"{path}: expected surface_model_type '{OURS[0]}', found '{made_for}'")

@@ -10,17 +10,17 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
-from scanprep.skeleton.roles import numbered_roles
+from scanprep.skeleton.roles import find_numbered_roles
 
 from ..body import BodyModel
 from ..linear import Subject
 from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
-from .error import Followed, followed
+from .error import Followed, measure_error
 from .files import betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
-from .retarget import Pairing, Retargeted, retargeted
-from .same import copied
+from .retarget import Pairing, Retargeted, retarget_pair
+from .same import copy_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject
     """A motion of another skeleton on a body, if none is given the mean person's."""
     subject = subject or model.subject(np.zeros(1) if model.n_betas else None)
     skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
-    same = copied(skeleton, subject.template, subject.vertices, moving)
+    same = copy_motion(skeleton, subject.template, subject.vertices, moving)
     if same is not None:
         return BodyMotion(same.poses, same.trans, subject.betas, same.rate, gender,
                           "part by part, of the same skeleton", brought=same)
@@ -120,10 +120,10 @@ def _onto(path: Path, moving: MovingSkeleton, model: BodyModel, subject: Subject
         uncertain = f"that of frame {frame}, in which it stands: the file has none of a person who does"
     try:
         pair = Pairing(skeleton, subject.vertices, moving)
-        found = retargeted(pair)
+        found = retarget_pair(pair)
     except ValueError as problem:
         raise StorageError(f"{path}: {problem}") from None
-    fit = followed(pair, found.poses, subject.joints(found.poses, found.trans))
+    fit = measure_error(pair, found.poses, subject.joints(found.poses, found.trans))
     return BodyMotion(found.poses, found.trans, subject.betas, found.rate, gender, "by the directions of the segments",
                       uncertain, found, fit)
 
@@ -134,7 +134,7 @@ def standing_rest(moving: MovingSkeleton) -> tuple[MovingSkeleton, int | None]:
     Some files have bones at rest that all lie along one axis. A skeleton that stands at rest, or never, is returned as
     it is, and None. The vertical is y, as BVH says, or z where nobody stands along y.
     """
-    roles = numbered_roles(moving.names, moving.rest)
+    roles = find_numbered_roles(moving.names, moving.rest)
     chains = [[roles.get(f"{side}_{name}") for name in ("shoulder", "hip", "knee", "ankle")] for side in "lr"]
     if any(j is None for chain in chains for j in chain):
         return moving, None

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import rotations
-from scanprep.skeleton.roles import NEEDED, above, numbered_roles, trunk, way
+from scanprep.skeleton.roles import NEEDED, above, find_numbered_roles, trunk, way
 from scanprep.skeleton.tree import Skeleton
 
 from ..rig import check_motion, joint_places
 from .moving import MovingSkeleton
-from .trunks import grouped, heights, nearest_starts, spread
+from .trunks import group_trunk, heights, nearest_starts, spread
 
 Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres
 
@@ -67,8 +67,8 @@ class Pairing:
         self.joints = skeleton.joints.copy()
         for j, p in enumerate(skeleton.parents[1:], start=1):
             self.joints[j] = self.joints[p] + self.P[p].T @ (skeleton.joints[j] - skeleton.joints[p])
-        self.ours = numbered_roles(skeleton.names, skeleton.joints)
-        self.theirs = numbered_roles(moving.names, moving.rest)
+        self.ours = find_numbered_roles(skeleton.names, skeleton.joints)
+        self.theirs = find_numbered_roles(moving.names, moving.rest)
         for what, found, names in (("body", self.ours, skeleton.names), ("motion", self.theirs, moving.names)):
             missing = [role for role in NEEDED if role not in found]
             if missing:
@@ -135,7 +135,7 @@ class Pairing:
             links = [b if self.skeleton.parents[b] == a else a for a, b in pairwise(below)]
             starts = nearest_starts(heights(self.joints, links, self.ours), heights(moving.rest, joints, self.theirs))
             carried = [self.theirs[role] for role in ("l_shoulder", "r_shoulder", "skullbase") if role in self.theirs]
-            out, told = grouped(moving, joints, starts, parts, carried)
+            out, told = group_trunk(moving, joints, starts, parts, carried)
         else:
             out, told = {}, {}
         more = spread(moving, necks, beyond[1:])
@@ -158,7 +158,7 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retargeted(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
+def retarget_pair(pair: Pairing, aligned: bool = False, girdle: float = 0.2, here: bool = False) -> Retargeted:
     """The motion of the pair's skeleton on its body; `aligned`: the body rests as that skeleton does.
 
     Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' angle above the level.

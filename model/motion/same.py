@@ -13,7 +13,7 @@ from .moving import MovingSkeleton
 from .retarget import Retargeted, Vertices, lift
 
 
-def copied(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
+def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: MovingSkeleton) -> Retargeted | None:
     """The motion of the same parts, which rest alike in axes of another name; None where it is another skeleton.
 
     The tree may hang on another part; bones may be those of another person.

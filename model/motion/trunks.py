@@ -10,8 +10,8 @@ from scanprep.geometry import rotations
 from .moving import MovingSkeleton
 
 
-def grouped(moving: MovingSkeleton, joints: Sequence[int], starts: Sequence[int], parts: Sequence[int],
-            carried: Sequence[int]) -> tuple[dict[int, np.ndarray], dict[int, str]]:
+def group_trunk(moving: MovingSkeleton, joints: Sequence[int], starts: Sequence[int], parts: Sequence[int],
+                carried: Sequence[int]) -> tuple[dict[int, np.ndarray], dict[int, str]]:
     """The rotation (T, 3, 3) of each of fewer parts than there are joints of a trunk, and what it follows.
 
     Each part stands for the joints from one of `starts` to the next. It brings the next part where its joints bring it;

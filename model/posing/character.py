@@ -9,7 +9,7 @@ import numpy as np
 
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import checked_points, checked_surface
+from scanprep.geometry.surface import check_points, check_surface
 from scanprep.ranges import FLAG, Settings
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
@@ -132,7 +132,7 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
     else:
         known = model.info.get("landmarks", {}) if template_landmarks is None else template_landmarks
         _, vertices, points = match_landmarks(known, landmarks or {}, minimum=4)
-        fit = _registered(model.template, mesh, vertices.astype(np.int64), points, config, progress)
+        fit = _register_character(model.template, mesh, vertices.astype(np.int64), points, config, progress)
         body = fit.mesh
     pose = character_pose(model, body.vertices, config.character)
     found = character_model(model, body.vertices, config.character, pose)
@@ -140,8 +140,9 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
     return Character(found, body, pose, joints, inside(body, joints), fit)
 
 
-def _registered(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.ndarray, config: CharacterMeshConfig,
-                progress: Progress | None) -> Registration:
+def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.ndarray,
+                        config: CharacterMeshConfig,
+                        progress: Progress | None) -> Registration:
     """The template on the mesh; first at the template's size, then from where that left it."""
     tell = progress or (lambda done, total: None)
     size = _spread(template.vertices[vertices]) / _spread(points)
@@ -164,7 +165,7 @@ def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     """Which points (n, 3) lie inside a closed mesh; ValueError for one that is not finite."""
     import igl
 
-    turns = igl.fast_winding_number(*checked_surface(mesh), checked_points(points))
+    turns = igl.fast_winding_number(*check_surface(mesh), check_points(points))
     return np.asarray(np.abs(turns) > 0.5)
 
 

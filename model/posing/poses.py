@@ -175,7 +175,7 @@ def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
     """
     marks = _marks(template, skeleton)
     size = float(np.linalg.norm(np.ptp(template.vertices, axis=0)))
-    tried = (_fitted(skeleton, marks, plane) for plane in _candidates(template, marks))
+    tried = (_fit_mirror(skeleton, marks, plane) for plane in _candidates(template, marks))
     found = [mirror for mirror in tried if mirror is not None]
     if not found:
         raise ValueError("skeleton: it is not symmetric, no mirror image of its tree is the tree itself")
@@ -210,12 +210,12 @@ def _candidates(template: Mesh, marks: np.ndarray) -> list[MirrorPlane]:
     return planes + [MirrorPlane(axis, centre) for axis in axes.T]
 
 
-def _fitted(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror | None:
+def _fit_mirror(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror | None:
     """The mirror near a plane, parts paired and plane fitted in turn; None where parts cannot be paired."""
     partners = np.full(len(skeleton.parents), -1)
     for _ in range(10):
         before = partners
-        paired = _paired(skeleton, plane.reflect(marks), marks)
+        paired = _pair_parts(skeleton, plane.reflect(marks), marks)
         if paired is None:
             return None
         partners = paired
@@ -226,7 +226,7 @@ def _fitted(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror
     return Mirror(plane.normal, plane.point, partners, float(np.sqrt((off**2).sum(axis=-1).mean())))
 
 
-def _paired(skeleton: Skeleton, image: np.ndarray, marks: np.ndarray) -> np.ndarray | None:
+def _pair_parts(skeleton: Skeleton, image: np.ndarray, marks: np.ndarray) -> np.ndarray | None:
     """The partner of every part, paired where they come nearest; None where that breaks the tree."""
     cost = ((image[:, :, None] - marks[:, None]) ** 2).sum(axis=(0, -1))
     partners, parents = linear_sum_assignment(cost)[1], skeleton.parents

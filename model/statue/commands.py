@@ -25,7 +25,7 @@ from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
-from scanprep.registration.nonrigid import uncovered_share
+from scanprep.registration.nonrigid import share_uncovered
 from scanprep.skeleton.roles import in_words
 from scanprep.surfaces.cloud import read_surface
 
@@ -40,10 +40,10 @@ from .detail.reconstruction import (
     Level,
     Reconstruction,
     adaptive_level,
-    displaced_surface,
+    displace_surface,
+    find_inverted,
     in_folds,
-    inverted_triangles,
-    measured_levels,
+    measure_levels,
     remaining_error,
 )
 from .detail.subdivision import subdivide, subdivide_adaptive
@@ -133,7 +133,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     posed, surface, control = statue.posed, statue.surface, statue.control
     assert posed is not None and surface is not None, "made by fit_statue"
     save_statue(folder, statue)
-    levels, fine = measured_levels(statue, scan)
+    levels, fine = measure_levels(statue, scan)
     adaptive = adaptive_level(statue, scan)
     write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
     write_body(folder, statue)
@@ -150,7 +150,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     # what the map holds, and how far the surface made from it lies from the scan
     shares, lacking = coverage_shares(control, statue.map), parts_without_data(statue)
     left = remaining_error(control, statue.map, scan)
-    inverted = inverted_triangles(control, control.mesh.vertices, fine, levels[-1].mesh.vertices)
+    inverted = find_inverted(control, control.mesh.vertices, fine, levels[-1].mesh.vertices)
     outside = ~in_folds(control, statue.map, fine)[inverted]
     stored = sum((folder / file).stat().st_size for file in ("control.npz", "displacement.png", "coverage.png"))
     rows += [Metric("one-to-one", 100 * shares["measured"], "% of the surface"),
@@ -181,7 +181,7 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     assert posed is not None, "made by fit_statue"
     told = (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
             f"{100 * shares['measured']:.0f}% has data one-to-one")
-    missed = uncovered_share(scan, finest.mesh, 0.01 * float(np.sqrt(scan.face_areas.sum())))
+    missed = share_uncovered(scan, finest.mesh, 0.01 * float(np.sqrt(scan.face_areas.sum())))
     failed, check = [], list(left_out)
     # share of the control mesh that is folded: persons who stand have up to 0.014, dressed ones 0.07 to 0.13, a half
     # 0.08; and that is measured: persons seen from all sides have 0.85 to 0.94, a half 0.53
@@ -255,7 +255,7 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
     loaded = load_statue(statue, image)
     control = loaded.control
     fine = subdivide(control.mesh, control.chart, level) if tolerance is None else subdivide_adaptive(
-        control.mesh, control.chart, displaced_surface(control, loaded.map), tolerance / MM, level)
+        control.mesh, control.chart, displace_surface(control, loaded.map), tolerance / MM, level)
     mesh = Reconstruction(control, loaded.map, fine).mesh()
     if output.suffix.lower() == ".glb":
         write_statue_glb(output, control, mesh.vertices, fine, loaded.texture, up=loaded.upright_axis)
@@ -329,7 +329,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
                 progress(t + 1, len(bodies))
     # inverted triangles of a frame: 100 poses of people have up to 0.002, a real walk 0.005; joint angles of noise
     # 0.010, a walk whose degrees are taken for radians 0.012
-    inverted = [len(inverted_triangles(control, body, fine, detailed(body))) for body in shown]
+    inverted = [len(find_inverted(control, body, fine, detailed(body))) for body in shown]
     share = max(inverted) / len(fine.faces)
     doubts = [f"{100 * share:.1f}% of the triangles are inverted in a frame: the pose is beyond what the skin can "
               "follow"] if share > 0.008 else []

@@ -107,20 +107,20 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     given = (scan, joints, points, control)
     if joints is None and points is None:
         found = step("features", given, lambda: find_features(control, scan))
-        posed = posed_automatically(control, found, config.start == "registered")                # [Statues] Eq. 4-5
+        posed = pose_automatically(control, found, config.start == "registered")                # [Statues] Eq. 4-5
     else:
-        posed = posed_by_features(control, joints or {}, points or {})                           # [Statues] Eq. 1-5
+        posed = pose_by_features(control, joints or {}, points or {})                           # [Statues] Eq. 1-5
     surface = step("surface", (given, config), lambda: fit_surface(
         control.mesh, posed.start, scan, config.surface, progress, posed.hidden))                # [Statues] Eq. 6-18
-    fitted = step("control", (given, config), lambda: fitted_control(
+    fitted = step("control", (given, config), lambda: fit_control(
         control, posed.features, surface, scan, config.displacement))
     map = step("map", (given, config), lambda: bake(
         fitted, scan, config.displacement, progress))                                            # [Statues] Eq. 19-21
     return FittedStatue(fitted, posed.features.pose, map, posed=posed, surface=surface)
 
 
-def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
-                      ) -> Posed:
+def pose_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
+                     ) -> Posed:
     """The control model posed by features, and its head warped to those of the face."""
     return with_head(control, fit_features(control, joints, points), points)                     # [Statues] Eq. 4
 
@@ -138,7 +138,7 @@ def with_head(control: ControlModel, fit: FeatureFit, points: Mapping[str, np.nd
     return Posed(fit, start, np.zeros(len(start), dtype=bool), len(face))
 
 
-def posed_automatically(control: ControlModel, found: Features, registered: bool = True) -> Posed:
+def pose_automatically(control: ControlModel, found: Features, registered: bool = True) -> Posed:
     """The control model where `find_features` found the person, posed and its head warped as by features given.
 
     If `registered`, its surface begins on the scan; only parts whose joint the scan does not show stand as the pose
@@ -156,8 +156,8 @@ def posed_automatically(control: ControlModel, found: Features, registered: bool
                    face=posed.face if "skullbase" in found.missing else 0)
 
 
-def fitted_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
-                   config: DisplacementConfig | None = None) -> ControlModel:
+def fit_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
+                config: DisplacementConfig | None = None) -> ControlModel:
     """The control model on the scan, drawn out of folds, its joints where the features put them."""
     unfolded = unfold_control(control.fitted(surface.vertices, posed.joints), scan, config).mesh.vertices
     root = unfolded[control.skeleton.part_of_vertex(control.mesh) == 0].mean(axis=0)

@@ -15,8 +15,8 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, part_colors, render, side_by_side
 from scanprep.pictures.sheets import webp_bytes
-from scanprep.pictures.thinning import MOST, thinned
-from scanprep.synthetic.people import named_pose, walk
+from scanprep.pictures.thinning import MOST, thin_solid
+from scanprep.synthetic.people import find_pose, walk
 
 from .control.files import humanoid
 from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, Statue
@@ -68,7 +68,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
     control, joints = statue.control, statue.control.skeleton.joints
     marks, names = list(control.landmarks.values()), list(control.landmarks)
     page.bodies([Pane([
-        thinned(Solid(Mesh(scan.vertices, scan.faces), opacity=0.35, name="scan"), MOVED),
+        thin_solid(Solid(Mesh(scan.vertices, scan.faces), opacity=0.35, name="scan"), MOVED),
         Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True, name="skeleton"),
         Dots(joints, on_top=True, name="joints", labels=control.skeleton.names),
         Dots(control.mesh.vertices[marks], (0.15, 0.45, 0.75), 0.006, True, name="feature points", labels=names)],
@@ -98,11 +98,11 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
         far[one.mesh.faces[~one.shown]] = np.nan
         # to 3 mm, the end of the colours
         solid = Solid(one.mesh, Heat(far, 0.0, 0.003, "distance to the scan"), shades={"plain": np.array(CLAY)})
-        panes.append(Pane([thinned(solid, MOVED)], camera, f"{one.name}: {len(one.mesh.faces):,} triangles"))
+        panes.append(Pane([thin_solid(solid, MOVED)], camera, f"{one.name}: {len(one.mesh.faces):,} triangles"))
     page.bodies(panes, THINNED, 420)
     if frames:
         page.section("In motion", "The skeleton moves the control mesh, and the detail stands on its moving normals.")
-        page.bodies([Pane([thinned(Solid(mesh), MOVED)], cameras(statue, mesh, (20,))[0], label)
+        page.bodies([Pane([thin_solid(Solid(mesh), MOVED)], cameras(statue, mesh, (20,))[0], label)
                      for label, mesh in frames], THINNED, HEIGHT)
     return page
 
@@ -125,7 +125,7 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
     """The statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
     if statue.control.skeleton.names != humanoid().skeleton.names:
         return []
-    poses = np.stack([walk(80)[0][20], named_pose("squat"), named_pose("arms_up")])
+    poses = np.stack([walk(80)[0][20], find_pose("squat"), find_pose("arms_up")])
     moved = people_motion(statue.control, statue.pose, poses)
     detailed = Reconstruction(statue.control, statue.map, subdivide(statue.control.mesh, statue.control.chart, 3))
     bodies = statue.control.rig.vertices(moved.poses, moved.trans)

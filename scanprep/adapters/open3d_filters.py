@@ -34,7 +34,7 @@ def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     return recolor(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
 
 
-def oriented_normals(points: np.ndarray) -> np.ndarray:
+def estimate_oriented_normals(points: np.ndarray) -> np.ndarray:
     """Unit normals (n, 3) of points (n, 3), metres, that face the same way along the surface; inward or outward."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
@@ -43,7 +43,7 @@ def oriented_normals(points: np.ndarray) -> np.ndarray:
     return np.asarray(cloud.normals).copy()
 
 
-def screened_poisson(points: np.ndarray, normals: np.ndarray, spacing: float) -> Mesh:
+def reconstruct_screened_poisson(points: np.ndarray, normals: np.ndarray, spacing: float) -> Mesh:
     """A surface by screened Poisson reconstruction, its cells as large as the spacing of the points, metres."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.mesh import Mesh
-from ..threads import asked
+from ..threads import threads_asked
 from .open3d_filters import library, recolor
 
 
@@ -26,7 +26,7 @@ def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
 def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     """A closed surface near the mesh by screened Poisson reconstruction."""
     meshes = _meshes(mesh)
-    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=asked() or 1)
+    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=threads_asked() or 1)
     return recolor(_result(meshes), mesh)
 
 

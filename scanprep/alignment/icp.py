@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
-from ..geometry.surface import checked_points
+from ..geometry.surface import check_points
 from ..geometry.target import target_of
 from ..judgement import extent, unit_problem
 from ..ranges import Positive, Settings, SomeShare
@@ -46,7 +46,7 @@ class RigidAlignment:
 
 def align_landmarks(source: np.ndarray, target: np.ndarray, scale: bool = False) -> RigidAlignment:
     """The rotation and translation, optionally with scale, that bring landmarks (L, 3) nearest to their targets."""
-    source, target = checked_points(source, "source"), checked_points(target, "target")
+    source, target = check_points(source, "source"), check_points(target, "target")
     if source.shape != target.shape:
         raise ValueError(f"target: expected {len(source)} landmarks as in source, got {len(target)}")
     if len(source) < 3:
@@ -83,7 +83,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     """
     config = config or RigidConfig()
     reach = np.inf if config.reach is None else config.reach
-    moving = checked_points(source.vertices if isinstance(source, Mesh) else source, "source")
+    moving = check_points(source.vertices if isinstance(source, Mesh) else source, "source")
     if not len(moving):
         raise ValueError("source: expected points, got none")
     goal = target_of(target, name="target")

@@ -53,7 +53,7 @@ class KeptCall:
                 raise ValueError(f"kind and version are not those of a {_kind(cls)} that is known here")
             hints = typing.get_type_hints(cls)
             usual: Callable[[], Settings] = hints["config"]
-            config = config_files.parsed(told.pop("config"), path, {"config": usual()})["config"]
+            config = config_files.parse_settings(told.pop("config"), path, {"config": usual()})["config"]
             # values of JSON in the types of the fields: Path, text, one of some words, tuples of these, or None
             return cls(**{name: msgspec.convert(value, hints[name], dec_hook=lambda kind, text: kind(text))
                           for name, value in told.items()} | {"config": config})

@@ -41,7 +41,7 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
         # a task that gives its argument back: unlike scattered data it is made anew where all copies are lost
         shared = client.submit(bytes, pickle.dumps((work, _versions())), pure=False)
         there = _entrance()
-        ship = not all(_seen_there(client, job.given) for job in jobs[:1])
+        ship = not all(_has_same_files(client, job.given) for job in jobs[:1])
         waiting = iter(jobs)
         job_of: dict[Any, Job] = {}
         running = as_completed([], loop=client.loop)
@@ -64,7 +64,7 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job]) -> Iterator[tup
             yield job, _outcome(future, job, address)
 
 
-def _seen_there(client: Any, given: Any) -> bool:
+def _has_same_files(client: Any, given: Any) -> bool:
     """Whether every worker has the files of a job, by path and size."""
     def same(files: list[tuple[str, int]]) -> bool:
         import os
@@ -106,14 +106,14 @@ def _outcome(future: Any, job: Job, address: str) -> Any:
     if isinstance(error, KilledWorker):
         return Failure(f"{job.name}: the workers at work on it died, one after another")
     raise ValueError(f"workers: a worker of {address} cannot run this ({type(error).__name__}: "
-                     f"{' '.join(str(error).split())}); expected {_described(_versions())} on every worker")
+                     f"{' '.join(str(error).split())}); expected {_describe_versions(_versions())} on every worker")
 
 
 def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes], list[str]]:
     """One job on the machine of a worker: what the work returned, the files that it wrote, and our warnings."""
     work, versions = pickle.loads(shared)
     if versions != _versions():
-        raise RuntimeError(f"the worker has {_described(_versions())}")
+        raise RuntimeError(f"the worker has {_describe_versions(_versions())}")
     name, place, given, sent = pickle.loads(packed)
     with tempfile.TemporaryDirectory() as temporary:
         here, paths = Path(temporary), dict[Path, Path]()
@@ -147,5 +147,5 @@ def _versions() -> dict[str, str]:
     return {"scapekit": program(), "numpy": np.__version__}
 
 
-def _described(versions: dict[str, str]) -> str:
+def _describe_versions(versions: dict[str, str]) -> str:
     return " and ".join(f"{name} {version}" for name, version in versions.items())

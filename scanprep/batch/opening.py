@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Annotated
 
-from .ownership import HOME, ForeignFileError, refusal, refuse_any, written_of
+from .ownership import HOME, ForeignFileError, digests_in_report, refusal, refuse_any
 from .workspace import NothingMadeError, Workspace
 
 FileWorkspace = Annotated[Workspace, "steps of a command whose output is a file; they are kept beside it"]
@@ -34,7 +34,7 @@ def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
         raise ForeignFileError(f"{folder}: expected a folder for the output, found a file")
     if not (folder / HOME).is_dir():
         refuse_any(folder)
-    with _opened(Workspace(folder, folder / HOME, force)) as space:
+    with _lock_and_recover(Workspace(folder, folder / HOME, force)) as space:
         yield space
 
 
@@ -46,8 +46,8 @@ def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
     """
     output = Path(output)
     space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)
-    with _opened(space):                    # first what a killed run had finished comes to its place, and is ours
-        if output.is_dir() and not (output / HOME).is_dir() and not written_of(output):
+    with _lock_and_recover(space):                # first what a killed run had finished comes to its place, and is ours
+        if output.is_dir() and not (output / HOME).is_dir() and not digests_in_report(output):
             refuse_any(output)
         if output.is_file() and not space.is_ours(output.name):
             raise ForeignFileError(refusal(output))
@@ -55,7 +55,7 @@ def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
 
 
 @contextlib.contextmanager
-def _opened(space: Workspace) -> Iterator[Workspace]:
+def _lock_and_recover(space: Workspace) -> Iterator[Workspace]:
     """Locked, and put right where an earlier run was killed; of one that came to nothing, nothing is left."""
     key, made = space.home.absolute(), [p for p in (space.home, *space.home.parents) if not p.exists()]
     for place in (space.home, *(Path(parent) / name for parent, folders, files in os.walk(space.home)
@@ -64,7 +64,7 @@ def _opened(space: Workspace) -> Iterator[Workspace]:
             raise ForeignFileError(f"{place}: expected a file or folder that scapekit made, found a link; remove it")
     space.home.mkdir(parents=True, exist_ok=True)
     space.is_new = space.folder in made
-    with locked(space.home / "lock", space.output or space.folder):
+    with lock_output(space.home / "lock", space.output or space.folder):
         space._recover()
         _open[key] = space
         try:
@@ -87,7 +87,7 @@ def _opened(space: Workspace) -> Iterator[Workspace]:
 
 
 @contextlib.contextmanager
-def locked(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
+def lock_output(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
     """Keep other runs out of an output until the block ends: ValueError, or wait for them.
 
     The operating system holds the lock, so that a run that was killed leaves none behind. `output` is for the message.

@@ -28,7 +28,7 @@ def report_path(output: Path) -> Path:
     return output / "report.json" if output.is_dir() else output.with_name(f"{output.name}.report.json")
 
 
-def written_of(output: Path) -> dict[str, str]:
+def digests_in_report(output: Path) -> dict[str, str]:
     """File -> digest of all that a command wrote for an output, as its report tells; nothing where there is none.
 
     Paths are from the folder of the report on. Reports of files were once named without the ending, and count too.

@@ -20,7 +20,7 @@ def save_value(path: Path, value: Any, header: dict[str, Any]) -> None:
     Values are None, bool, number, text, Path, array, and tuples, lists, dicts with text keys and dataclasses of these.
     """
     arrays: list[np.ndarray] = []
-    told = {**header, "value": _packed(value, arrays)}
+    told = {**header, "value": _pack(value, arrays)}
     storage.save(path, KIND, VERSION, {f"a{i}": array for i, array in enumerate(arrays)}, told, compress=False)
 
 
@@ -37,10 +37,10 @@ def load_value(path: Path) -> Any:
     """The value of a file of `save_value`; StorageError where it is missing, damaged or of another version."""
     header, arrays = storage.load(path, KIND, (VERSION,))
     with storage.taking_apart(path, "a result"):
-        return _unpacked(header["value"], [arrays[f"a{i}"] for i in range(len(arrays))])
+        return _unpack(header["value"], [arrays[f"a{i}"] for i in range(len(arrays))])
 
 
-def _packed(value: Any, arrays: list[np.ndarray]) -> Any:
+def _pack(value: Any, arrays: list[np.ndarray]) -> Any:
     """JSON for a value; arrays are put aside."""
     if isinstance(value, np.ndarray | np.generic):           # before numbers: some scalars are Python's floats too
         if value.dtype.hasobject:
@@ -52,20 +52,20 @@ def _packed(value: Any, arrays: list[np.ndarray]) -> Any:
     if isinstance(value, Path):
         return {"path": str(value)}
     if isinstance(value, list):
-        return [_packed(v, arrays) for v in value]
+        return [_pack(v, arrays) for v in value]
     if isinstance(value, tuple):
-        return {"tuple": [_packed(v, arrays) for v in value]}
+        return {"tuple": [_pack(v, arrays) for v in value]}
     if isinstance(value, dict):
-        return {"dict": [[_packed(k, arrays), _packed(v, arrays)] for k, v in value.items()]}
+        return {"dict": [[_pack(k, arrays), _pack(v, arrays)] for k, v in value.items()]}
     if dataclasses.is_dataclass(value) and type(value).__module__.split(".")[0] in PACKAGES:
-        kept = {f.name: _packed(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
+        kept = {f.name: _pack(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
         return {"class": f"{type(value).__module__}:{type(value).__qualname__}", "fields": kept}
     raise TypeError(f"cannot keep a {type(value).__name__}")
 
 
-def _unpacked(told: Any, arrays: list[np.ndarray]) -> Any:
+def _unpack(told: Any, arrays: list[np.ndarray]) -> Any:
     if isinstance(told, list):
-        return [_unpacked(v, arrays) for v in told]
+        return [_unpack(v, arrays) for v in told]
     if not isinstance(told, dict):
         return told
     if "array" in told:
@@ -74,12 +74,12 @@ def _unpacked(told: Any, arrays: list[np.ndarray]) -> Any:
     if "path" in told:
         return Path(told["path"])
     if "tuple" in told:
-        return tuple(_unpacked(v, arrays) for v in told["tuple"])
+        return tuple(_unpack(v, arrays) for v in told["tuple"])
     if "dict" in told:
-        return {_unpacked(k, arrays): _unpacked(v, arrays) for k, v in told["dict"]}
+        return {_unpack(k, arrays): _unpack(v, arrays) for k, v in told["dict"]}
     # an object of a frozen dataclass of this project, by its constructor, which does nothing but check its values;
     # folders of results travel, so the name may be anything
-    name, values = told["class"], {name: _unpacked(v, arrays) for name, v in told["fields"].items()}
+    name, values = told["class"], {name: _unpack(v, arrays) for name, v in told["fields"].items()}
     module, _, qualified = name.partition(":")
     if module.split(".")[0] not in PACKAGES:
         raise ValueError(f"{name} is not of this project")

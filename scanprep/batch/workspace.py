@@ -25,7 +25,7 @@ from urllib.parse import quote, unquote
 
 from ..geometry import storage
 from .digests import Digests
-from .ownership import HOME, ForeignFileError, add_written, refusal, report_path, written_of
+from .ownership import HOME, ForeignFileError, add_written, digests_in_report, refusal, report_path
 from .pool import Failure, Job, Progress, Workers, run_jobs
 from .values import load_header, load_value, save_value
 
@@ -86,7 +86,7 @@ class Workspace:
             for record in (place / HOME / "done").glob("*.npz"):
                 add_written(found, _files_of(record, place), place.relative_to(self.folder))
         if self.output is not None:
-            add_written(found, written_of(self.output), report_path(self.output).parent.relative_to(self.folder))
+            add_written(found, digests_in_report(self.output), report_path(self.output).parent.relative_to(self.folder))
         return found
 
     def run(self, work: Any, tasks: Sequence[Task], workers: Workers | None = None, progress: Progress | None = None,
@@ -293,7 +293,7 @@ class Workspace:
             return files
         # an output that is a file keeps no record of it
         place = report_path(self.output).parent.relative_to(self.folder)
-        return {(place / file).as_posix(): digest for file, digest in written_of(self.output).items()}
+        return {(place / file).as_posix(): digest for file, digest in digests_in_report(self.output).items()}
 
     def _recover(self) -> None:
         """What a killed run left: results that were whole come to their place, the others go."""

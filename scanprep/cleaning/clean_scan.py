@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh
 from ..geometry.places import spacing
 from ..geometry.sanitise import sanitise
-from ..geometry.sparse import connected_pieces
+from ..geometry.sparse import label_components
 from ..ranges import Settings
 from .floor import Plane, find_plane, floor_points
 
@@ -201,7 +201,7 @@ def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
                            _sparse_links(points[first], link, SPARSE * link)])
     a = np.concatenate([sides[:, 0], first[near[:, 0]], np.arange(len(points))])
     b = np.concatenate([sides[:, 1], first[near[:, 1]], first[cell.reshape(-1)]])
-    label = connected_pieces(a, b, len(points))
+    label = label_components(a, b, len(points))
     size = np.bincount(label[first])                    # by cells, not by points, which crowd near the scanner
     rank = np.argsort(np.argsort(-size, kind="stable"), kind="stable")
     return np.asarray(rank[label])

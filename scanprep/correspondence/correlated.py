@@ -22,7 +22,7 @@ from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import target_of
 from ..threads import one_thread
-from .correspondences import Correspondences, checked_pairs
+from .correspondences import Correspondences, check_pairs
 from .search import BeliefLevel, CorrelatedConfig, Seeds, result, search, surfaces_of
 from .sheet import Sheet
 
@@ -63,7 +63,7 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
     if seeds is None:
         found = find_seeds(template, scan)
         seeds = (found.template_vertices, found.scan_points)
-    vertices, places = checked_pairs(template, *seeds, "seeds")
+    vertices, places = check_pairs(template, *seeds, "seeds")
     total = 2 + 2 * len(config.levels)
     sheet = Sheet(target_of(scan), config.spacing * float(np.sqrt(template.face_areas.sum())))
     points = sheet.at(places)

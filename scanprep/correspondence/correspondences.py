@@ -32,8 +32,8 @@ class Correspondences:
         return len(self.template_vertices)
 
 
-def checked_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: str, least: int = 3
-                  ) -> tuple[np.ndarray, np.ndarray]:
+def check_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: str, least: int = 3
+                ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (L,) of a template and their places (L, 3), or ValueError that names the argument they came by."""
     vertices, points = np.asarray(vertices), np.asarray(points, dtype=np.float64)
     if vertices.ndim != 1 or not np.issubdtype(vertices.dtype, np.integer):

@@ -35,8 +35,8 @@ class Places:
         return len(self.points)
 
 
-def seen_from(points: np.ndarray, normals: np.ndarray, distances: np.ndarray, at: np.ndarray, radius: float,
-              sure: np.ndarray) -> Places:
+def distance_profile(points: np.ndarray, normals: np.ndarray, distances: np.ndarray, at: np.ndarray, radius: float,
+                     sure: np.ndarray) -> Places:
     """Some points `at` (n,) of a surface (m, 3) as seen from the seeds, from which `distances` (S, m) are.
 
     Directions are averaged over neighbourhoods of `radius` metres.

@@ -13,7 +13,7 @@ from ..geometry.mesh import Mesh
 from ..ranges import Cell, Count, Settings
 from .belief_propagation import Beliefs, PairField, propagate
 from .correspondences import Correspondences
-from .potentials import MOST_EDGE, Places, edge_energy, most_place_energy, place_energy, seen_from
+from .potentials import MOST_EDGE, Places, distance_profile, edge_energy, most_place_energy, place_energy
 from .sheet import Sheet
 
 
@@ -98,7 +98,7 @@ def search(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config
     """Belief propagation over the places of one level, in domains pruned by what is known; the template rescaled."""
     spread = np.arange(min(level.places, len(surfaces.places)))
     unary = place_energy(surfaces.scan, surfaces.places[spread], surfaces.size)
-    wanted = unary if before is None else -_expected_places(surfaces, before, spread)
+    wanted = unary if before is None else -_spread_beliefs(surfaces, before, spread)
     domains = np.argsort(wanted, axis=1)[:, :level.domain]
     n, K = domains.shape
     # The field has one more state that says: no image. It costs half of what the worst one may cost, and so does each
@@ -168,10 +168,10 @@ def surfaces_of(template: Mesh, sheet: Sheet, seeds: Seeds, config: CorrelatedCo
     same = (sheet.piece[chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
     # a way that bridges a gap of the scan, or ends in one, is trusted less
     radius = 0.042 * size                                                  # over which directions are averaged
-    scan = seen_from(sheet.points, sheet.normals, on_scan, chosen, radius, np.where(same, 1.0, 0.3))
+    scan = distance_profile(sheet.points, sheet.normals, on_scan, chosen, radius, np.where(same, 1.0, 0.3))
     vertices = _spread_vertices(template, min(max(level.places for level in config.levels), len(template.vertices)))
-    places = seen_from(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, radius,
-                       np.ones((len(vertices), len(clicked))))
+    places = distance_profile(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, radius,
+                              np.ones((len(vertices), len(clicked))))
     return Surfaces(size, scan, edges, places, vertices, scale)
 
 
@@ -191,7 +191,7 @@ def _scale_between(template: np.ndarray, scan: np.ndarray) -> float:
     return float(np.median(near[good] / far[good])) if good.any() else 1.0
 
 
-def _expected_places(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
+def _spread_beliefs(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
     """Beliefs so far, spread over other places near by: (n, m), not normalised."""
     n, K = images.domains.shape
     reach = 0.012 * surfaces.size

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ..geometry.sparse import connected_pieces
+from ..geometry.sparse import label_components
 from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
@@ -166,7 +166,7 @@ def _label_pieces(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.
     right, below = across & mask[:, 1:] & mask[:, :-1], down & mask[1:] & mask[:-1]
     a = np.concatenate([index[:, :-1][right], index[:-1][below]])
     b = np.concatenate([index[:, 1:][right], index[1:][below]])
-    return connected_pieces(a, b, mask.size).reshape(mask.shape)
+    return label_components(a, b, mask.size).reshape(mask.shape)
 
 
 def _area_and_radius(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:

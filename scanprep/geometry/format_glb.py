@@ -118,7 +118,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
                 if own is not tree or points not in placed:
                     placed[points] = start
                     if joints is not None and points[1] is not None:
-                        vertices.append(skinned(local, weights_of(own, data, primitive, len(joints)), joints))
+                        vertices.append(apply_skin(local, weights_of(own, data, primitive, len(joints)), joints))
                     else:
                         vertices.append(local @ instance[:3, :3].T + instance[:3, 3])
                     colors.append(_colors(own, data, primitive, len(local)))
@@ -207,7 +207,7 @@ def weights_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], j
     return np.asarray(weights / total)
 
 
-def skinned(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
+def apply_skin(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """(n, 3) vertices where their joints carry them: weights (n, J), matrices (J, 4, 4)."""
     if np.allclose(joints, np.eye(4), atol=1e-6):            # in its bind pose: the very same numbers
         return points

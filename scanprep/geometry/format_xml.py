@@ -81,7 +81,7 @@ def read_dae(path: Path, data: bytes) -> Contents:
             raise ValueError(f"it begins with {root.tag}")
         scene, ids = _Scene(path, 10**6 + 4 * len(data)), {e.attrib["id"]: e for e in root.iter() if "id" in e.attrib}
         shown = root.find("scene/instance_visual_scene")
-        top = root.findall("library_visual_scenes/visual_scene") if shown is None else [_linked(ids, shown)]
+        top = root.findall("library_visual_scenes/visual_scene") if shown is None else [_follow_link(ids, shown)]
         for mesh, name, matrix in (found for part in top for found in _instances(part, np.eye(4), ids, 0)):
             vertices, faces, colors = _geometry(path, mesh, ids)
             scene.add(name, vertices, faces, matrix, colors)
@@ -90,8 +90,8 @@ def read_dae(path: Path, data: bytes) -> Contents:
     return scene.contents(metres if np.isfinite(metres) and metres > 0 else 1.0)
 
 
-def _linked(ids: dict[str, ElementTree.Element], element: ElementTree.Element, key: str = "url"
-            ) -> ElementTree.Element:
+def _follow_link(ids: dict[str, ElementTree.Element], element: ElementTree.Element, key: str = "url"
+                 ) -> ElementTree.Element:
     """The element that another one points to."""
     return ids[element.attrib[key].removeprefix("#")]
 
@@ -106,14 +106,14 @@ def _instances(node: ElementTree.Element, matrix: np.ndarray, ids: dict[str, Ele
         if child.tag == "node":
             yield from _instances(child, matrix, ids, depth + 1)
         elif child.tag == "instance_node":
-            yield from _instances(_linked(ids, child), matrix, ids, depth + 1)
+            yield from _instances(_follow_link(ids, child), matrix, ids, depth + 1)
         elif child.tag in ("instance_geometry", "instance_controller"):
-            shown, place = _linked(ids, child), matrix
+            shown, place = _follow_link(ids, child), matrix
             while shown.tag == "controller":             # a skin, or a morph of a geometry
                 inner = shown[0] if shown[0].tag in ("skin", "morph") else shown[1]
                 bound = inner.find("bind_shape_matrix")
                 place = np.eye(4) if bound is None else _numbers(bound.text).reshape(4, 4)
-                shown = _linked(ids, inner, "source")
+                shown = _follow_link(ids, inner, "source")
             yield shown, str(node.get("name") or shown.get("name") or shown.get("id")), place
 
 
@@ -171,11 +171,11 @@ def _geometry(path: Path, geometry: ElementTree.Element, ids: dict[str, ElementT
 
 def _source(ids: dict[str, ElementTree.Element], element: ElementTree.Element) -> np.ndarray:
     """(n, 3) the first three of every row of numbers that an input points to."""
-    accessor = _linked(ids, element, "source").find("technique_common/accessor")
+    accessor = _follow_link(ids, element, "source").find("technique_common/accessor")
     if accessor is None:
         raise ValueError("a source without accessor")
     stride, first = int(accessor.get("stride", 1)), int(accessor.get("offset", 0))
-    values = _numbers(_linked(ids, accessor, "source").text)[first:]
+    values = _numbers(_follow_link(ids, accessor, "source").text)[first:]
     return np.asarray(values[:len(values) // stride * stride].reshape(-1, stride)[:, :3])
 
 

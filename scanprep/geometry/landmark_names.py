@@ -53,7 +53,7 @@ def landmark_name(name: str) -> str:
     return f"{side} {known}".strip()
 
 
-def known_landmarks(landmarks: Mapping[str, Any]) -> dict[str, Any]:
+def translate_landmarks(landmarks: Mapping[str, Any]) -> dict[str, Any]:
     """Landmarks by our names: `left knee` for `knee in left leg` or `Lt. Femoral Lateral Epicn.`.
 
     Where several are names of one place, the one that is spelt as ours counts, else the first.
@@ -66,7 +66,7 @@ def known_landmarks(landmarks: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def paired_names(ours: Iterable[str], theirs: Iterable[str]) -> list[tuple[str, str]]:
+def pair_names(ours: Iterable[str], theirs: Iterable[str]) -> list[tuple[str, str]]:
     """The names (ours, theirs) of the same places, in our order: equal ones, then those that mean the same."""
     theirs = list(theirs)
     same = set(ours) & set(theirs)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from . import storage
 from .files import name_of
 from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_of, metres_per_unit
-from .landmark_names import paired_names
+from .landmark_names import pair_names
 from .landmark_reading import Entry, entries_of
 from .landmark_writing import as_bytes
 from .mesh import Mesh
@@ -181,7 +181,7 @@ def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mappi
     ValueError
         Fewer than `minimum` names match; both lists are in the message.
     """
-    pairs = paired_names(template_landmarks, scan_landmarks)
+    pairs = pair_names(template_landmarks, scan_landmarks)
     if len(pairs) < minimum:
         raise ValueError(f"landmarks: expected at least {minimum} names that template and scan share, found "
                          f"{len(pairs)}; template: {', '.join(template_landmarks) or 'none'}; "
@@ -190,8 +190,8 @@ def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mappi
             np.array([scan_landmarks[theirs] for _, theirs in pairs]))
 
 
-def shared_landmarks(path: Path, template_landmarks: Mapping[str, int], scan_landmarks: Mapping[str, np.ndarray]
-                     ) -> tuple[np.ndarray, np.ndarray] | None:
+def try_match_landmarks(path: Path, template_landmarks: Mapping[str, int], scan_landmarks: Mapping[str, np.ndarray]
+                        ) -> tuple[np.ndarray, np.ndarray] | None:
     """Vertices (L,) and points (L, 3) that `match_landmarks` pairs; None, with a warning, where they are too few.
 
     `path` is the scan's landmark file, for the warning, which says what both sides call theirs.

@@ -9,7 +9,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ..words import number_of
-from .sparse import connected_pieces, distinct
+from .sparse import distinct, label_components
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ class Mesh:
         row = row[np.argsort(row[:, 0], kind="stable")]
         same = row[1:, 0] == row[:-1, 0]
         a, b = np.r_[row[:-1, 1][same], row[:-1, 2][same]], np.r_[row[1:, 1][same], row[1:, 2][same]]
-        return connected_pieces(a, b, self.faces.size).reshape(-1, 3)
+        return label_components(a, b, self.faces.size).reshape(-1, 3)
 
     @cached_property
     def is_vertex_manifold(self) -> bool:

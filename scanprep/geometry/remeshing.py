@@ -140,7 +140,7 @@ def improve_triangles(mesh: Mesh, surface: Surface, keep: np.ndarray | None = No
     return flip_edges(mesh)
 
 
-def clamped_cotangents(mesh: Mesh) -> csr_array:
+def clamp_cotangents(mesh: Mesh) -> csr_array:
     """(N, N) Laplacian, rows summing to 0, whose off-diagonal weights stay positive on any triangles."""
     rows, cols, values = [], [], []
     for corner in range(3):

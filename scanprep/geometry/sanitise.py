@@ -14,7 +14,7 @@ from ..threads import search_threads
 from ..words import number_of
 from .mesh import Mesh
 from .places import distinct_rows
-from .sparse import connected_pieces
+from .sparse import label_components
 from .surface import Rays
 
 SAMPLES = 400            # triangles of each patch that look for what is in front of them and behind
@@ -56,17 +56,17 @@ def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
         return scan                          # nothing but lines: whoever needs a surface says so
     kept = one_place if keep.all() else Mesh(scan.vertices, one_place.faces[keep])
     invert, patch = invert_against_neighbours(kept)
-    invert ^= _inside_out(Mesh(kept.vertices, inverted(kept.faces, invert)) if invert.any() else kept, patch)
+    invert ^= _inside_out(Mesh(kept.vertices, invert_triangles(kept.faces, invert)) if invert.any() else kept, patch)
     if invert.any():
         notes.append("all triangles faced inward and were turned" if invert.all() else
                      f"{invert.sum()} of {len(invert)} triangles faced inward and were turned")
     if not notes:
         return scan
     warnings.warn(f"{name}: {'; '.join(notes)}", stacklevel=2)
-    return Mesh(scan.vertices, inverted(scan.faces[keep], invert), scan.colors, scan.of_file)
+    return Mesh(scan.vertices, invert_triangles(scan.faces[keep], invert), scan.colors, scan.of_file)
 
 
-def inverted(faces: np.ndarray, which: np.ndarray) -> np.ndarray:
+def invert_triangles(faces: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Triangles (F, 3), some of them, (F,) bool, seen from the other side; their first corner stays."""
     return np.where(which[:, None], faces[:, [0, 2, 1]], faces)
 
@@ -113,12 +113,12 @@ def invert_against_neighbours(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     first, second = mesh.side_pairs.T
     a, b = first // 3, second // 3
     if mesh.is_edge_manifold:
-        return np.zeros(count, dtype=bool), connected_pieces(a, b, count)
+        return np.zeros(count, dtype=bool), label_components(a, b, count)
     forward = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).ravel()
     agree = forward[first] != forward[second]
     # Every triangle is there twice, as it is and inverted; what faces the same way hangs together.
     rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
-    patch = connected_pieces(rows, columns, 2 * count)
+    patch = label_components(rows, columns, 2 * count)
     as_is, turned = patch[:count], patch[count:]
     area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
     invert = area[turned] > area[as_is]

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .sparse import connected_pieces
+from .sparse import label_components
 
 
 def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
@@ -27,7 +27,7 @@ def seams_closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     if not len(again):
         return None
     a, b = ends[order[again]].ravel(), ends[order[again + 1]].ravel()
-    label = connected_pieces(a, b, len(vertices))
+    label = label_components(a, b, len(vertices))
     first = np.unique(label, return_index=True)[1]
     return np.argsort(np.argsort(first))[label]
 

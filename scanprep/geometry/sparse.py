@@ -38,7 +38,7 @@ def distinct(numbers: np.ndarray) -> np.ndarray:
     return np.asarray(ordered[first])
 
 
-def connected_pieces(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+def label_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
     """The number (count,) of the piece that each of so many things is in, which links from a (n,) to b (n,) join.
 
     Examples

@@ -14,7 +14,7 @@ from .mesh import Mesh
 FARTHEST = 1e30                      # metres; the square of what lies beyond, or its float32, is infinite
 
 
-def checked_points(points: np.ndarray, name: str = "points") -> np.ndarray:
+def check_points(points: np.ndarray, name: str = "points") -> np.ndarray:
     """Query points (n, 3) as float64, in one block; ValueError for one too far away for any library."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -26,11 +26,11 @@ def checked_points(points: np.ndarray, name: str = "points") -> np.ndarray:
     return points
 
 
-def checked_surface(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def check_surface(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a mesh that has some, in one block each; ValueError without a triangle."""
     if not len(mesh.faces):
         raise ValueError(f"mesh: expected at least one triangle, got {mesh}")
-    return checked_points(mesh.vertices, "mesh"), np.ascontiguousarray(mesh.faces)
+    return check_points(mesh.vertices, "mesh"), np.ascontiguousarray(mesh.faces)
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class Surface:
         import igl
 
         self.mesh = mesh
-        self._vertices, self._faces = checked_surface(mesh)
+        self._vertices, self._faces = check_surface(mesh)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
     def closest(self, points: np.ndarray) -> SurfacePoints:
         """The point of the surface closest to each query point (n, 3); ValueError for one that is not finite."""
-        points = checked_points(points)
+        points = check_points(points)
         squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, points)[:3]
         squared, face = np.asarray(squared).reshape(-1), np.asarray(face, dtype=np.int64).reshape(-1)
         closest = np.asarray(closest).reshape(-1, 3)
@@ -108,13 +108,13 @@ class OrientedPoints:
     def __init__(self, points: np.ndarray, normals: np.ndarray, scale: float = 0.05) -> None:
         if not len(points):
             raise ValueError("points: expected at least one to search among, got none")
-        self.points, self.normals, self.scale = checked_points(points), checked_points(normals, "normals"), scale
+        self.points, self.normals, self.scale = check_points(points), check_points(normals, "normals"), scale
         self._tree = cKDTree(np.hstack([points, scale * normals]))
 
     def match(self, points: np.ndarray, normals: np.ndarray, max_distance: float = np.inf,
               min_cosine: float = 0.5) -> Matches:
         """The best target of each query (n, 3) with normals (n, 3); ValueError for one that is not finite."""
-        points, normals = checked_points(points), checked_points(normals, "normals")
+        points, normals = check_points(points), check_points(normals, "normals")
         # what is farther away than this in six dimensions is too far, or faces away: the search may stop there
         reach = np.hypot(max_distance, self.scale * np.sqrt(2 - 2 * min_cosine)) * (1 + 1e-9)
         _, index = self._tree.query(np.hstack([points, self.scale * normals]), distance_upper_bound=reach,
@@ -145,8 +145,8 @@ class Rays:
 
         ValueError for a ray that is not finite: it would seem to hit nothing.
         """
-        origins = checked_points(origins, "origins")
-        along = checked_points(np.broadcast_to(directions, origins.shape), "directions").astype(np.float32)
+        origins = check_points(origins, "origins")
+        along = check_points(np.broadcast_to(directions, origins.shape), "directions").astype(np.float32)
         start = np.ascontiguousarray(origins - self._origin, dtype=np.float32)
         hit = self._scene.run(start, along, np.full(len(start), reach, dtype=np.float32), output=True)
         face = np.asarray(hit["primID"], dtype=np.int64)

@@ -82,7 +82,7 @@ def table_rows(path: str | Path, data: bytes, error: type[StorageError] = Storag
     first line are left out.
     """
     with taking_apart(path, "a CSV table", error):
-        text = decoded(data)
+        text = decode_text(data)
         separator = max(separators, key=text.split("\n", 1)[0].count)
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         rows = [(reader.line_num, [_of_cell(cell.strip()) for cell in cells]) for cells in reader]
@@ -111,7 +111,7 @@ def number_cells(cells: Sequence[str], decimal_commas: bool = False) -> list[flo
     return out
 
 
-def decoded(data: bytes) -> str:
+def decode_text(data: bytes) -> str:
     """Text of a file as programs save it, without a mark of its encoding; ValueError for what is none, or too long."""
     if len(data) > LARGEST_TEXT:
         raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")

@@ -12,7 +12,7 @@ from .mesh import Mesh
 from .places import distinct_places
 from .sanitise import sanitise
 from .sparse import distinct
-from .surface import OrientedPoints, checked_points
+from .surface import OrientedPoints, check_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
 
     Every point has a normal. ValueError for fewer than four distinct points.
     """
-    points = checked_points(scan.vertices if isinstance(scan, Mesh) else scan, name)
+    points = check_points(scan.vertices if isinstance(scan, Mesh) else scan, name)
     index, normals = distinct_places(points), None
     if isinstance(scan, Mesh) and len(scan.faces):
         scan = sanitise(scan, name)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from .mesh import Mesh
 from .places import distinct_rows
-from .sparse import connected_pieces
+from .sparse import label_components
 
 MOST = 1_000_000         # triangles of a person about 1.8 mm long; what has less than twice as many is left as it is
 
@@ -89,7 +89,7 @@ def _join(new: np.ndarray, members: np.ndarray, faces: np.ndarray) -> np.ndarray
     row[members] = np.arange(len(members))
     a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     inner = (row[a] >= 0) & (new[a] == new[b])
-    return connected_pieces(row[a[inner]], row[b[inner]], len(members))
+    return label_components(row[a[inner]], row[b[inner]], len(members))
 
 
 def _without_pleats(faces: np.ndarray) -> np.ndarray:

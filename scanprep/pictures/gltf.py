@@ -25,11 +25,12 @@ def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, 
     Every frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
     core of glTF is used. The axis `up` is turned to y. What has a skeleton is smaller as `write_moving_glb` writes it.
     """
-    write(path, animated_glb(faces, frames, rate, colors, up))
+    write(path, encode_animated_glb(faces, frames, rate, colors, up))
 
 
-def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None, up: int = 2
-                 ) -> bytes:
+def encode_animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None,
+                        up: int = 2
+                        ) -> bytes:
     """The bytes of `write_animated_glb`."""
     frames, faces = np.asarray(frames, dtype=float), np.asarray(faces)
     _check(frames, rate)

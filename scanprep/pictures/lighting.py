@@ -60,7 +60,7 @@ class Scene:
         self.attributes[..., :3] = np.concatenate([s.normals for s in shapes])
         self.attributes[..., 3:6] = np.concatenate([s.colors for s in shapes])
         self._tree = EmbreeScene()
-        self._kept = TriangleMesh(self._tree, *_indexed(shapes))
+        self._kept = TriangleMesh(self._tree, *_merge_shapes(shapes))
         span = self.corners.reshape(-1, 3)
         self.size = float(np.linalg.norm(np.ptp(span, axis=0))) if len(span) else 1.0
         solids = [s.corners.reshape(-1, 3) @ vertical for s in shapes if s.faces is not None and len(s.corners)]
@@ -156,7 +156,7 @@ class Scene:
         return sky + 0.40 * (1 - self._open(points, normals, cone_directions(key, 0.22, 32), 4 * self.size))
 
 
-def _indexed(shapes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
+def _merge_shapes(shapes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float32 and triangles (F, 3) int32 of all shapes: a tree of these is made faster."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     for shape in shapes:

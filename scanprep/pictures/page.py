@@ -17,7 +17,7 @@ import numpy as np
 from ..console import JUDGEMENT, Metric, judgement_of, split_figures
 from ..geometry.storage import write
 from ..judgement import Judgement
-from .scene import Pane, framed_alike, pack_scene, picture_panes
+from .scene import Pane, match_camera_scales, pack_scene, picture_panes
 from .sheets import png_bytes, webp_bytes
 
 VIEWER = Path(__file__).parents[1] / "viewer"
@@ -80,7 +80,7 @@ class Page:
 
         Where there is no WebGL, and until they are drawn, stands a picture of them, by default what the cameras see.
         """
-        panes = framed_alike(panes)
+        panes = match_camera_scales(panes)
         if picture is None:
             low, camera = min(height, 300), panes[0].camera            # at most 300 pixels high, and 1,400 wide
             columns = max(1, int(1400 / max(110, low * camera.width / camera.height + 18)))

@@ -21,7 +21,7 @@ from .colors import Heat, heat
 from .low_rank import low_rank
 from .shading import Bones, Dots, Moving, Shape, Solid, own_color, render
 from .sheets import side_by_side
-from .thinning import of_vertices, thinned
+from .thinning import of_vertices, thin_solid
 
 FORMAT = 1
 SCENE = "picture.scene"              # beside a picture, for the page of many
@@ -39,7 +39,7 @@ class Pane:
     label: str = ""
 
 
-def framed_alike(panes: Sequence[Pane]) -> list[Pane]:
+def match_camera_scales(panes: Sequence[Pane]) -> list[Pane]:
     """The panes with cameras of one scale, so that bodies beside each other can be compared."""
     sizes = {side: max(getattr(pane.camera, side) for pane in panes) for side in ("width", "height", "distance")}
     return [replace(pane, camera=replace(pane.camera, **sizes)) for pane in panes]
@@ -74,18 +74,18 @@ def pack_scene(panes: Sequence[Pane], whole: bool = False) -> bytes:
 
 def small_scene(panes: Sequence[Pane]) -> bytes:
     """A packed scene with fewer triangles, for a page of many."""
-    few = [replace(pane, shapes=[thinned(shape if isinstance(shape, Solid) else Solid(shape), SMALL)
+    few = [replace(pane, shapes=[thin_solid(shape if isinstance(shape, Solid) else Solid(shape), SMALL)
                                  if isinstance(shape, Solid | Mesh) else shape for shape in pane.shapes])
-           for pane in framed_alike(panes)]
+           for pane in match_camera_scales(panes)]
     return pack_scene(few)
 
 
 def worst_that_turn(paths: Sequence[Path]) -> list[bytes | None]:
     """The packed scenes of files, worst first, of as many as a page can carry; None where there is none, or no room."""
-    return [*carried(paths[:MOST_TURN], MOST_BYTES), *(None for _ in paths[MOST_TURN:])]
+    return [*embed_files(paths[:MOST_TURN], MOST_BYTES), *(None for _ in paths[MOST_TURN:])]
 
 
-def carried(paths: Iterable[Path], room: int) -> list[bytes | None]:
+def embed_files(paths: Iterable[Path], room: int) -> list[bytes | None]:
     """What files hold, as long as there is room for so many bytes; None where there is none, or no room."""
     out = list[bytes | None]()
     for path in paths:
@@ -137,7 +137,7 @@ def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, whole: 
     if isinstance(shape, Mesh):
         shape = Solid(shape)
     if isinstance(shape, Solid):
-        shape = shape if whole else thinned(shape)
+        shape = shape if whole else thin_solid(shape)
         points = shape.mesh.vertices
         first = shape.color if isinstance(shape.color, Heat) else own_color(shape)
         shades = [_shade(name, shade, shape.mesh, columns) for name, shade in {"": first, **shape.shades}.items()]

@@ -159,7 +159,7 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Textur
     colors, weight = look(places, normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None])
     image = np.full((size * size, 3), unseen.mean())
     image[covered] = np.where(weight[:, None] > 0, colors, plain)
-    return Texture(Mesh(body.vertices[kept], faces), uv, padded(image.reshape(size, size, 3),
+    return Texture(Mesh(body.vertices[kept], faces), uv, pad_charts(image.reshape(size, size, 3),
                                                                  (face >= 0).reshape(size, size)))
 
 
@@ -174,7 +174,7 @@ def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return kept.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64)
 
 
-def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
+def pad_charts(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """The picture with the colours of charts going on eight pixels beyond them, so that seams do not show."""
     from scipy.ndimage import distance_transform_edt
 

@@ -13,7 +13,7 @@ from .shading import Solid
 MOST = 40_000                        # triangles of a shape in the browser
 
 
-def thinned(solid: Solid, most: int = MOST) -> Solid:
+def thin_solid(solid: Solid, most: int = MOST) -> Solid:
     """The same with at most about so many triangles, each vertex coloured as the nearest one before."""
     mesh = solid.mesh
     if len(mesh.faces) <= most:

@@ -21,7 +21,7 @@ from ..cli import MM, Output, Unit
 from ..console import Metric, Outcome, bar
 from ..geometry import tables
 from ..geometry.files import name_of, read_mesh, read_scan
-from ..geometry.landmark_names import known_landmarks, landmark_name
+from ..geometry.landmark_names import landmark_name, translate_landmarks
 from ..geometry.landmark_writing import Format, landmark_ending
 from ..geometry.landmarks import landmarks_beside, read_template_landmarks, write_landmarks
 from ..geometry.mesh import Mesh, check_template
@@ -115,7 +115,7 @@ def template_and_landmarks(template: Path | None, space: Workspace, progress: Pr
     body = read_mesh(template)
     check_template(body)
     known = read_template_landmarks(template, body) if landmarks_beside(template) else {}
-    named = known_landmarks(known)
+    named = translate_landmarks(known)
     more = space.step("template", (body, known), lambda folder: find_landmarks(body, known, progress))
     # names stay as they are spelt in the file
     marks = known | {name: vertex for name, vertex in more.items() if name not in named}

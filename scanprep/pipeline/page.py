@@ -18,7 +18,7 @@ from ..judgement import Judgement, judge_many
 from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around
 from ..pictures.page import Page, data_uri
-from ..pictures.scene import Pane, carried, small_scene, worst_that_turn
+from ..pictures.scene import Pane, embed_files, small_scene, worst_that_turn
 from ..pictures.shading import CLAY, Dots, Heat, Shape, Solid, color_bar, part_colors, render
 from ..pictures.sheets import webp_bytes
 from ..registration.figures import (
@@ -66,12 +66,12 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page.picture(color_bar(0, FAR * size, "distance to the scan; grey: no data there"))
     shots = [folder / pictures_place(entries.get(verdict.name)) / verdict.name for verdict in verdicts]
     scenes = worst_that_turn([shot.with_name(f"{shot.name}.scene") for shot in shots])
-    pictures = carried((shot.with_name(f"{shot.name}.webp") for shot in shots), MOST_CARRIED)
+    pictures = embed_files((shot.with_name(f"{shot.name}.webp") for shot in shots), MOST_CARRIED)
     look = max(FEW, sum(verdict.suspect or verdict.failed for verdict in verdicts))
     for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
         entry = entries.get(verdict.name)
-        shown = _shown(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
-        rival = _shown(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None, None)
+        shown = _scan_view(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)
+        rival = _scan_view(page, folder, pictures_place(entry).with_name(RIVALS), verdict.name, None, None)
         page.markup(_card(verdict, entry, shown, rival))
     if whole.skeleton is not None:
         page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
@@ -184,7 +184,7 @@ def _card(verdict: Verdict, entry: SetEntry | None, shown: str, rival: str) -> s
             + (f"<div><h4>the other body that explains the scan</h4>{rival}</div>" if rival else "") + "</section>")
 
 
-def _shown(page: Page, folder: Path, place: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
+def _scan_view(page: Page, folder: Path, place: Path, name: str, picture: bytes | None, scene: bytes | None) -> str:
     """A scan that turns, or its picture: the page carries that, or finds it in the folder when it is scrolled to."""
     if picture is not None and scene is not None:
         return page.turning(scene, picture, height=300)
@@ -219,12 +219,12 @@ def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> t
     size, ball = size_of(template), 0.013 * size_of(template)
     given: Solid | Dots
     if isinstance(scan, Mesh) and len(scan.faces):
-        coarse = coarsened(scan, 0.007 * size)
+        coarse = cluster_vertices(scan, 0.007 * size)
         given = Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
     else:
         points = scan.vertices if isinstance(scan, Mesh) else scan
         given = Dots((points[thin(points, 1.25 * ball)] - middle) @ R.T, CLAY, ball)
-    far = Heat(evened(body, fit.distances), 0, FAR * size, "distance to the scan")
+    far = Heat(smooth_values(body, fit.distances), 0, FAR * size, "distance to the scan")
     sure = Heat(1 - fit.confidence, -0.35, 1, colormap="Blues")                     # unlike the distances
     shown: list[tuple[Shape, Camera]] = [
         (given, near), (Solid(body, CLAY), near), (Solid(body, far), near), (Solid(body, far), back),
@@ -236,7 +236,7 @@ def pictures_of(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> t
     return strip, small_scene([Pane([given], near, "scan"), Pane([registered, over], near, "the template on it")])
 
 
-def evened(mesh: Mesh, values: np.ndarray) -> np.ndarray:
+def smooth_values(mesh: Mesh, values: np.ndarray) -> np.ndarray:
     """Values (N,) averaged with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
     known = np.isfinite(values)
     weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
@@ -246,7 +246,7 @@ def evened(mesh: Mesh, values: np.ndarray) -> np.ndarray:
     return values
 
 
-def coarsened(mesh: Mesh, cell: float) -> Mesh:
+def cluster_vertices(mesh: Mesh, cell: float) -> Mesh:
     """The mesh with all vertices of a cubic cell (metres) in one; for pictures only, it may not be manifold."""
     key = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
     _, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)

@@ -41,7 +41,7 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
     """
     ending = landmark_ending(format)
     if (mesh / "set.json").exists():
-        return _mended(mesh, scans, ending, names, unit, serve)
+        return _run_mending(mesh, scans, ending, names, unit, serve)
     template = Clicked.found(mesh, ending, None if scans else unit)      # as scape prep run reads it
     others = [Clicked.found(path, ending, unit, file) for path, file in _files(scans)]
     with bar("reading") as progress:                      # a file that is no mesh is refused before a browser opens
@@ -49,24 +49,24 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
             progress(number, len(first))
             _ = one.shown
     app = PickApp(template, others, read_names(names))
-    return _shown(app, serve)
+    return _serve_until_closed(app, serve)
 
 
-def _mended(folder: Path, scans: tuple[Path, ...], ending: str, names: str, unit: Unit | None, serve: Port | None
-            ) -> Outcome:
+def _run_mending(folder: Path, scans: tuple[Path, ...], ending: str, names: str, unit: Unit | None, serve: Port | None
+                 ) -> Outcome:
     """The same for the scans of a set, which are registered again there."""
     from .mend import MendApp
 
     if scans or unit:
         raise ValueError(f"{folder}: a registered set knows its scans and their unit; name nothing but the set")
     app = MendApp(folder, ending, () if names == "ten" else read_names(names))
-    done = _shown(app, serve)
+    done = _serve_until_closed(app, serve)
     return replace(done, metrics=[*done.metrics, Metric("scans that need a look",
                                                         sum(v.suspect for v in app.verdicts.values())),
                                   Metric("scans changed and not registered again", len(app.changed - {-1}))])
 
 
-def _shown(app: PickApp, serve: Port | None) -> Outcome:
+def _serve_until_closed(app: PickApp, serve: Port | None) -> Outcome:
     """An app in the browser until it is ended, and what was clicked."""
     from ..viewer.server import serve as show
 

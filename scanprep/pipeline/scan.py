@@ -13,17 +13,17 @@ from ..batch.room import Progress, Room
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan, take_clutter
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan, write_mesh
-from ..geometry.landmarks import check_on_surface, read_landmarks, shared_landmarks
+from ..geometry.landmarks import check_on_surface, read_landmarks, try_match_landmarks
 from ..geometry.mesh import Mesh
 from ..judgement import beyond_people, extent
 from ..ranges import FLAG, Settings
 from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
 from ..registration.lead import Lead
-from ..registration.limbs import Doubt, exchanged_sides, limb_doubts
+from ..registration.limbs import Doubt, find_exchanged_sides, limb_doubts
 from ..registration.nonrigid import LedRegistration, register, registration_problem
 from ..registration.person import PersonParts, stature
-from ..registration.repair import repaired
+from ..registration.repair import repair_limbs
 from ..registration.schedule import RegistrationConfig
 from ..registration.unmarked import register_by_any
 from ..threads import one_thread
@@ -99,7 +99,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         if settings.through == "pose":
             fit = register(template, scan, None, settings.registration, progress)
             if not registration_problem(template, scan, fit, marked=False):
-                fit = repaired(template, scan, fit, parts, None, settings.registration)
+                fit = repair_limbs(template, scan, fit, parts, None, settings.registration)
             led = LedRegistration(fit, "pose")
         else:
             try:
@@ -110,7 +110,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         problem = registration_problem(template, scan, led.fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        if parts is not None and (problem := exchanged_sides(template, parts, led.fit.mesh.vertices)):
+        if parts is not None and (problem := find_exchanged_sides(template, parts, led.fit.mesh.vertices)):
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         done = finish_scan(task.name, template, scan, led, parts, removed, settings.pictures)
         doubts = done.figures.doubts if done.rival is None else (*done.figures.doubts, TWO_BODIES)
@@ -191,4 +191,4 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         return None
     found = read_landmarks(task.landmarks, scan, settings.unit)
     check_on_surface(task.landmarks, found, scan.vertices if isinstance(scan, Mesh) else scan)
-    return shared_landmarks(task.landmarks, template_landmarks, found)
+    return try_match_landmarks(task.landmarks, template_landmarks, found)

@@ -25,17 +25,17 @@ from ..geometry.landmarks import (
     match_landmarks,
     read_landmarks,
     read_template_landmarks,
-    shared_landmarks,
+    try_match_landmarks,
 )
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement, beyond_people, size
 from .figures import UNSEEN, figures_of, review
 from .ground import soles_row, with_soles
 from .lead import lead_of
-from .limbs import exchanged_sides, limb_doubts
+from .limbs import find_exchanged_sides, limb_doubts
 from .nonrigid import LedRegistration, Registration, register, registration_problem
 from .person import PersonParts, person_parts, stature
-from .repair import repaired
+from .repair import repair_limbs
 from .schedule import RegistrationConfig
 from .unmarked import FEW, RIVAL, register_by_any
 
@@ -83,7 +83,7 @@ def _read_landmarks(template: Path, body: Mesh, scan: Path, data: Mesh | np.ndar
     if file is None:
         return None, [Metric("landmarks", 0)]
     known = read_landmarks(file, data, unit)
-    pairs = shared_landmarks(file, read_template_landmarks(template, body, template_landmarks), known)
+    pairs = try_match_landmarks(file, read_template_landmarks(template, body, template_landmarks), known)
     return pairs, [Metric("landmarks", len(pairs[0]) if pairs else 0), Metric("landmark file", file.name)]
 
 
@@ -153,7 +153,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         with bar("registering") as progress:
             fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
         with bar("trying other rolls of limbs") as progress:
-            fit = repaired(body, data, fit, parts, pairs, config, progress, hints)
+            fit = repair_limbs(body, data, fit, parts, pairs, config, progress, hints)
     else:
         if pairs is None:
             data, removed = take_clutter(data)
@@ -186,7 +186,7 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
     `has_rival` is whether another body explains the scan as well.
     """
     problem = registration_problem(template, scan, fit, pairs is not None) or (
-        exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
+        find_exchanged_sides(template, parts, fit.mesh.vertices) if parts else None)
     doubts = limb_doubts(template, parts, fit.mesh.vertices) if parts else ()
     verdict = review([figures_of(name, "", template, fit)], {} if problem is None else {name: problem}, size(template),
                      len(template.faces), doubts={name: doubts} if parts else None, usual=UNSEEN)[0]

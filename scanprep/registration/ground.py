@@ -63,7 +63,7 @@ def with_soles(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts
     if parts is None:
         return fit
     target = orient(target_of(scan), fit.mesh, NORMALS * size(template))
-    found = grounded(template, fit.mesh, foot_of_vertex(template, parts.skeleton), target.points, target.normals)
+    found = put_on_floor(template, fit.mesh, foot_of_vertex(template, parts.skeleton), target.points, target.normals)
     if found is None:
         return fit
     vertices = without_inverted(template, found.vertices)          # narrow ones at rims of soles may turn over
@@ -78,8 +78,8 @@ def soles_row(beyond: tuple[float, float] | None) -> list[Metric]:
                         f"end, where they were {1000 * beyond[0]:.0f} mm")]
 
 
-def grounded(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, normals: np.ndarray
-             ) -> Grounded | None:
+def put_on_floor(reference: Mesh, body: Mesh, foot: np.ndarray, points: np.ndarray, normals: np.ndarray
+                 ) -> Grounded | None:
     """A body with its soles on the floor at which a scan ends; None where it does not end flat around the feet.
 
     A scanner may cut some millimetres above the floor, and a body that is like the person knows its soles better then.

@@ -52,7 +52,7 @@ def lead_of(template: Mesh, through: str, progress: Callable[[int, int], None] |
     """
     if through == "none" or (through == "auto" and not has_limbs(template)):
         return None
-    return _known_as("model", f"--through {through}")(template, through, progress)
+    return _load_entry_point("model", f"--through {through}")(template, through, progress)
 
 
 def learn_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None, path: Path) -> None:
@@ -74,10 +74,10 @@ def learn_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: n
     ValueError
         Meshes that cannot teach, and why.
     """
-    _known_as("learn", "a model of this set")(template, skeleton, poses, shapes, path)
+    _load_entry_point("learn", "a model of this set")(template, skeleton, poses, shapes, path)
 
 
-def _known_as(name: str, wanted: str) -> Callable[..., Any]:
+def _load_entry_point(name: str, wanted: str) -> Callable[..., Any]:
     """What the package `model` makes known by a name; ValueError where it is not installed."""
     found = [entry for entry in entry_points(group=GROUP) if entry.name == name]
     if not found:

@@ -18,7 +18,7 @@ from ..judgement import size
 from ..skeleton.roles import in_words, part_kind
 from ..skeleton.tree import Skeleton
 from ..synthetic.anatomy import MIRROR_PART
-from ..synthetic.people import NAMED_POSES, PARENTS, PARTS, named_pose, random_pose
+from ..synthetic.people import NAMED_POSES, PARENTS, PARTS, find_pose, random_pose
 from .limb_ends import bending
 from .person import PersonParts, average_person
 
@@ -91,7 +91,7 @@ def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tup
     return limb_measures(template, parts, vertices).doubts(parts.skeleton)
 
 
-def exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> str | None:
+def find_exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> str | None:
     """Why left and right are exchanged in a registration, vertices (N, 3), metres; None where they are not."""
     measures, names = limb_measures(template, parts, vertices), parts.skeleton.names
     beyond = measures.beyond[:, ROLL]
@@ -196,7 +196,7 @@ def people_do() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     person, rng = average_person(), np.random.default_rng(0)
     # random poses beside the named ones that show what people do
-    poses = [*map(named_pose, NAMED_POSES), *(random_pose(rng) for _ in range(60))]
+    poses = [*map(find_pose, NAMED_POSES), *(random_pose(rng) for _ in range(60))]
     bodies = np.stack([person.posed(pose) for pose in poses])
     angles = joint_angles(person.skeleton.fit_rotations(person.mesh, bodies))
     bent = np.stack([part_bending(person.mesh, person.skeleton, body)[0] for body in bodies])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..alignment.icp import align_rigid, landmark_motion
-from ..correspondence.correspondences import Correspondences, checked_pairs
+from ..correspondence.correspondences import Correspondences, check_pairs
 from ..geometry.farthest_points import farthest_points, thin
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.sparse import gatherer, sum_groups
@@ -53,9 +53,9 @@ def prepare(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None
     """Everything checked, and the surfaces described by their paths to landmarks, or else to the surest hints."""
     check_template(template)
     if landmarks is not None:
-        landmarks = checked_pairs(template, *landmarks, "landmarks")
+        landmarks = check_pairs(template, *landmarks, "landmarks")
     if hints is not None:
-        vertices, points = checked_pairs(template, hints.template_vertices, hints.scan_points, "correspondences", 0)
+        vertices, points = check_pairs(template, hints.template_vertices, hints.scan_points, "correspondences", 0)
         confidence = np.asarray(hints.confidence, dtype=np.float64)
         if confidence.shape != (len(hints),) or not (np.isfinite(confidence) & (confidence >= 0)).all():
             raise ValueError(f"correspondences: expected {len(hints)} confidences of at least 0")

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from ..correspondence.correspondences import Correspondences
 from ..geometry.mesh import Mesh
-from ..geometry.surface import OrientedPoints, Surface, checked_points
+from ..geometry.surface import OrientedPoints, Surface, check_points
 from ..geometry.target import Target, orient
 from ..judgement import HAND, extent, size, unit_problem
 from ..threads import one_thread
@@ -49,7 +49,7 @@ class Registration:
     inverted: int                # triangles that face against their surroundings
     confidence: np.ndarray       # (N,) from 0, made up from the surroundings, to 1: data here, from both directions
     uncovered: float
-    rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repaired`
+    rolled: bool = False         # limbs were rolled otherwise than they were found first: see `repair_limbs`
     soles: tuple[float, float] | None = None    # metres beyond the floor where the scan ends: see `with_soles`
 
 
@@ -109,7 +109,7 @@ def near_origin(method: F) -> F:
     """
     @wraps(method)
     def wrapper(template: Mesh, scan: Mesh | np.ndarray, *args: Any, **named: Any) -> Any:
-        points = checked_points(scan.vertices if isinstance(scan, Mesh) else scan, "scan")
+        points = check_points(scan.vertices if isinstance(scan, Mesh) else scan, "scan")
         middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
         # within 100 m nothing changes: at 3 m a registration is the same to 1e-14 m, at 5,000 km it was 15 mm off
         if np.abs(middle).max() <= 100:
@@ -159,7 +159,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {config.method!r}")
     # what is known of both, and how every point is told from others: by place, normal, and paths to landmarks
     inputs = prepare(template, scan, landmarks, correspondences)
-    begin = initial_transform(inputs) if start is None else _checked_start(template, start)
+    begin = initial_transform(inputs) if start is None else _check_start(template, start)
     # near the scan, from stiff to soft; then onto it, below its noise
     fit = METHODS[config.method](inputs, begin, config, lambda done, total: tell(90 * done // total, 100))
     fit = fit_surface(inputs, fit, config)
@@ -167,7 +167,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     return measure_fit(inputs, fit, scan)
 
 
-def _checked_start(template: Mesh, start: np.ndarray) -> np.ndarray:
+def _check_start(template: Mesh, start: np.ndarray) -> np.ndarray:
     """A transform (4, 4) or vertices (N, 3) to begin with; ValueError for anything else."""
     found = np.asarray(start, dtype=np.float64)
     if found.shape not in ((4, 4), template.vertices.shape) or not np.isfinite(found).all():
@@ -223,7 +223,7 @@ def measure_fit(inputs: Inputs, fit: Fit, scan: Mesh | np.ndarray) -> Registrati
         rms=float(np.sqrt(np.mean(found.distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms=landmark_rms,
         converged=bool(fit.moved <= 0.001 * size and seen.any()), iterations=fit.iterations, energies=fit.energies,
         inverted=int(inverted_triangles(inputs.template, fit.x).sum()), confidence=found.confidence,
-        uncovered=uncovered_share(scan, body, 0.01 * size))
+        uncovered=share_uncovered(scan, body, 0.01 * size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +277,7 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
     return Evidence(confidence, distances)
 
 
-def uncovered_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
+def share_uncovered(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
     """Share of the points of a scan that lie further than `far` (metres) from a mesh."""
     points = scan.vertices if isinstance(scan, Mesh) else scan
     points = points[:: max(1, len(points) // samples)]

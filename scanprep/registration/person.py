@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from ..correspondence.correlated import find_correspondences, find_seeds
 from ..geometry.format_glb import tallest
-from ..geometry.landmark_names import known_landmarks
+from ..geometry.landmark_names import translate_landmarks
 from ..geometry.landmarks import match_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
@@ -136,7 +136,7 @@ def find_landmarks(template: Mesh, known: Mapping[str, int],
         Those that are known, as they are, by our names; then the others. The known ones alone where the average
         person does not come to lie on the template.
     """
-    marks, given = landmarks(), known_landmarks(known)
+    marks, given = landmarks(), translate_landmarks(known)
     names, vertices, places = match_landmarks(marks, given, minimum=0)
     # landmarks from which the average person finds the others
     led = (vertices, template.vertices[places]) if len(names) >= 4 else None

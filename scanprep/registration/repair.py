@@ -20,7 +20,7 @@ from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform
 from .graph_fit import GraphFit, fit_stages
 from .limbs import Doubt, frames, limb_doubts
 from .matches import Landmarks, prepare
-from .nonrigid import Registration, fit_surface, measure_fit, near_origin, principal_stretches, uncovered_share
+from .nonrigid import Registration, fit_surface, measure_fit, near_origin, principal_stretches, share_uncovered
 from .person import PersonParts
 from .rolls import other_rolls
 from .schedule import RegistrationConfig
@@ -31,10 +31,10 @@ LESS_COVERED = 0.001                   # share of the scan
 
 @near_origin
 @one_thread()
-def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: PersonParts | None,
-             landmarks: Landmarks | None = None, config: RegistrationConfig | None = None,
-             progress: Callable[[int, int], None] | None = None, correspondences: Correspondences | None = None
-             ) -> Registration:
+def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: PersonParts | None,
+                 landmarks: Landmarks | None = None, config: RegistrationConfig | None = None,
+                 progress: Callable[[int, int], None] | None = None, correspondences: Correspondences | None = None
+                 ) -> Registration:
     """A registration with its doubted limbs rolled otherwise, where that is better; else as it is.
 
     Parameters
@@ -70,11 +70,11 @@ def repaired(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts: 
     short = [replace(stage, rounds=min(stage.rounds, 3), ends=0) for stage in coarse]
     now = gravity(limb_doubts(template, parts, deform(graph, start)))
     for number, angles in enumerate(tries):
-        motion = rolled(graph, start, template, parts, x, angles)
+        motion = roll_parts(graph, start, template, parts, x, angles)
         begun = GraphFit(deform(graph, motion), graph=graph, motion=motion, iterations=fit.iterations)
         trial = fit_stages(inputs, begun, short)
         looks.append((gravity(limb_doubts(template, parts, trial.x)),
-                      uncovered_share(scan, template.with_vertices(trial.x), 0.01 * inputs.size), trial))
+                      share_uncovered(scan, template.with_vertices(trial.x), 0.01 * inputs.size), trial))
         tell(number + 1, len(tries) + 1)
     best = min(looks, key=lambda look: look[:2], default=None)
     if best is not None and best[0] + LESS_DOUBTED < now:
@@ -106,8 +106,8 @@ def strain(template: Mesh, registered: Mesh) -> float:
     return float(np.sqrt(np.average((logs**2).mean(axis=0), weights=template.face_areas)))
 
 
-def rolled(graph: DeformationGraph, motion: NodeMotion, template: Mesh, parts: PersonParts, x: np.ndarray,
-           angles: np.ndarray) -> NodeMotion:
+def roll_parts(graph: DeformationGraph, motion: NodeMotion, template: Mesh, parts: PersonParts, x: np.ndarray,
+               angles: np.ndarray) -> NodeMotion:
     """A motion of nodes with every part rolled about its own bone by an angle (16,), radians, the bone left in place.
 
     Vertices x (N, 3), metres, tell where the bones are.

@@ -19,11 +19,11 @@ from ..geometry.mesh import Mesh
 from ..judgement import HAND, size
 from ..words import number_of
 from .lead import Lead
-from .limbs import exchanged_sides, limb_doubts
+from .limbs import find_exchanged_sides, limb_doubts
 from .matches import Landmarks
 from .nonrigid import LedRegistration, Registration, near_origin, register, registration_problem
 from .person import PersonParts
-from .repair import gravity, repaired
+from .repair import gravity, repair_limbs
 from .schedule import RegistrationConfig
 
 FEW = 7                              # landmarks from which on they lead a template alone
@@ -67,7 +67,7 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
     if landmarks is not None and (lead is None or len(landmarks[0]) >= FEW):
         fit = register(template, scan, landmarks, config, progress)
         if not registration_problem(template, scan, fit, marked=True):
-            fit = repaired(template, scan, fit, parts, landmarks, config)
+            fit = repair_limbs(template, scan, fit, parts, landmarks, config)
         return LedRegistration(fit, clicked[0])
     candidates = list[Candidate]()
     if lead is not None:
@@ -81,7 +81,7 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
         first = choose_clearly(candidates)
         chosen = [one for one in (first, find_rival(template, first, candidates)) if one is not None]
         others = [one for one in candidates if one not in chosen]
-        mended = [repaired(template, scan, one.fit, parts, landmarks, config) for one in chosen]
+        mended = [repair_limbs(template, scan, one.fit, parts, landmarks, config) for one in chosen]
         candidates = [*(Candidate(weigh_doubts(template, parts, fit), fit, way) for fit in mended), *others]
     if landmarks is None and all(one.doubt > GRAVE for one in candidates):
         try:
@@ -91,7 +91,7 @@ def register_by_any(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmark
                 raise
         else:
             if not registration_problem(template, scan, fit, marked=False):
-                fit = repaired(template, scan, fit, parts, None, config, correspondences=pairs)
+                fit = repair_limbs(template, scan, fit, parts, None, config, correspondences=pairs)
             candidates.append(Candidate(weigh_doubts(template, parts, fit), fit,
                                         number_of(len(pairs), "correspondence")))
     best = choose_clearly(candidates)
@@ -128,7 +128,7 @@ def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -
     """
     lost = fit.uncovered / UNCOVERED
     limbs = 0.0 if parts is None else gravity(limb_doubts(template, parts, fit.mesh.vertices)) + EXCHANGED * (
-        exchanged_sides(template, parts, fit.mesh.vertices) is not None)
+        find_exchanged_sides(template, parts, fit.mesh.vertices) is not None)
     return limbs + (lost if lost > 1 else 0.0)
 
 

@@ -8,7 +8,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
-from ..geometry.remeshing import clamped_cotangents, flip_edges, mean_of_neighbours
+from ..geometry.remeshing import clamp_cotangents, flip_edges, mean_of_neighbours
 from ..geometry.sparse import factor
 from ..geometry.surface import Rays
 from .intersections import intersecting_faces
@@ -111,7 +111,7 @@ class Patch:
         rows = np.concatenate([rim, free])
         area = self.mesh.vertex_areas[rows]
         area = np.maximum(area, 0.1 * np.median(area))                 # slivers on a rim must not rule
-        laplacian = csr_array(clamped_cotangents(self.mesh)[rows])
+        laplacian = csr_array(clamp_cotangents(self.mesh)[rows])
         # bends of rim and patch, in curvature times radius of the hole, that count less than squared
         large = np.repeat([2.0, 4.0], [len(rim), len(free)]) / self._radii()[rows]
         weight = np.ones(len(rows))

@@ -6,7 +6,7 @@ import heapq
 import numpy as np
 
 from ..geometry.mesh import Mesh
-from ..geometry.sparse import connected_pieces
+from ..geometry.sparse import label_components
 
 
 def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
@@ -21,7 +21,7 @@ def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
         both = np.zeros((len(loops), len(loops)), dtype=bool)
         both[large] = facing > 0.6
         a, b = np.nonzero(both & both.T)
-        label = connected_pieces(a, b, len(loops))
+        label = label_components(a, b, len(loops))
     return [[loops[k] for k in np.flatnonzero(label == label[number])]
             for number in np.unique(label, return_index=True)[1]]
 

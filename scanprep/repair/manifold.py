@@ -4,8 +4,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..geometry.mesh import Mesh
-from ..geometry.sanitise import invert_against_neighbours, inverted
-from ..geometry.sparse import connected_pieces
+from ..geometry.sanitise import invert_against_neighbours, invert_triangles
+from ..geometry.sparse import label_components
 from ..geometry.surface import Rays
 
 FLAT = 1e-12               # square metres: no area
@@ -83,7 +83,7 @@ def _drop_flat(mesh: Mesh) -> Mesh:
 def orient(mesh: Mesh) -> Mesh:
     """Triangles inverted so that neighbours face the same way, in every patch the way most of its area does."""
     invert, _ = invert_against_neighbours(mesh)
-    return Mesh(mesh.vertices, inverted(mesh.faces, invert), mesh.colors) if invert.any() else mesh
+    return Mesh(mesh.vertices, invert_triangles(mesh.faces, invert), mesh.colors) if invert.any() else mesh
 
 
 def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
@@ -130,7 +130,7 @@ def _join_across_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
     pairs = [(at[u, v][1], at[v, w][0]) for loop in mesh.boundary_loops
              for u, v, w in zip(np.roll(loop, 1).tolist(), loop.tolist(), np.roll(loop, -1).tolist(), strict=True)]
     a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    return connected_pieces(a, b, int(fan.max()) + 1)
+    return label_components(a, b, int(fan.max()) + 1)
 
 
 def drop_small_components(mesh: Mesh, share: float) -> Mesh:
@@ -138,7 +138,7 @@ def drop_small_components(mesh: Mesh, share: float) -> Mesh:
     if not len(mesh.faces):
         return mesh
     a, b = mesh.faces[:, [0, 1]].T, mesh.faces[:, [1, 2]].T       # not mesh.edges: sorting them takes longer
-    label = connected_pieces(a.ravel(), b.ravel(), len(mesh.vertices))
+    label = label_components(a.ravel(), b.ravel(), len(mesh.vertices))
     size = np.bincount(label)
     keep = size >= share * size.max()
     if share >= 1:

@@ -28,7 +28,7 @@ def diffuse_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, 
     low = points.min(axis=0) - margin
     shape = np.ceil((np.ptp(points, axis=0) + 2 * margin) / voxel).astype(int) + 1
     grid = low + voxel * np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1)
-    distance, sure = signed_distance(mesh, grid)
+    distance, sure = measure_signed_distance(mesh, grid)
     known = sure & (np.abs(distance) <= 3 * voxel)
     operator = _roughness(tuple(shape.tolist()))
     values = _spread(operator, known, distance)
@@ -52,7 +52,7 @@ def _zero_surface(grid: np.ndarray, values: np.ndarray, shape: np.ndarray) -> Me
     return Mesh(*igl.marching_cubes(values[order], grid[order], *shape.tolist(), 0.0)[:2])
 
 
-def signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def measure_signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances (n,) in metres of points from a surface with borders, and (n,) bool where they can be trusted.
 
     Beyond a border inside and outside are not defined: there the closest point lies on the border.

@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from ..geometry.mesh import Mesh
-from ..geometry.sparse import connected_pieces
+from ..geometry.sparse import label_components
 from .motions import Motions, PosedSurface
 from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
@@ -28,9 +28,9 @@ def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, n
     return pairs, np.bincount(number.ravel(), s.pair_lengths[differ], len(pairs))
 
 
-def linked(links: np.ndarray, count: int) -> bool:
+def is_connected(links: np.ndarray, count: int) -> bool:
     """Whether links (n, 2) join all of `count` parts."""
-    return not connected_pieces(links[:, 0], links[:, 1], count).any()
+    return not label_components(links[:, 0], links[:, 1], count).any()
 
 
 def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
@@ -50,7 +50,7 @@ def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
     for i in np.argsort(lengths, kind="stable"):
         if weak[i] and keep[i]:
             keep[[i, image[i]]] = False
-            if not linked(pairs[keep], count):
+            if not is_connected(pairs[keep], count):
                 keep[[i, image[i]]] = True
     return pairs[keep]
 
@@ -159,12 +159,12 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
         of_pair = {tuple(pair): i for i, pair in enumerate(pairs.tolist())}
         while len(links) > count - 1:
             each = np.arange(len(links))
-            loop = [i for i in each if linked(links[each != i], count)]
+            loop = [i for i in each if is_connected(links[each != i], count)]
             number = np.array([of_pair[tuple(links[i].tolist())] for i in loop])
             image = mirror_pairs(links, search.sides.partners(label))
             cheapest = number[extra[number].argmin()]
             sound = [k for k in np.argsort(-extra[number], kind="stable")
-                     if linked(np.delete(links, [loop[k], image[loop[k]]], axis=0), count)]
+                     if is_connected(np.delete(links, [loop[k], image[loop[k]]], axis=0), count)]
             close = separation[cheapest] < LOOP_SEPARATION * search.config.separation
             joined = not sound or close
             at = cheapest if joined else number[sound[0]]

@@ -5,7 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from ..geometry.sparse import connected_pieces
+from ..geometry.sparse import label_components
 
 
 def field_energy(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.ndarray) -> float:
@@ -110,7 +110,7 @@ def _cut(own: np.ndarray, i: np.ndarray, j: np.ndarray, W: np.ndarray, state: np
 def pieces(pairs: np.ndarray, label: np.ndarray) -> np.ndarray:
     """(F,) number of the connected piece of equal labels that each triangle lies in."""
     a, b = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]].T
-    return connected_pieces(a, b, len(label))
+    return label_components(a, b, len(label))
 
 
 def keep_connected(costs: np.ndarray, pairs: np.ndarray, areas: np.ndarray, label: np.ndarray) -> np.ndarray:

@@ -94,12 +94,12 @@ def find_roles(names: Sequence[str]) -> dict[str, int]:
 
 def limb_parts(names: Sequence[str], parents: np.ndarray, joints: np.ndarray, limb: str, side: str) -> list[int]:
     """The parts of an "arm" or "leg" of the "left" or "right", from the body outwards; none where it is not named."""
-    roles = numbered_roles(names, joints)
+    roles = find_numbered_roles(names, joints)
     found = [roles[f"{side[0]}_{role}"] for role in LIMBS[limb] if f"{side[0]}_{role}" in roles]
     return way(parents, found[0], found[-1]) if found else []
 
 
-def numbered_roles(names: Sequence[str], joints: np.ndarray) -> dict[str, int]:
+def find_numbered_roles(names: Sequence[str], joints: np.ndarray) -> dict[str, int]:
     """`find_roles`, also of limbs that are numbered outwards (arm1_left, arm2_left, ...), with joints (J, 3) at rest.
 
     Of such a limb the elbow or knee is where it leaves two pieces that are most alike.
@@ -128,7 +128,7 @@ def missing_joints(names: Sequence[str], joints: np.ndarray) -> list[str]:
     names : names of the J parts
     joints : (J, 3) float, metres, at rest
     """
-    roles = numbered_roles(names, joints)
+    roles = find_numbered_roles(names, joints)
     if not set(NEEDED) <= set(roles):
         return []
     missing = [] if "skullbase" in roles else ["neck"]

@@ -39,11 +39,12 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
     MissingLibrary
         open3d, or the system's libraries it stands on.
     """
-    from ..adapters.open3d_filters import oriented_normals, screened_poisson
+    from ..adapters.open3d_filters import estimate_oriented_normals, reconstruct_screened_poisson
 
     points, normals = _thin(cloud)
     spacing = spacing_of(points)
-    surface = screened_poisson(points, oriented_normals(points) if normals is None else normals, spacing)
+    surface = reconstruct_screened_poisson(points, estimate_oriented_normals(points) if normals is None else normals,
+                                           spacing)
     away = cKDTree(points).query(surface.vertices)[0]
     # spacings from the nearest point, beyond which nothing was measured
     surface = surface.submesh((away <= 2.5 * spacing)[surface.faces].all(axis=1))[0]
@@ -73,11 +74,11 @@ def mesh_of_view(view: PointCloud | np.ndarray) -> tuple[Mesh, np.ndarray]:
     All normals face the camera. On people they lie around the direction to it, so their mean is that direction, and
     what they enclose is behind them. The camera is taken to be 2.5 m away.
     """
-    from ..adapters.open3d_filters import ball_pivoting, oriented_normals
+    from ..adapters.open3d_filters import ball_pivoting, estimate_oriented_normals
 
     points, normals = _thin(view)
     if normals is None:
-        normals = oriented_normals(points)
+        normals = estimate_oriented_normals(points)
         # from the axis along which normals are longest to the direction around which they lie
         ahead = np.linalg.eigh(normals.T @ normals)[1][:, -1]
         for _ in range(10):

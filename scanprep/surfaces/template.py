@@ -173,14 +173,14 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
         mesh = Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colors)
     keep = None if landmarks is None else np.unique(cKDTree(mesh.vertices).query(landmarks)[1])
     small = _improve(decimate(mesh, faces, config.decimate, keep), surface, keep)
-    balance = left_share(small)
+    balance = share_on_left(small)
     # of all triangles that one side may have more of than its area lets expect
     if balance is not None and abs(balance - 0.5) > 0.03:
         # collapses of least error spend triangles on the noise of one side; those of shortest edges do not
         small = _improve(decimate(mesh, faces, replace(config.decimate, method="even")), surface, keep)
         notes.append(f"{100 * balance:.0f}% of the triangles were on the left side; made even, "
-                     f"{100 * (left_share(small) or 0.5):.0f}% are")
-        balance = left_share(small)
+                     f"{100 * (share_on_left(small) or 0.5):.0f}% are")
+        balance = share_on_left(small)
     if template_problem(small):                                  # a triangle that decimation left without area
         small = close(small, config.fill)
     check_template(small, what)
@@ -211,7 +211,7 @@ def carry_landmarks(places: Mapping[str, np.ndarray], mesh: Mesh) -> tuple[dict[
             {name: float(d) for name, d in zip(places, away, strict=True) if d > OFF})
 
 
-def left_share(mesh: Mesh) -> float | None:
+def share_on_left(mesh: Mesh) -> float | None:
     """The share of the triangles on one side of the body's plane of symmetry; None where it has none."""
     found = find_symmetry(mesh)
     if not found.holds or not found.two_sided:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from ..geometry import storage
 from ..geometry.mesh import Mesh
 from .landmarks import landmarks as landmark_vertices
-from .people import NAMED_POSES, BodyShape, Person, mirrored_pose, named_pose, random_pose
+from .people import NAMED_POSES, BodyShape, Person, find_pose, mirror_pose, random_pose
 from .scanner import RangeView, Scan, ScannerConfig, scan
 
 VERSION = 2                          # 1 was of people who were made up; their shapes mean nothing here
@@ -199,8 +199,8 @@ def subject_pose(k: int, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         # hands and feet held in all ways, or none could tell where they begin
         loose[[6, 9]] = np.clip(4.5 * loose[[6, 9]], -WRIST, WRIST)
         loose[[12, 15]] = np.clip(3.0 * loose[[12, 15]], -ANKLE, ANKLE)
-        pose = named_pose(name) + loose
-        return name, mirrored_pose(pose) if rng.random() < 0.4 else pose
+        pose = find_pose(name) + loose
+        return name, mirror_pose(pose) if rng.random() < 0.4 else pose
     return f"random{k}", random_pose(rng)
 
 

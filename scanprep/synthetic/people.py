@@ -14,11 +14,11 @@ from ..geometry.mesh import Mesh
 from ..skeleton.tree import Skeleton
 from .anatomy import PARENTS, PARTS, Anatomy, BodyShape
 from .landmarks import landmarks, markers
-from .poses import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose, walk
+from .poses import NAMED_POSES, compose, find_pose, mirror_pose, random_pose, walk
 from .posing import Poser
 from .topology import load
 
-__all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose", "named_pose",
+__all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "find_pose", "mirror_pose",
            "random_pose", "walk"]
 
 

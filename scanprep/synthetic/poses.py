@@ -95,7 +95,7 @@ _STORED: dict[str, Any] = json.loads(Path(__file__).with_name("poses.json").read
 NAMED_POSES = tuple(_STORED["named"])
 
 
-def named_pose(name: str) -> np.ndarray:
+def find_pose(name: str) -> np.ndarray:
     """A pose (16, 3), radians, by its name in `NAMED_POSES`."""
     if name not in NAMED_POSES:
         raise ValueError(f"name: no pose '{name}', expected one of {', '.join(NAMED_POSES)}")
@@ -117,16 +117,16 @@ def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
     pose = np.zeros((16, 3))
     for group in limbs:
         name = NAMED_POSES[rng.integers(len(NAMED_POSES))]
-        source = named_pose(name)
+        source = find_pose(name)
         if rng.random() < 0.5:
-            source = mirrored_pose(source)
+            source = mirror_pose(source)
         pose[group] = rng.uniform(0.55, 1.0) * source[group]
     noise = rng.normal(size=(16, 3)) * looseness[:, None] * 0.7
     noise[[5, 8, 11, 14]] = 0.0
     return spread * (pose + noise)
 
 
-def mirrored_pose(pose: np.ndarray) -> np.ndarray:
+def mirror_pose(pose: np.ndarray) -> np.ndarray:
     """The pose (..., 16, 3) of the mirror image."""
     return pose[..., MIRROR_PART, :] * [1, -1, -1]
 

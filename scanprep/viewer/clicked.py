@@ -19,7 +19,7 @@ from ..geometry.surface import Surface
 from ..pictures.camera import Camera, upright
 from ..pictures.scene import Pane
 from ..pictures.shading import CLAY, Dots, Shape, Solid
-from ..pictures.thinning import thinned
+from ..pictures.thinning import thin_solid
 from .surface_clicks import Clickable
 
 KEPT = ".before"                     # ending of the copy of a landmark file as it was found
@@ -91,7 +91,7 @@ class Clicked:
         if self._shown is None:
             shape, points = self.body.shape, self.body.points
             # a cloud of more points is no clearer, and slow to turn
-            self._shown = thinned(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
+            self._shown = thin_solid(Solid(shape)) if isinstance(shape, Mesh) and self.body.has_surface else \
                 Dots(points[::max(1, len(points) // 150_000)], CLAY, 0.004)
         return self._shown
 

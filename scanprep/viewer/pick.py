@@ -16,7 +16,7 @@ import numpy as np
 
 from ..console import say
 from ..depth_camera.picture import is_picture
-from ..geometry.landmark_names import landmark_name, paired_names
+from ..geometry.landmark_names import landmark_name, pair_names
 from ..geometry.mesh import Mesh
 from ..geometry.sides import other_side
 from ..judgement import extent
@@ -96,7 +96,7 @@ class PickApp:
         pane = self.scan.pane(self.scan.path.name)
         if is_picture(self.scan.path):
             return pane
-        pairs = paired_names(self.template.places, self.scan.places)
+        pairs = pair_names(self.template.places, self.scan.places)
         template, body = self.template.body.points, self.scan.body.shape
         landmarks = None
         if len(pairs) >= ENOUGH:

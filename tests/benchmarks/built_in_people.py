@@ -20,7 +20,7 @@ from protocols import half_view, load_real, machine, scape_fold, spring_split, w
 
 from completion.partial.completion import complete
 from model.files import load_model
-from scanprep.geometry.landmark_names import paired_names
+from scanprep.geometry.landmark_names import pair_names
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
@@ -28,7 +28,7 @@ from scanprep.geometry.surface import Surface
 def measure_body(model: Any, body: Mesh, k: int, landmarks: dict[str, int]) -> dict[str, float]:
     """Figures of one body, millimetres and seconds."""
     rng = np.random.default_rng(k)
-    names = {theirs: mine for mine, theirs in paired_names(model.info["landmarks"], landmarks)}
+    names = {theirs: mine for mine, theirs in pair_names(model.info["landmarks"], landmarks)}
     known = {name: vertex for name, vertex in landmarks.items() if name in names}
     mine = {vertex: model.info["landmarks"][names[name]] for name, vertex in known.items()}
 

@@ -18,7 +18,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.subject.person import PersonConfig, PersonFit, find_person
 from completion.motion import Motion
@@ -75,7 +75,7 @@ def main() -> None:
     args = parser.parse_args()
     model = load_model(args.model)
     people = model.info.get("people_vertices")
-    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
+    layout = load_layout(args.layout, model.template, None if people is None else np.array(people))
     shape, config = PersonConfig(), AnimateConfig()
     rows = []
     for path in sorted(args.folder.glob("*.c3d")):

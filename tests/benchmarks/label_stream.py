@@ -25,7 +25,7 @@ from protocols import machine, write_report
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.labelling.stream import LabelledFrame, LabelStream
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import choose_layout, named_layout
+from completion.mocap.marker_sets.named import choose_layout, load_layout
 from completion.mocap.pose.follow import animate
 from completion.mocap.subject.person import find_person
 from model.body import BodyModel
@@ -60,7 +60,7 @@ def recorded(model: BodyModel, path: Path) -> Take:
 
 def simulated(model: BodyModel, take: Take) -> Take:
     """The same motion with 67 markers."""
-    layout = named_layout("mosh67", model.template, np.asarray(model.info["people_vertices"]))
+    layout = load_layout("mosh67", model.template, np.asarray(model.info["people_vertices"]))
     sequence = MarkerSequence(take.markers, take.layout.labels, take.rate)
     motion, rng = animate(take.subject, sequence, take.layout), np.random.default_rng(0)
     markers = np.stack([layout.place(take.subject.template.with_vertices(take.subject.vertices(pose, trans)))

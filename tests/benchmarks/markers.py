@@ -21,7 +21,7 @@ from protocols import RealData, load_real, machine, scape_fold, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.stream import MarkerStream
 from completion.mocap.subject.person import find_person
@@ -152,7 +152,7 @@ def main() -> None:
     if args.c3d:
         people = load_model(args.people) if args.people else model
         layout = MarkerLayout.load(args.layout) if Path(args.layout).is_file() else \
-            named_layout(args.layout, people.template)
+            load_layout(args.layout, people.template)
         report["real"] = real_sequences(people, args.c3d, layout, args.betas, args.limit)
     for name, value in report["mean"].items():
         print(f"{name:24s} {value:8.2f}")

@@ -22,7 +22,7 @@ from scans import HELD_MEN, TEN
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.subject.person import find_person
 from completion.partial.completion import Completion, complete
 from model.body import BodyModel
@@ -90,7 +90,7 @@ def of_completion(done: Completion) -> dict[str, np.ndarray]:
 def marked(model: BodyModel, person: Person, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """The body whose markers move between poses of the model."""
     ids = np.array(model.info["people_vertices"])
-    usual = named_layout("vicon47", model.template, ids)
+    usual = load_layout("vicon47", model.template, ids)
     layout = MarkerLayout(usual.labels, usual.vertices, RADIUS, usual.weights)
     rest = Mesh(person.mesh.vertices[ids], model.template.faces)
     places = Surface(rest).closest(layout.skin_points(rest.vertices) + rng.normal(0, PLACING, (len(layout.labels), 3)))

@@ -26,7 +26,7 @@ from completion.mocap.artefacts.find import find_artefacts
 from completion.mocap.artefacts.results import ArtefactConfig, BadKind, BadSpan, Swap
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.mosh.mosh import MoshConfig, mosh
 from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
@@ -184,8 +184,9 @@ def simulated(model: BodyModel, body: np.ndarray, motion: Motion, layout: Marker
     man = subject_from_body(model, body)
     ids, weights = supports(man.template, layout)
     points = man.points(ids, weights)
-    exact = np.concatenate([energy.lifted(points.evaluate(motion.poses[i:i + 64], motion.trans[i:i + 64]),
-                                          np.asarray(layout.distances)) for i in range(0, len(motion.poses), 64)])
+    exact = np.concatenate([energy.rise_above_skin(points.evaluate(motion.poses[i:i + 64], motion.trans[i:i + 64]),
+                                                   np.asarray(layout.distances)) for i in range(0, len(motion.poses),
+                                                                                                64)])
     misplaced = rng.normal(0, 0.005, (len(layout.labels), 3))
     exact += (turned(man, layout, motion) @ misplaced[..., None])[..., 0] + rng.normal(0, 0.0005, exact.shape)
     return Case(name, MarkerSequence(exact, layout.labels, motion.rate), layout, (man, motion))
@@ -248,7 +249,7 @@ def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.nd
 
 def cases(model: BodyModel, args: argparse.Namespace) -> list[Case]:
     """The real files, and men moved as in them."""
-    layout = named_layout("cmu41", model.template)
+    layout = load_layout("cmu41", model.template)
     out = [Case(path.stem, read_markers(path), layout, None) for path in sorted(args.folder.glob("*.c3d"))
            if not args.files or path.stem in args.files]
     if args.men:

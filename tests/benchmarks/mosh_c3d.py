@@ -33,7 +33,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.mosh import takes
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
@@ -55,7 +55,7 @@ MEASURES = ("stature", "chest_girth", "waist_girth", "hip_girth")
 def held_out(model: BodyModel, motion: Motion, soft: SoftTissue | None, markers: MarkerSequence, layout: MarkerLayout
              ) -> dict[str, object]:
     """How far the body is from the markers that were in no stage, millimetres: plain, and calibrated."""
-    plain = takes.held_out(model, layout, HELD_OUT, markers, motion, soft)
+    plain = takes.measure_held_out(model, layout, HELD_OUT, markers, motion, soft)
     assert plain is not None and motion.betas is not None, "markers were held out of a person"
     seen, subject = markers.select(plain.labels).positions, model.subject(motion.betas)
     known = [label for label in markers.labels if label not in plain.labels]
@@ -183,7 +183,7 @@ def main() -> None:
     model, presets = load_model(args.model), {"default": MoshConfig(), "published": MoshConfig.published()}
     config = dataclasses.replace(presets[args.preset], soft_tissue=args.soft)
     people = model.info.get("people_vertices")
-    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
+    layout = load_layout(args.layout, model.template, None if people is None else np.array(people))
     rows: list[dict] = []
     for path in sorted(args.folder.glob("*.c3d")):
         markers = read_markers(path)

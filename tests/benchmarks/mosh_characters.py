@@ -20,7 +20,7 @@ from protocols import load_real, machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.mosh.mosh import mosh
 from completion.mocap.retargeting.soft_tissue import (
     Creases,
@@ -85,11 +85,11 @@ def joints_off(model: BodyModel, figure: Cartoon, found: Character) -> list[floa
 def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSequence, MarkerLayout]:
     """Markers of an embedded man who walks, and their layout on the model's template."""
     person = Person(SUBJECT)
-    layout = named_layout("cmu41", person.mesh)
+    layout = load_layout("cmu41", person.mesh)
     poses, trans = walk(frames, rate)
     bodies = [person.mesh.with_vertices(person.posed(p, t)) for p, t in zip(poses, trans, strict=True)]
     markers = MarkerSequence(np.stack([layout.place(body) for body in bodies]), layout.labels, rate)
-    return markers, named_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    return markers, load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
 
 
 def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float, frames: np.ndarray) -> dict:
@@ -130,7 +130,7 @@ def main() -> None:
     args.folder.mkdir(parents=True, exist_ok=True)
     model = load_model(args.model) if args.model else load_built_in_model()
     markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
-        (read_markers(args.c3d), named_layout("cmu41", model.template))
+        (read_markers(args.c3d), load_layout("cmu41", model.template))
     soft = mosh(model, markers, layout).soft_tissue[0]
     frames = np.unique(np.linspace(0, len(soft.motion.poses) - 1, args.frames).round().astype(int))
     rows = []

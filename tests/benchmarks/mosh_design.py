@@ -23,7 +23,7 @@ from completion.mocap.marker_selection.fits import DesignConfig, vertex_errors
 from completion.mocap.marker_selection.greedy import Groups, MarkerSets, exchange, symmetric_groups
 from completion.mocap.marker_selection.linear import LinearBodies, WholeFits, fit_bodies, in_poses
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from model.body import BodyModel
 from model.files import load_model
 
@@ -97,7 +97,7 @@ def main() -> None:
         bodies = in_poses(model, data.shapes[men], poses).reshape(-1, *model.template.vertices.shape)
         if given.bodies:
             np.savez(given.bodies, bodies=bodies)
-    base = named_layout("vicon47", model.template)
+    base = load_layout("vicon47", model.template)
     candidates = candidate_layout(model, base, 114)
     groups = symmetric_groups(candidates.labels)
     report: dict[str, object] = {"machine": machine(), "model": str(given.model), "men": given.men,
@@ -150,7 +150,7 @@ def _with_others(candidates: MarkerLayout, model: BodyModel) -> tuple[MarkerLayo
     labels, vertices = list(candidates.labels), candidates.vertices.tolist()
     rows = {}
     for name in OTHERS:
-        layout = named_layout(name, model.template)
+        layout = load_layout(name, model.template)
         rows[name] = list(range(len(labels), len(labels) + len(layout.labels)))
         labels += [f"{name} {label}" for label in layout.labels]
         vertices += layout.vertices.tolist()

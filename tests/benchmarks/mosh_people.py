@@ -20,7 +20,7 @@ from protocols import load_real, machine, spring_split, write_report
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import layout_names, named_layout
+from completion.mocap.marker_sets.named import layout_names, load_layout
 from completion.mocap.subject.person import PersonConfig, PersonFit, find_person
 from model.body import BodyModel
 from model.files import load_model
@@ -38,7 +38,7 @@ WHOLE = 47                           # markers of the set that is compared with 
 def marker_set(model: BodyModel, count: int) -> MarkerLayout:
     """The Vicon set, the spread-out part of it, or the larger set; every marker a ball on the skin."""
     name = "vicon47" if count <= WHOLE or "mosh67" not in layout_names() else "mosh67"
-    layout = named_layout(name, model.template)
+    layout = load_layout(name, model.template)
     plain = MarkerLayout(layout.labels, layout.vertices, RADIUS, layout.weights)
     places = model.template.vertices[plain.nearest]
     if count >= len(plain.labels):

@@ -18,7 +18,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.subject.person import find_person
 from model.body import BodyModel
 from model.files import load_model
@@ -73,10 +73,10 @@ def told(models: dict[str, BodyModel], sex: float, seed: int, args: argparse.Nam
     """One subject: truth, guess, and residuals with the models of both sexes."""
     rng = np.random.default_rng([seed, 61])
     person = Person(BodyShape.random(rng, sex=sex))
-    layout = named_layout("cmu41", person.mesh)
+    layout = load_layout("cmu41", person.mesh)
     sequence = walking(person, layout, rng, args.error, args.frames)
     kept = np.array(models["neutral"].info["people_vertices"])
-    places = named_layout("cmu41", models["neutral"].template, kept)
+    places = load_layout("cmu41", models["neutral"].template, kept)
     start = time.process_time()
     found = find_person(models["neutral"], sequence, places)
     seconds = time.process_time() - start

@@ -29,7 +29,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
@@ -39,7 +39,7 @@ from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
-from model.fitting.energy import lifted
+from model.fitting.energy import rise_above_skin
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.pictures.camera import Camera, upright
 from scanprep.pictures.colors import Heat
@@ -85,7 +85,7 @@ class Scene:
         self.subject = model.subject(motion.betas)
         self.skin = motion.vertices(self.subject)
         self.normals = np.array([model.template.with_vertices(v).vertex_normals for v in self.skin])
-        self.marks = named_layout("mosh67", model.template)
+        self.marks = load_layout("mosh67", model.template)
         D = model.shape_jacobian(model.pose_mean)
         self.area = np.sqrt(model.template.vertex_areas)
         self.betas = np.linalg.qr((self.area[:, None, None] * D).reshape(-1, D.shape[-1]))[0]
@@ -134,12 +134,12 @@ class Scene:
             chosen.append(int(soft[np.argmax(self.graph.nearest(np.array(chosen))[0][soft])]))
         more = np.array(chosen[len(self.marks.labels):])
         dense = self.marks.joined(MarkerLayout(tuple(f"M{i}" for i in range(len(more))), more))
-        return {41: named_layout("cmu41", self.model.template), 67: self.marks, 90: dense}
+        return {41: load_layout("cmu41", self.model.template), 67: self.marks, 90: dense}
 
     def found(self, truth: np.ndarray, layout: MarkerLayout, seed: int) -> tuple[Motion, SoftTissue]:
         """The motion of fixed shape and that with soft tissue, from the markers of a true skin."""
         ids, weights = supports(self.model.template, layout)
-        places = lifted(np.einsum("lk,tlkd->tld", weights, truth[:, ids]), np.asarray(layout.distances))
+        places = rise_above_skin(np.einsum("lk,tlkd->tld", weights, truth[:, ids]), np.asarray(layout.distances))
         noise = np.random.default_rng(seed).normal(0, NOISE, places.shape)
         markers = MarkerSequence(places + noise, layout.labels, self.motion.rate)
         fixed = animate(self.subject, markers, layout, MoshConfig().poses)
@@ -207,7 +207,7 @@ def main() -> None:
     parser.add_argument("--picture", help="write the bumps of which least was found here")
     args = parser.parse_args()
     model, whole = load_model(args.model), read_markers(args.folder / f"{args.file}.c3d")
-    layout = named_layout("cmu41", model.template)
+    layout = load_layout("cmu41", model.template)
     first = max(0, (len(whole.positions) - args.frames) // 2)
     person = find_person(model, whole, layout)
     scene = Scene(model, animate(model.subject(person.betas), whole.frames(slice(first, first + args.frames)),

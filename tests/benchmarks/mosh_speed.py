@@ -28,7 +28,7 @@ from mosh_artefacts import exchanged, spoilt
 from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers, write_markers
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.marked_body import supports
 from model.built_in import load_built_in_model
 from model.files import BUILT_IN
@@ -44,10 +44,10 @@ Row = dict[str, float | str | dict[str, float]]
 def walking(frames: int, faulty: bool, rng: np.random.Generator) -> MarkerSequence:
     """Markers of a synthetic person who walks."""
     model = load_built_in_model()
-    layout = named_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
+    layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
     subject, (poses, trans) = model.subject(0.5 * rng.normal(size=model.n_betas)), walk(frames, RATE)
     points = subject.points(*supports(model.template, layout))
-    places = energy.lifted(points.evaluate(poses, trans), np.asarray(layout.distances))
+    places = energy.rise_above_skin(points.evaluate(poses, trans), np.asarray(layout.distances))
     clean = MarkerSequence(places + rng.normal(0, NOISE, places.shape), layout.labels, RATE)
     if not faulty:
         return clean

@@ -32,7 +32,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
@@ -114,8 +114,9 @@ def simulated(model: BodyModel, result: Solved, layout: MarkerLayout) -> np.ndar
     """Markers (T, L, 3) of a layout in a motion, metres."""
     motion = result.motion
     points = model.subject(result.betas).points(*supports(model.template, layout))
-    return np.concatenate([energy.lifted(points.evaluate(motion.poses[i:i + 64], motion.trans[i:i + 64]),
-                                         np.asarray(layout.distances)) for i in range(0, len(motion.poses), 64)])
+    return np.concatenate([energy.rise_above_skin(points.evaluate(motion.poses[i:i + 64], motion.trans[i:i + 64]),
+                                                  np.asarray(layout.distances)) for i in range(0, len(motion.poses),
+                                                                                               64)])
 
 
 def rotations_of(model: BodyModel, result: Solved, vertices: np.ndarray) -> np.ndarray:
@@ -249,7 +250,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     args = parser.parse_args()
     model = load_model(args.model)
-    layout, rows, refs, plain = named_layout(args.layout, model.template), [], [], []
+    layout, rows, refs, plain = load_layout(args.layout, model.template), [], [], []
     for path in sorted(args.folder.glob("*.c3d")):
         if args.files and path.stem not in args.files:
             continue

@@ -46,7 +46,7 @@ from scipy.spatial.transform import Rotation
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.mosh.mosh import MoshConfig, mosh
 from completion.mocap.pose.marked_body import MarkedBody
 from completion.mocap.subject.person import spread_frames
@@ -165,7 +165,7 @@ def main() -> None:
     args = parser.parse_args()
     model, rows = load_model(args.model), []
     people = model.info.get("people_vertices")
-    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
+    layout = load_layout(args.layout, model.template, None if people is None else np.array(people))
     for path in sorted(args.folder.glob("*.c3d")):
         if args.files and path.stem not in args.files.split(","):
             continue

@@ -28,7 +28,7 @@ from scanprep.registration.lead import Lead, lead_of
 from scanprep.registration.limbs import Doubt, limb_doubts
 from scanprep.registration.nonrigid import METHODS, Registration, register, registration_problem
 from scanprep.registration.person import PersonParts, person_parts
-from scanprep.registration.repair import repaired
+from scanprep.registration.repair import repair_limbs
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.registration.unmarked import FEW, register_by_any, register_unmarked
 
@@ -52,7 +52,7 @@ def registered(data: RealData, parts: PersonParts, item: TestScan, marks: str, c
     led_by = "correspondences" if landmarks is None else "landmarks"
     if registration_problem(data.template, item.scan, found, marks != "0"):
         return found, found, led_by              # as in a folder: it means nothing, whatever its limbs do
-    return found, repaired(data.template, item.scan, found, parts, landmarks, config, correspondences=pairs), led_by
+    return found, repair_limbs(data.template, item.scan, found, parts, landmarks, config, correspondences=pairs), led_by
 
 
 class Judged(NamedTuple):

@@ -33,7 +33,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.registration.figures import EVIDENCE, UNSEEN, Limits, evidence_of, figures_of, review
 from scanprep.registration.lead import Lead, lead_of
-from scanprep.registration.limbs import exchanged_sides, limb_doubts
+from scanprep.registration.limbs import find_exchanged_sides, limb_doubts
 from scanprep.registration.nonrigid import registration_problem
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.unmarked import register_by_any
@@ -97,7 +97,8 @@ def measure(data: RealData, parts: PersonParts, lead: Lead, kind: str, index: in
     limb = worst_limb(x, replace(item, truth=item.truth.with_vertices(truth)), parts)
     mean = 1e3 * float(np.linalg.norm(x - truth, axis=1).mean())
     figures, doubts = figures_of(item.name, way, data.template, fit), limb_doubts(data.template, parts, x)
-    problem = registration_problem(data.template, scan, fit, marked=False) or exchanged_sides(data.template, parts, x)
+    problem = registration_problem(data.template, scan, fit, marked=False) or find_exchanged_sides(data.template, parts,
+                                                                                                   x)
     scale, faces = size(data.template), len(data.template.faces)
     verdict = review([figures], {item.name: problem} if problem else {}, scale, faces, None, {item.name: doubts},
                      UNSEEN)[0]

@@ -6,7 +6,7 @@
 Registrations that roll a limb are rare, so they are made: every limb of every pose is rolled about its bone, the roll
 beginning within 5 cm of its joint, and laid on the true surface again. Counted is a doubt that the pose itself did not
 raise. What we lose at: half a right angle, which elbows and hands of real people do. With `--repair` the virtual scans
-of some poses are given to `repaired` with every such limb, and its error before and after is told.
+of some poses are given to `repair_limbs` with every such limb, and its error before and after is told.
 """
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from scanprep.registration.limbs import limb_doubts
 from scanprep.registration.matches import prepare
 from scanprep.registration.nonrigid import measure_fit
 from scanprep.registration.person import PersonParts, person_parts
-from scanprep.registration.repair import repaired
+from scanprep.registration.repair import repair_limbs
 
 LIMBS = ("forearm_left", "forearm_right", "hand_left", "hand_right", "shin_left", "shin_right", "head")
 ANGLES = (45, 90, 135, 180)
@@ -64,7 +64,7 @@ def put_right(data: RealData, parts: PersonParts, pose: int, degrees: int) -> No
         p = parts.skeleton.names.index(limb)
         x = rolled(data, parts, item.truth.vertices, p, np.radians(degrees))
         before = measure_fit(given, replace(start_fit(data.template, np.eye(4), 300), x=x, moved=0.0), item.scan)
-        after = repaired(data.template, item.scan, before, parts, landmarks)
+        after = repair_limbs(data.template, item.scan, before, parts, landmarks)
         off = [1e3 * np.linalg.norm(fit.mesh.vertices - item.truth.vertices, axis=1)[part == p].mean()
                for fit in (before, after)]
         print(f"{item.name} {limb} {degrees} degrees: {off[0]:.1f} mm, after {off[1]:.1f} mm", flush=True)

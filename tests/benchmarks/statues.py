@@ -19,9 +19,9 @@ from protocols import machine, write_report
 from model.statue.detail.displacement import DisplacementConfig, coverage_shares
 from model.statue.detail.reconstruction import (
     Reconstruction,
+    find_inverted,
     in_folds,
-    inverted_triangles,
-    measured_levels,
+    measure_levels,
     remaining_error,
 )
 from model.statue.fit import StatueConfig, fit_statue
@@ -52,13 +52,13 @@ def row(name: str, scan: Mesh, size: int, vectors: bool) -> dict[str, object]:
     statue = fit_statue(scan, config=StatueConfig(displacement=DisplacementConfig(size=size, vectors=vectors)))
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     control, map_ = statue.control, statue.map
-    levels, fine = measured_levels(statue, scan)
+    levels, fine = measure_levels(statue, scan)
     build = Reconstruction(control, map_, fine)
     start = time.perf_counter()
     for _ in range(FRAMES):
         moved = build(control.mesh.vertices)
     rate = FRAMES / (time.perf_counter() - start)
-    turned = inverted_triangles(control, control.mesh.vertices, fine, moved)
+    turned = find_inverted(control, control.mesh.vertices, fine, moved)
     left = remaining_error(control, replace(map_, vectors=None), scan)
     return {"scan": name, "triangles": len(scan.faces), "vectors": vectors, **coverage_shares(control, map_),
             "levels": [{"vertices": len(one.mesh.vertices), "mean_mm": 1e3 * one.mean, "rms_mm": 1e3 * one.rms}

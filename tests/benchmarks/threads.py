@@ -28,7 +28,7 @@ import numpy as np
 from protocols import half_view, machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, write_markers
-from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.named import load_layout
 from model.body import BodyModel
 from model.built_in import load_built_in_model
 from model.files import BUILT_IN
@@ -59,7 +59,7 @@ def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, li
     write_landmarks(folder / "half.landmarks.json",
                     {names[int(v)]: p for v, p in zip(*seen.landmarks, strict=True)})
     subject = model.subject(0.5 * rng.normal(size=model.n_betas))
-    layout = named_layout("cmu41", model.template, kept)
+    layout = load_layout("cmu41", model.template, kept)
     bodies = subject.vertices(*walk(720, 120.0))
     places = np.array([layout.place(model.template.with_vertices(v)) for v in bodies])
     places += rng.normal(0, 0.001, places.shape)

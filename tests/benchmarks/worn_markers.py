@@ -24,7 +24,7 @@ from protocols import RealData, half_view, load_real, machine, scape_fold, sprin
 from scans import HELD_MEN, HELD_POSES, test_scan
 
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import layout_on, named_layout
+from completion.mocap.marker_sets.named import layout_on, load_layout
 from completion.partial.completion import complete
 from model import LearnConfig, learn_scape
 from model.body import BodyModel
@@ -73,7 +73,7 @@ def in_sight(layout: MarkerLayout, truth: Mesh, scan: Mesh) -> np.ndarray:
 
 def real_cases(data: RealData, model: BodyModel, kind: str, numbers: list[int]) -> Iterator[Case]:
     """Held-out poses, as a known and as an unknown man, or held-out men."""
-    layout = named_layout("cmu41", data.template)
+    layout = load_layout("cmu41", data.template)
     for k in numbers:
         item = test_scan(data, kind, k)
         landmarks = item.landmarks(data, "7")
@@ -88,7 +88,7 @@ def synthetic_cases(count: int) -> Iterator[Case]:
     """Women and men in turn, none of whom the model was learned from, in random poses."""
     model = load_built_in_model()
     kept = np.array(model.info["people_vertices"])
-    layout, marks = named_layout("cmu41", model.template, kept), model.info["landmarks"]
+    layout, marks = load_layout("cmu41", model.template, kept), model.info["landmarks"]
     chosen = np.array([v for name, v in marks.items() if name in (
         "left toe", "right toe", "left knee", "left middle finger", "right middle finger", "top of head", "navel")])
     for k in range(count):

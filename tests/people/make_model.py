@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from model.built_in import KIND, STORED, VERSION, pack_coefficients, shape_space
-from model.human_poses import mixed, with_human_poses
+from model.human_poses import mix_moments, with_human_poses
 from model.importing import FINGERS
 from model.learning.config import LearnConfig
 from model.learning.scape import learn_scape
@@ -37,7 +37,7 @@ from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.people import BodyShape, Person
 from scanprep.synthetic.population import STORED as PEOPLE
 from scanprep.synthetic.population import population
-from scanprep.synthetic.poses import arm, mirrored_pose
+from scanprep.synthetic.poses import arm, mirror_pose
 
 STANDING = 0.4                       # poses near rest for each other one: bodies at rest were 0.3 mm off, 0.5 without
 STOOD = 60                           # examples of poses of people who stand
@@ -57,7 +57,7 @@ def learn_people_model(poses: int, faces: int, config: LearnConfig = LEARN, n_be
     at = [subject_pose(k, rng)[1] for k in range(poses // 2)]
     at += [near_rest(rng) for _ in range(round(STANDING * poses / 2))]
     # with mirror images: else the mean of the poses leaves the body at rest turned to one side
-    at = [side for pose in at for side in (pose, mirrored_pose(pose))]
+    at = [side for pose in at for side in (pose, mirror_pose(pose))]
     posed = np.stack([person.posed(pose) for pose in at])
     small = decimate_person(person, posed, faces)
     assert small.skeleton is not None, "a skeleton was given"
@@ -89,7 +89,7 @@ def pose_prior(template: Mesh, skeleton: Skeleton, posed: np.ndarray, standing: 
                ) -> tuple[np.ndarray, np.ndarray]:
     """Mean (J, 3) and covariance (3J, 3J) of poses, radians: of those who stand, and of everything that joints do."""
     (m, C), (m_standing, C_standing) = ((x.mean(axis=0), np.cov(x.reshape(len(x), -1).T)) for x in (posed, standing))
-    return mixed((m_standing, C_standing), with_human_poses(template, skeleton, len(posed), m, C), STAND)
+    return mix_moments((m_standing, C_standing), with_human_poses(template, skeleton, len(posed), m, C), STAND)
 
 
 def decimate_person(person: Person, posed: np.ndarray | None, faces: int) -> DecimatedSet:

@@ -28,7 +28,7 @@ def holds_keys(path: Path) -> bool:
     if path.suffix.lower() not in (".csv", ".tsv") or not path.is_file():
         return False
     with storage.taking_apart(path, "a table"):
-        head = tables.decoded(storage.read_bytes(path, "a table")).split("\n", 1)[0]
+        head = tables.decode_text(storage.read_bytes(path, "a table")).split("\n", 1)[0]
     return any(re.fullmatch(".+_r[xyz]", word.strip(' "\r').lower()) for word in re.split("[,;\t]", head))
 
 
@@ -96,7 +96,7 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
         keyed = np.isfinite(angles[:, 0])
         if keyed.any():
             TURNS.check(np.radians(angles[keyed]), f"{path}: {name}")
-            poses[:, j] = turned_between(times[keyed], np.radians(angles[keyed]), at)
+            poses[:, j] = interpolate_rotations(times[keyed], np.radians(angles[keyed]), at)
     places = _coordinates(path, table, columns, PLACE, lines)
     keyed = np.isfinite(places[:, 0])
     trans = _between(times[keyed], UNITS[unit or "m"] * places[keyed], at) if keyed.any() else np.zeros((len(at), 3))
@@ -110,7 +110,7 @@ def judge_keys(poses: np.ndarray) -> Judgement:
                                "degrees"] if 0 < largest < 2 * np.pi else [])
 
 
-def turned_between(times: np.ndarray, turns: np.ndarray, at: np.ndarray) -> np.ndarray:
+def interpolate_rotations(times: np.ndarray, turns: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Rotation vectors (T, 3), radians, at some times, between those (n, 3) at growing `times` (n,).
 
     Monotone cubics of unit quaternions of continuous sign. A spline of continuous acceleration, as `RotationSpline`,

@@ -19,7 +19,7 @@ from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 
 from ...motion import Motion
-from ...motion_pictures import chart_residuals, dotted_pane, frame_panes, moving_pane, worst_frames
+from ...motion_pictures import chart_residuals, frame_panes, moving_pane, pane_with_dots, worst_frames
 from ..files.motion_files import write_glb, write_motion, write_residuals
 from .keys import holds_keys, judge_keys, read_keys
 
@@ -51,7 +51,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     else:
         found = read_motion(path, model, subject, unit, rate)
         body = subject if subject is not None else model.subject(found.betas)
-        judgement = judged(found.fit)
+        judgement = judge_fit(found.fit)
     motion = Motion.of(found)
     metrics = [judgement_row(judgement), Metric("model", name), *figures(found)]
     write_motion(room.folder, motion, body)
@@ -67,7 +67,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     return metrics, motion, body, page.section("Figures").figures(metrics)
 
 
-def judged(fit: Followed | None) -> Judgement:
+def judge_fit(fit: Followed | None) -> Judgement:
     """What a motion is worth that was brought onto a body."""
     reasons = []
     if fit is not None and fit.angle > MOST:
@@ -102,7 +102,8 @@ def figures(found: BodyMotion) -> list[Metric]:
 
 def _joints(page: Page, motion: Motion, body: Subject, fit: Followed, folder: Path) -> None:
     """The body with the joint centres that it follows; the residuals of `motion` are their distances."""
-    page.bodies([dotted_pane(motion, body, fit.wanted, "joint centres of the motion", [*map(_words, fit.names)], True)],
+    page.bodies([pane_with_dots(motion, body, fit.wanted, "joint centres of the motion", [*map(_words, fit.names)],
+                                True)],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Joint centres").chart(chart_residuals(motion, "joint centres"),
                                         "distance of the body's joint centres from those of the motion")

@@ -22,22 +22,22 @@ from ...motion import Motion
 from ...motion_pictures import (
     chart_residuals,
     chart_states,
-    dotted_pane,
     frame_panes,
     marker_rows,
     moving_pane,
+    pane_with_dots,
     worst_frames,
 )
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import write_glb, write_motion
-from ..files.opensim import believed
+from ..files.opensim import remove_distrusted
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.coverage import find_coverage
 from ..pose.follow import AnimateConfig, animate
 from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_problem
-from ..retargeting.retarget import morphed_vertices, retarget
+from ..retargeting.retarget import morph_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
 from .motions import bring, is_motion
@@ -77,7 +77,7 @@ class Work:
                          "longer as the legs are, and the feet are on the ground when those of the first are.")
             page.bodies([moving_pane(other, self.retarget_to)])
         if self.betas_to is not None:
-            bodies = partial(morphed_vertices, self.model, motion, betas_in_motion(self.betas_to, motion))
+            bodies = partial(morph_vertices, self.model, motion, betas_in_motion(self.betas_to, motion))
             metrics += write_glb(room.folder / "morph.glb", motion, body, bodies)
             page.section("With a body that changes", "Betas change straight from key to key, or are given for every "
                          "frame.")
@@ -120,7 +120,7 @@ class Work:
         if found is not None:
             judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *figures(motion)]
-        write_motion(output, motion, body, believed(motion, sequence), covered.told)
+        write_motion(output, motion, body, remove_distrusted(motion, sequence), covered.told)
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:
@@ -173,7 +173,7 @@ def betas_in_motion(given: BetasTo, motion: Motion) -> dict[float, np.ndarray] |
 def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str, metrics: list[Metric]) -> Page:
     """The page of `scape animate`."""
     page = Page(f"{name}, animated", "The body in motion, with the markers that were measured as dots.")
-    page.bodies([dotted_pane(motion, subject, markers.positions, "measured markers", markers.labels)],
+    page.bodies([pane_with_dots(motion, subject, markers.positions, "measured markers", markers.labels)],
                 "Press the triangle to play, drag the body to turn it; it is kept in the middle.", 520)
     page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.bodies(frame_panes(motion, subject, markers.positions, worst_frames(motion, 5)),

@@ -9,8 +9,8 @@ from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose import swaps
-from ..pose.follow import between_keys, seen_span
-from ..pose.marked_body import AnimateConfig, MarkedBody, batches, known_median, marker_weights
+from ..pose.follow import between_keys, span_with_markers
+from ..pose.marked_body import AnimateConfig, MarkedBody, batches, marker_weights, median_of_known
 from .results import ArtefactConfig, BadSpan, MarkerArtefacts, list_swaps
 from .slips import find_bad, without_lost_limbs
 
@@ -36,7 +36,7 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
         Where on the person the markers sit. Swaps are also found among labels that it does not know.
     config : ArtefactConfig, optional
     motion : Motion, optional
-        Of the person in this sequence as `known` has repaired it, else `relabelled_by_tracks`, if it is known already.
+        Of the person in this sequence as `known` has repaired it, else `relabel_by_tracks`, if it is known already.
     progress : callable, optional
         Called with (done, total) rounds.
     known : MarkerArtefacts, optional
@@ -58,7 +58,7 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
     unsure = (order != np.arange(order.shape[1])).mean(axis=0) > (0.25 if known is None else 1)
     for done in range(ROUNDS):
         # the body follows the markers as they are repaired by now, from where it was
-        repaired = _repaired(markers, order, bad)[:, body.rows]
+        repaired = _repair(markers, order, bad)[:, body.rows]
         x = body.body.body.join(motion.poses, motion.trans) if motion is not None and not done and not unsure.any() \
             else body.follow(repaired, unsure, near)
 
@@ -74,7 +74,7 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
         # and which markers are elsewhere; where labels are wrong, so is the body, and a lost limb is sought anew
         bad, near = (), x if same else None
         if sure and same:
-            tracks = swaps.Tracks(swaps.relabelled(markers.positions, order)[:, body.rows], markers.rate)
+            tracks = swaps.Tracks(swaps.apply_order(markers.positions, order)[:, body.rows], markers.rate)
             off = tracks.positions - simulated
             found = find_bad(body.local(off, x), body.local(body.alone(off, x, repaired), x),
                              np.where(tracks.jumped, tracks.off, 0), body.labels, config, markers.rate)
@@ -88,10 +88,10 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
     return _result(body, markers, order, bad, x)
 
 
-def relabelled_by_tracks(markers: MarkerSequence) -> MarkerSequence:
+def relabel_by_tracks(markers: MarkerSequence) -> MarkerSequence:
     """The sequence with labels put right as far as the tracks of the markers alone tell, without a body."""
     order = swaps.find_order(markers.positions, markers.rate)
-    return MarkerSequence(swaps.relabelled(markers.positions, order), markers.labels, markers.rate)
+    return MarkerSequence(swaps.apply_order(markers.positions, order), markers.labels, markers.rate)
 
 
 def no_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, motion: Motion) -> MarkerArtefacts:
@@ -108,18 +108,18 @@ def _out(markers: MarkerSequence, bad: tuple[BadSpan, ...]) -> np.ndarray:
     return out
 
 
-def _repaired(markers: MarkerSequence, order: np.ndarray, bad: tuple[BadSpan, ...]) -> np.ndarray:
+def _repair(markers: MarkerSequence, order: np.ndarray, bad: tuple[BadSpan, ...]) -> np.ndarray:
     """The markers (T, L, 3), metres, under their right labels, without bad spans."""
-    return np.where(_out(markers, bad)[..., None], np.nan, swaps.relabelled(markers.positions, order))
+    return np.where(_out(markers, bad)[..., None], np.nan, swaps.apply_order(markers.positions, order))
 
 
 def _result(body: Simulation, markers: MarkerSequence, order: np.ndarray, bad: tuple[BadSpan, ...], x: np.ndarray
             ) -> MarkerArtefacts:
     """What has been found, with the body at unknowns (T, P)."""
-    repaired, simulated = _repaired(markers, order, bad), body.body.positions(x)
+    repaired, simulated = _repair(markers, order, bad), body.body.positions(x)
     targets = repaired[:, body.rows]
     # seconds that a marker out of sight takes to its usual place, and from there
-    off = bridged(body.local(targets - simulated, x), 0.5 * markers.rate)
+    off = bridge_gaps(body.local(targets - simulated, x), 0.5 * markers.rate)
     return MarkerArtefacts(list_swaps(order, markers.seen, markers.labels), bad, simulated, body.labels,
                            MarkerSequence(repaired, markers.labels, markers.rate),
                            marker_weights(simulated, targets, 1.0, FOLLOW.outlier)[0],
@@ -148,7 +148,7 @@ class Simulation:
             if np.isfinite(some[..., 0]).sum(axis=1).max() >= 0.6 * len(self.rows):
                 targets = some
         x = between_keys(self.body, targets, self.rate, FOLLOW) if near is None else near.copy()
-        inside, stiffness = seen_span(targets), FOLLOW.inertia(self.rate, self.body.n_unknowns)
+        inside, stiffness = span_with_markers(targets), FOLLOW.inertia(self.rate, self.body.n_unknowns)
         for _ in range(FOLLOW.smoothing):
             weights = self.weights(x[inside], targets[inside])
             x[inside] = self.body.smoothed(x[inside], stiffness, self.body.system, targets[inside], weights)
@@ -160,7 +160,7 @@ class Simulation:
 
     def expected(self, targets: np.ndarray, simulated: np.ndarray, x: np.ndarray, unsure: np.ndarray) -> np.ndarray:
         """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
-        usual = known_median(self.local(targets - simulated, x), 0)
+        usual = median_of_known(self.local(targets - simulated, x), 0)
         usual[unsure[self.rows]] = 0
         # metres, most that a marker's usual place is taken to be from its simulation
         usual *= np.minimum(1, 0.04 / np.maximum(np.linalg.norm(usual, axis=1, keepdims=True), 1e-12))
@@ -215,7 +215,7 @@ def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: 
                ) -> np.ndarray:
     """The order (T, L) with close markers swapped where the body at x (T, P) has followed the wrong ones."""
     raw = swaps.Tracks(markers.positions, markers.rate)
-    tracks = swaps.Tracks(swaps.relabelled(markers.positions, order), markers.rate)
+    tracks = swaps.Tracks(swaps.apply_order(markers.positions, order), markers.rate)
     swapped = {(min(a, b), max(a, b)) for row in np.unique(order, axis=0) for a, b in enumerate(row.tolist()) if a != b}
     pairs, order = swaps.pairs_that_jump(raw, set(range(len(markers.labels)))) | swapped, order.copy()
     for a, b in sorted(pairs):
@@ -224,7 +224,7 @@ def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: 
             frames, columns = ambiguous_swap(body, x, tracks, a, b), np.array((a, b))
             order[np.ix_(frames, columns)] = order[np.ix_(frames, columns[::-1])]
             if len(frames):
-                tracks.change(columns, swaps.relabelled(markers.positions, order[:, columns]))
+                tracks.change(columns, swaps.apply_order(markers.positions, order[:, columns]))
     return order
 
 
@@ -261,9 +261,9 @@ def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: swaps.Tracks, a: int
     return swapped if total > swaps.WORTH else swapped[:0]
 
 
-def bridged(local: np.ndarray, reach: float) -> np.ndarray:
+def bridge_gaps(local: np.ndarray, reach: float) -> np.ndarray:
     """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, long ones by the usual place."""
-    out = np.repeat(known_median(local, 0)[None], len(local), axis=0)
+    out = np.repeat(median_of_known(local, 0)[None], len(local), axis=0)
     for i in range(local.shape[1]):
         seen = np.flatnonzero(np.isfinite(local[:, i, 0]))
         if not len(seen):

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
-from ..pose.marked_body import known_median, stretches
+from ..pose.marked_body import median_of_known, stretches
 from .results import ArtefactConfig, BadKind, BadSpan
 
 SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within a tenth of a second
@@ -20,7 +20,7 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
     `off` is as the body follows all, `alone` as it would the others; `jumps` (T, L), metres, is how far tracks jump.
     """
     noise_usual, stray_usual, joined = 5.0, 4.0, 0.1        # times what is usual; seconds between spans that are one
-    usual = known_median(np.linalg.norm(off - known_median(off, 0), axis=2))
+    usual = median_of_known(np.linalg.norm(off - median_of_known(off, 0), axis=2))
     tracks = [off[:, i][np.isfinite(off[:, i, 0])] for i in range(len(labels))]
     # second differences, those at the ends repeated
     jitter = [np.pad(np.linalg.norm(np.diff(track, 2, axis=0), axis=1), 1, mode="edge") if len(track) > 2

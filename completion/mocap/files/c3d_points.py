@@ -76,7 +76,7 @@ def _with_points(path: Path, data: bytes, table: PointTable, words: np.ndarray, 
     rows = np.frombuffer(data, np.uint8, T * table.width, table.start).reshape(T, -1)
     encoded = np.frombuffer(table.numbers.encoded(words, table.kind), np.uint8)
     own = 4 * len(table.labels) * size
-    body = _padded(np.concatenate([encoded.reshape(T, -1), rows[:, own:]], axis=1).tobytes())
+    body = _pad(np.concatenate([encoded.reshape(T, -1), rows[:, own:]], axis=1).tobytes())
     behind = behind if behind >= table.start + table.frames * table.width else 0
     try:
         section = _section(path, data, begin, table, labels, descriptions, len(body) // BLOCK if behind else 0)
@@ -124,7 +124,7 @@ def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: lis
         name = 2 + abs(struct.unpack_from("b", record)[0])
         linked += record[:name] + struct.pack(f"{order}H", len(record) - name + 2 if i < len(kept) - 1 else 0) \
             + record[name:]
-    return _padded(bytes(linked))
+    return _pad(bytes(linked))
 
 
 def _parameter(group: int, name: str, values: bytes) -> bytes:
@@ -145,5 +145,5 @@ def _records(data: bytes, table: PointTable) -> Iterator[tuple[int, str, bytes]]
         yield group, name, data[place:link] + data[link + 2:end]
 
 
-def _padded(data: bytes) -> bytes:
+def _pad(data: bytes) -> bytes:
     return data + b"\0" * (-len(data) % BLOCK)

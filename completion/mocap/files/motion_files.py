@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from model.export.bvh import write_bvh
-from model.export.conventions import aimed
+from model.export.conventions import aim_bones
 from model.export.correctives import body_correctives, motion_correctives, off_exact
 from model.export.glb import write_skinned_glb
 from model.linear import Subject
@@ -20,7 +20,7 @@ from scanprep.pictures.camera import upright
 
 from ...motion import Motion
 from .markers import MarkerSequence
-from .opensim import known_centres, write_opensim
+from .opensim import mask_unknown_centres, write_opensim
 
 KEYS = 240                           # frames of a GLB whose bodies are made one by one, where they change
 
@@ -61,7 +61,7 @@ def write_motion(folder: Path, motion: Motion, subject: Subject, markers: Marker
     write_table(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
                 np.c_[motion.times, angles.reshape(T, -1)])
     write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, known_centres(centres, skeleton, told).reshape(T, -1)])
+                np.c_[motion.times, mask_unknown_centres(centres, skeleton, told).reshape(T, -1)])
     write_opensim(folder, motion, subject, centres, markers, told)
     if motion.labels:
         write_residuals(folder / "residuals.csv", motion)
@@ -98,7 +98,7 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
     up, measured = upright(subject.template)[0], spread_indices(T, 40)      # compared with the exact bodies
     exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
     off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
-    write_skinned_glb(path, aimed(rig, up), motion.poses, motion.trans, motion.rate, up)
+    write_skinned_glb(path, aim_bones(rig, up), motion.poses, motion.trans, motion.rate, up)
     return details([Metric(f"{path.name}, distance from the exact body, mean", float(off.mean()), "mm"),
                     Metric("the same, largest", float(off.max()), "mm")])
 

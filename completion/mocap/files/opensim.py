@@ -14,7 +14,7 @@ from model.linear import Subject
 from scanprep.console import say
 from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import stance
-from scanprep.skeleton.roles import numbered_roles
+from scanprep.skeleton.roles import find_numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion
@@ -28,7 +28,7 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
 
     Centres and angles between parts of which the markers do not tell (`told` (J,) bool) are left out.
     """
-    points = centre_sequence(known_centres(centres, subject.skeleton, told), subject.skeleton, motion.rate)
+    points = centre_sequence(mask_unknown_centres(centres, subject.skeleton, told), subject.skeleton, motion.rate)
     try:
         angles = anatomical_angles(motion, subject, centres, told)
     except ValueError as error:
@@ -47,7 +47,7 @@ def write_opensim(folder: Path, motion: Motion, subject: Subject, centres: np.nd
     write_markers(folder / "motion.trc", MarkerSequence(positions @ ground, labels, rate))
 
 
-def believed(motion: Motion, markers: MarkerSequence) -> MarkerSequence:
+def remove_distrusted(motion: Motion, markers: MarkerSequence) -> MarkerSequence:
     """The markers of a motion without those that the body did not believe; unknown ones stay."""
     doubted = np.isfinite(motion.residuals) & ~motion.trusted
     return MarkerSequence(np.where(doubted[..., None], np.nan, markers.positions), markers.labels, markers.rate)
@@ -71,7 +71,7 @@ def centre_sequence(centres: np.ndarray, skeleton: Skeleton, rate: float) -> Mar
     return MarkerSequence(centres[:, 1:], centre_labels(skeleton), rate)
 
 
-def known_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | None) -> np.ndarray:
+def mask_unknown_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | None) -> np.ndarray:
     """Joint centres (T, J, 3) without, NaN, those between two parts of which the markers do not tell."""
     if told is None:
         return centres
@@ -81,7 +81,7 @@ def known_centres(centres: np.ndarray, skeleton: Skeleton, told: np.ndarray | No
 def centre_labels(skeleton: Skeleton) -> tuple[str, ...]:
     """(J - 1) names of the joints but the root's."""
     sided = {j: f"{role[2:]}_{role[0]}_joint" for role, j in
-             numbered_roles(skeleton.names, skeleton.joints).items() if role[:2] in ("l_", "r_")}
+             find_numbered_roles(skeleton.names, skeleton.joints).items() if role[:2] in ("l_", "r_")}
     taken = [sided.get(j, f"{name}_joint") for j, name in enumerate(skeleton.names)][1:]
     return tuple(label if taken.count(label) == 1 else f"{skeleton.names[j]}_joint{j}"
                  for j, label in enumerate(taken, start=1))

@@ -95,7 +95,7 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     if not body:
         raise MarkerFileError(f"{path}: truncated: expected frames below line {rows[named][0]}, found none")
     usual = Counter(len(cells) for _, cells in body).most_common(1)[0][0]
-    columns, names = _named_columns(rows[named][1], count, usual)
+    columns, names = _find_named_columns(rows[named][1], count, usual)
     if not names:
         raise MarkerFileError(f"{path}: line {rows[named][0]}: expected marker names, found none")
     width, notes = 5 + 3 * max(columns), []
@@ -116,7 +116,7 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
                       (*notes, *twice))
 
 
-def _named_columns(cells: Sequence[str], count: float | None, usual: int) -> tuple[list[int], list[str]]:
+def _find_named_columns(cells: Sequence[str], count: float | None, usual: int) -> tuple[list[int], list[str]]:
     """Which trajectories have a name, and their names, of the line with the names.
 
     `count` is what the header says, `usual` how many cells a line has. Names may be separated by blanks.

@@ -153,7 +153,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     """
     tell = progress or (lambda done, total: None)
     at, rate, T = points.positions, points.rate, len(points.positions)
-    known = _checked(known, points, sum(len(layout.labels) for _, layout in people))
+    known = _check_known(known, points, sum(len(layout.labels) for _, layout in people))
     tracks = link_points(at, rate)
 
     # key frames, from one in which the bodies are found: mean people, or those who are known
@@ -168,7 +168,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     columns, found = _in_order(bodies, columns, keys, found)
 
     # the same by the people themselves
-    bodies = [body if isinstance(model, Subject) else _found(body, model, at, mine, rate)
+    bodies = [body if isinstance(model, Subject) else _find_person(body, model, at, mine, rate)
               for body, (model, _), mine in zip(bodies, people, _of_each(bodies, columns), strict=True)]
     searches = [BodySearch(body.marked, body.subject) for body in bodies]
     labels = label_of_track(columns, tracks)
@@ -184,7 +184,7 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
         for k, mine in enumerate(_of_each(bodies, columns)):
             model = people[k][0]
             if changed and not isinstance(model, Subject):
-                bodies[k] = _found(bodies[k], model, at, mine, rate)
+                bodies[k] = _find_person(bodies[k], model, at, mine, rate)
         moving = [body.follow(at, mine, rate) for body, mine in zip(bodies, _of_each(bodies, columns), strict=True)]
         places = np.concatenate([one.places for one in moving], axis=1)
         turns = np.concatenate([one.turns for one in moving], axis=1)
@@ -245,7 +245,7 @@ class _Moving:
     turns: np.ndarray
 
 
-def _found(person: _Person, model: BodyModel, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:
+def _find_person(person: _Person, model: BodyModel, points: np.ndarray, columns: np.ndarray, rate: float) -> _Person:
     """A person of unknown shape by the labels that columns (T, L) give."""
     fit = find_person(model, _sequence(points, columns, person.usual, rate), person.usual)
     subject = model.subject(fit.betas)
@@ -300,7 +300,7 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
                      "people?")
 
 
-def _checked(known: np.ndarray | None, points: MarkerSequence, count: int) -> np.ndarray:
+def _check_known(known: np.ndarray | None, points: MarkerSequence, count: int) -> np.ndarray:
     """What is known of the points (T, C), and that there are enough of them."""
     most = int(points.seen.sum(axis=1).max(initial=0))
     if most < FEWEST:

@@ -13,7 +13,7 @@ from scanprep.pictures.page import Page
 from ..files.markers import MarkerSequence, read_markers, read_points
 from ..marker_sets.layout import MarkerLayout
 from .page import label_page
-from .recording import label_recording, named_only
+from .recording import drop_unnamed, label_recording
 
 LABELLED, TABLE, PAGE = "labelled.c3d", "labels.csv", "labels.html"
 
@@ -53,7 +53,7 @@ def label_first(room: Room, name: str, path: Path, model: BodyModel | Subject, l
 
 def read_labelled(labelled: Path, source: Path, unit: str | None, rate: float | None) -> MarkerSequence:
     """The markers of a labelled C3D that was made of a source, without the points that are none."""
-    return named_only(read_markers(labelled, _own_unit(source, unit), None, rate))
+    return drop_unnamed(read_markers(labelled, _own_unit(source, unit), None, rate))
 
 
 def show_labels(page: Page) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 
 from .body_search import ALONE, LIMB_ROUNDS, BodySearch, Placement
 from .follow_points import OWN_PERSON
-from .live_matching import left_over
+from .live_matching import find_unmatched
 
 WINDOW, LONG = 0.1, 2.0              # seconds over which strains are averaged, and what is usual
 RISE = 0.5                           # most markers by which a strain may lift what is usual
@@ -53,7 +53,7 @@ class LimbWatch:
         squared = ((points[chosen[there]] - places[there])**2).sum(axis=1)
         cost[there] = squared / (squared + OWN_PERSON.judged**2)
         # a marker without a point is a fault where a free point is near
-        free = left_over(len(points), chosen)
+        free = find_unmatched(len(points), chosen)
         if len(free) and not there.all():
             apart = ((points[free] - places[~there][:, None])**2).sum(axis=-1).min(axis=1)
             cost[~there] = np.where(apart < NEAR**2, ALONE, 0.0)

@@ -111,7 +111,7 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
     chosen : (L,) int
         Matches of each by itself.
     """
-    free = left_over(len(points), chosen)
+    free = find_unmatched(len(points), chosen)
     best, most = chosen, GAIN
     if (chosen >= 0).all() or not len(free):
         return chosen
@@ -123,7 +123,7 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
         if (chosen[group] >= 0).all():
             continue
         # points that no other marker has, after the shift
-        pool = left_over(len(points), np.delete(chosen, group))
+        pool = find_unmatched(len(points), np.delete(chosen, group))
         apart = expected.places[group][:, None] + shift - points[pool]
         moved, _ = assign(np.minimum((apart**2).sum(axis=-1) / (2 * SHIFTED_SD**2), 2 * ALONE), ALONE)
         moved = np.where(moved >= 0, pool[moved], -1)
@@ -137,7 +137,7 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
     return best
 
 
-def left_over(count: int, chosen: np.ndarray) -> np.ndarray:
+def find_unmatched(count: int, chosen: np.ndarray) -> np.ndarray:
     """Which (n,) of so many points no marker has in matches (L,)."""
     free = np.ones(count, dtype=bool)
     free[chosen[chosen >= 0]] = False

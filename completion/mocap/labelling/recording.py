@@ -122,7 +122,7 @@ def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subje
     names = tuple(prefix + label for prefix in prefixes for label in layout.labels)
     known = np.full(points.positions.shape[:2], UNKNOWN)
     if not relabel:
-        known = known_columns(points, layout, prefixes)
+        known = columns_of_labels(points, layout, prefixes)
     if corrections is not None:
         said = read_corrections(corrections, link_points(points.positions, points.rate), names)
         for row in np.unique(said[said >= 0]):                         # the file's own label gives way in these frames
@@ -135,7 +135,7 @@ def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subje
     return LabelledRecording(path, points, found, names, known)
 
 
-def known_columns(points: MarkerSequence, layout: MarkerLayout, prefixes: Sequence[str] = ("",)) -> np.ndarray:
+def columns_of_labels(points: MarkerSequence, layout: MarkerLayout, prefixes: Sequence[str] = ("",)) -> np.ndarray:
     """The rows (T, C) that the labels of a recording tell, `UNKNOWN` for others.
 
     Rows are those of the layout, counted on from person to person; `prefixes` are what their labels begin with, with
@@ -157,7 +157,7 @@ def known_columns(points: MarkerSequence, layout: MarkerLayout, prefixes: Sequen
     return known
 
 
-def named_only(markers: MarkerSequence) -> MarkerSequence:
+def drop_unnamed(markers: MarkerSequence) -> MarkerSequence:
     """The markers of a labelled recording, without the points that are none."""
     return markers.select([label for label in markers.labels if not label.startswith(NAMELESS)])
 

@@ -164,7 +164,7 @@ class LabelStream:
             if not (chosen >= 0).any():
                 break
             # one Gauss-Newton step; markers in doubt follow the others at first
-            targets = _taken(points, chosen)
+            targets = _take(points, chosen)
             weights, _ = marker_weights(on_body.places, targets, self.config.marker_sd, self.config.outlier)
             if i == 0 and not doubt:
                 weights = weights * np.maximum(2 * sure - 1, 0.0)
@@ -235,7 +235,7 @@ class LabelStream:
         found = self.search.judge(self.search.find(points).x, points, OWN_PERSON.judged)
         found = self.search.restart_limbs(found, points, OWN_PERSON.judged)
         # as near to its points as it will be followed
-        targets = _taken(points, found.matches)
+        targets = _take(points, found.matches)
         weights, _ = marker_weights(self.body.positions(found.x), targets, self.config.marker_sd, self.config.outlier)
         x = self.body.solve(found.x[None], targets, weights, SETTLED, 1e-4).x[0]
         return min(found, self.search.judge(x, points, OWN_PERSON.judged), key=lambda one: one.misfit)
@@ -303,7 +303,7 @@ class _Memory:
         self.last[rows], self.unseen[rows] = at, 0.0
 
 
-def _taken(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+def _take(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """The points (L, 3) that were chosen, NaN where none was."""
     targets = np.full((len(chosen), 3), np.nan)
     targets[chosen >= 0] = points[chosen[chosen >= 0]]

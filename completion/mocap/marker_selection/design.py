@@ -12,7 +12,7 @@ from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
 from .fits import DesignConfig, vertex_errors
 from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, symmetric_groups, walk
-from .linear import LinearBodies, fit_bodies, shared_shape
+from .linear import LinearBodies, fit_bodies, share_betas
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     """
     config = config or DesignConfig()
     groups = symmetric_groups(candidates.labels, partners)
-    kept = _kept(candidates, groups, keep, config)
+    kept = _groups_to_keep(candidates, groups, keep, config)
     if config.joint and people is None:
         raise ValueError("people: expected whose body each is, for betas that are common to a person's bodies")
     total = 2 * len(bodies) + 2 * len(candidates.labels)
@@ -139,7 +139,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
         halves = np.isin(people, names[:(len(names) + 1) // 2])
     if config.joint:
         assert people is not None, "checked above"
-        linear = shared_shape(fits.linear, fits.x, np.asarray(people), fits.markers.n_betas)
+        linear = share_betas(fits.linear, fits.x, np.asarray(people), fits.markers.n_betas)
         halves = np.arange(len(linear.rest)) < (len(linear.rest) + 1) // 2
     choice = choose(linear, groups, kept, config, lambda done: tell(min(2 * len(bodies) + done, total), total))
 
@@ -201,7 +201,7 @@ def best_path(paths: dict[str, Path], count: int) -> Path:
     return min(found, key=lambda path: (-path.counts[path.at(count)], path.rmse[path.at(count)]))
 
 
-def _kept(candidates: MarkerLayout, groups: Groups, keep: Sequence[str], config: DesignConfig) -> np.ndarray:
+def _groups_to_keep(candidates: MarkerLayout, groups: Groups, keep: Sequence[str], config: DesignConfig) -> np.ndarray:
     """(n,) bool: groups that stay."""
     unknown = [label for label in keep if label not in candidates.labels]
     if unknown:

@@ -10,7 +10,7 @@ import numpy as np
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
 from model.fitting.energy import MovingPoints, moving_points
-from model.linear import picked
+from model.linear import combination_weights
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
@@ -69,7 +69,7 @@ class BodyPoints:
 
     def some(self, chosen: np.ndarray) -> BodyPoints:
         """Some of the points."""
-        return BodyPoints(self.shaped.combined(picked(self.count, np.arange(self.count)[chosen], None)))
+        return BodyPoints(self.shaped.combined(combination_weights(self.count, np.arange(self.count)[chosen], None)))
 
     @property
     def batch(self) -> int:

@@ -175,24 +175,24 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
         before = done
         for group in np.flatnonzero(movable & sets.inside):
             if sets.inside[group]:
-                done += _exchanged(sets, movable, [int(group)])
+                done += _exchange(sets, movable, [int(group)])
         for group in np.flatnonzero(movable & sets.inside & (sets.sizes == 1)):
             others = np.flatnonzero(movable & sets.inside & (sets.sizes == 1))
             others = others[others != group]
             if sets.inside[group] and len(others):
                 least = others[np.argmin(sets.tried(others, REMOVE))]
-                done += _exchanged(sets, movable, [int(group), int(least)])
+                done += _exchange(sets, movable, [int(group), int(least)])
         if done == before:
             break
     return done
 
 
-def _exchanged(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
+def _exchange(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
     """Let groups of the set go for what serves best in their place; put them back where nothing is better."""
     before, enough = sets.state(), sets.costs.mean() * (1 - 1e-6)    # nothing is exchanged for a millionth less
     for group in out:
         sets.take(group, REMOVE)
-    new = _filled(sets, movable, int(sets.sizes[out].sum()))
+    new = _fill(sets, movable, int(sets.sizes[out].sum()))
     if set(new) != set(out) and sets.costs.mean() < enough:
         sets.renew()
         if sets.costs.mean() < enough:
@@ -201,7 +201,7 @@ def _exchanged(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
     return False
 
 
-def _filled(sets: MarkerSets, movable: np.ndarray, size: int) -> list[int]:
+def _fill(sets: MarkerSets, movable: np.ndarray, size: int) -> list[int]:
     """Let one group of that size come, or one marker after the other, whichever serves better; which they are."""
     whole, cost = _best(sets, movable, size)
     single, _ = _best(sets, movable, 1)
@@ -212,7 +212,7 @@ def _filled(sets: MarkerSets, movable: np.ndarray, size: int) -> list[int]:
     sets.take(single, ADD)
     second, together = _best(sets, movable, size - 1)
     if second >= 0 and together < cost:
-        return [single, *_filled(sets, movable, size - 1)]
+        return [single, *_fill(sets, movable, size - 1)]
     sets.put_back(before)
     sets.take(whole, ADD)
     return [whole]

@@ -128,7 +128,7 @@ def check_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     return bodies
 
 
-def shared_shape(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas: int) -> LinearBodies:
+def share_betas(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas: int) -> LinearBodies:
     """The same bodies, linearised around x (Z, P), with betas common to those of a person (Z,): one problem a person.
 
     Unknowns of a person are pose and place of the bodies one after the other, and the betas, a step from the mean

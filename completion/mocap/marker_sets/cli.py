@@ -17,7 +17,7 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmark_writing import marker_set
-from scanprep.geometry.landmarks import read_landmarks, read_template_landmarks, shared_landmarks
+from scanprep.geometry.landmarks import read_landmarks, read_template_landmarks, try_match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import Judgement
 from scanprep.registration.person import average_person
@@ -132,7 +132,7 @@ def transfer_to(layout: LayoutArg, target: Path, output: Output, source: Path | 
     if landmarks is not None:
         marks = synthetic_landmarks() if source is None and source_landmarks is None else read_template_landmarks(
             source or Path("average person"), ours, source_landmarks, "--source-landmarks")
-        pairs = shared_landmarks(landmarks, marks, read_landmarks(landmarks, theirs, unit))
+        pairs = try_match_landmarks(landmarks, marks, read_landmarks(landmarks, theirs, unit))
     with bar("registering") as progress:
         result = transfer_layout(found, ours, theirs, pairs, progress=progress)
     result.layout.save(output)

@@ -54,7 +54,7 @@ def layout_summaries() -> list[tuple[str, int, str, str]]:
     return out
 
 
-def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
     """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the synthetic people.
 
     Parameters
@@ -101,7 +101,7 @@ def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
     """The named layout that knows most of some labels, and its name; ValueError where none knows three of them."""
-    found = {name: named_layout(name, template, kept).spelled(labels) for name in layout_names()}
+    found = {name: load_layout(name, template, kept).spelled(labels) for name in layout_names()}
     known = {name: len(layout.matched(labels, 0)) for name, layout in found.items()}
     best = max(found, key=lambda name: (known[name], -len(found[name].labels)))
     if known[best] < FEWEST:
@@ -133,7 +133,7 @@ def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = Non
     """
     named = layout_or_file(given)
     if isinstance(named, str):
-        return named_layout(named, template, kept)
+        return load_layout(named, template, kept)
     if named.suffix.lower() in (".xml", ".osim") and skeleton is not None:
         return layout_on(template, opensim_places(named, template, skeleton))[0]
     clicked = named.suffix.lower() != ".json" or named.name.endswith(".mrk.json")

@@ -64,7 +64,7 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
         return pairs
     mirror = mirror or find_skin_mirror(template)
     skin = layout.skin_points(template.vertices)[untold]
-    image = mirrored_points(layout, template, mirror)[untold]
+    image = mirror_points(layout, template, mirror)[untold]
     apart = np.linalg.norm(image[:, None] - skin[None], axis=-1)
     apart = apart + apart.T                                                    # there and back
     for i, row in enumerate(untold):
@@ -74,7 +74,7 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
     return pairs
 
 
-def mirrored_points(layout: MarkerLayout, mesh: Mesh, mirror: SkinMirror) -> np.ndarray:
+def mirror_points(layout: MarkerLayout, mesh: Mesh, mirror: SkinMirror) -> np.ndarray:
     """(L, 3) where the mirror images of the markers lie on the skin, metres."""
     return layout.skin_points(mirror.image(mesh))
 

@@ -26,8 +26,8 @@ from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .cli import carry_out, describe
-from .mended_layout import Spot, changes, mended, next_file
-from .people import Found, found_people
+from .mended_layout import Spot, apply_corrections, changes, next_file
+from .people import Found, load_people
 from .work import ERRORS
 
 MENDED = "scape mosh, mended in the browser"
@@ -53,8 +53,8 @@ class Result:
         actors = [actor for actor in call.actors(folder) if actor.name in names]
         rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
         order = describe(call, models.name, actors).worst_first(Results(rows, {}, ()), rows)
-        people = found_people(folder, sorted(actors, key=lambda actor: order.index(actor.name)), models, call.unit,
-                              call.rate)
+        people = load_people(folder, sorted(actors, key=lambda actor: order.index(actor.name)), models, call.unit,
+                             call.rate)
         return Result(call, rows, people, _usual(call, models.neutral, people), models.neutral.template)
 
 
@@ -191,7 +191,7 @@ class MoshApp(ResultsApp):
             raise ValueError("nothing was corrected: move, exchange or take away a marker first")
         call = replace(self.result.call, layout=str(self.file))
         worn = {label for one in self.result.people for label in one.names}
-        mended(self.result.usual, self.spots).matched(sorted(worn), LEAST)
+        apply_corrections(self.result.usual, self.spots).matched(sorted(worn), LEAST)
         # now, as they are worked out from files that the run writes anew
         before = {one.name: self.result.figures(one.name) for one in self.result.people}
 
@@ -224,7 +224,7 @@ class MoshApp(ResultsApp):
                 self.spots[self._own(label)] = None if place is None else self._spot(number, label, place)
         self._place()
         if self.spots:
-            mended(self.result.usual, self.spots).save(self.file)
+            apply_corrections(self.result.usual, self.spots).save(self.file)
         else:
             self.file.unlink(missing_ok=True)
 

@@ -61,7 +61,7 @@ class Spot:
 Spots = Mapping[str, Spot | None]    # of markers by label; None for one out of use
 
 
-def mended(layout: MarkerLayout, spots: Spots) -> MarkerLayout:
+def apply_corrections(layout: MarkerLayout, spots: Spots) -> MarkerLayout:
     """A layout with some markers elsewhere, or without them."""
     kept = layout.without(list(spots))
     moved = {label: spot for label, spot in spots.items() if spot is not None}

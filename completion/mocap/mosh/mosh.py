@@ -17,7 +17,7 @@ from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 
 from ...motion import Motion, Progress
-from ..artefacts.find import find_artefacts, no_artefacts, relabelled_by_tracks
+from ..artefacts.find import find_artefacts, no_artefacts, relabel_by_tracks
 from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
@@ -269,7 +269,7 @@ class _Stages:
         """Labels put right as far as tracks tell."""
         if self.config.repair:
             trial.markers = self.run("artefacts", f"tracks {trial.number}", trial.raw,
-                                     lambda _: relabelled_by_tracks(trial.raw))
+                                     lambda _: relabel_by_tracks(trial.raw))
 
     def find_person(self, trials: Sequence[_Trial], layout: MarkerLayout, again: str = "") -> _Person:
         """Shape and marker places; `again` names it where it was found before, of other markers."""
@@ -359,7 +359,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
 
     [MoSh]
     """
-    checked_models(models)
+    check_models(models)
     config = config or MoshConfig()
     neutral = find_person(models["neutral"], sequences, layout, config.person, None, inside(step, "neutral"))
     guess = guess_sex(models["neutral"], neutral.betas)
@@ -369,7 +369,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
     return SexedMosh(guess, models[guess.sex], neutral, replace(result, motions=motions, soft_tissue=soft))
 
 
-def checked_models(models: Mapping[str, BodyModel]) -> None:
+def check_models(models: Mapping[str, BodyModel]) -> None:
     """ValueError for models with which a sex cannot be told or used."""
     missing = [name for name in ("neutral", "female", "male") if name not in models]
     if missing:

@@ -179,8 +179,8 @@ class Found:
         return Pane([Solid(body, name="body"), dots, rods], camera, frame.told)
 
 
-def found_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None,
-                 rate: float | None) -> list[Found]:
+def load_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None,
+                rate: float | None) -> list[Found]:
     """The people of an output, as their files tell; StorageError where they do not, ValueError where there are none."""
     found = []
     for actor in actors:

@@ -20,9 +20,9 @@ from ...motion_pictures import (
     chart_states,
     facing,
     frames_apart,
+    frames_to_play,
     mean_over,
     moving_pane,
-    played,
     upwards,
 )
 from ..artefacts.results import MarkerArtefacts
@@ -71,7 +71,7 @@ def marker_dots(take: Take, t: int, radius: float = 0.014) -> list[Dots]:
 
 def take_pane(take: Take) -> Pane:
     """The whole sequence with its markers."""
-    frames, _ = played(take.shown)
+    frames, _ = frames_to_play(take.shown)
     dots = [(Dots(at[0], color, 0.013, name=name, labels=take.markers.labels), at[frames])
             for name, (color, at) in kinds_of_markers(take).items()]
     return moving_pane(take.shown, take.subject, dots, take.make, take.light)
@@ -113,7 +113,7 @@ def soft_pane(take: Take, frames: np.ndarray) -> Pane:
     return Pane([Solid(body, shown)], look_around(body, turns=(20,))[0])
 
 
-def changed_panes(take: Take, frames: np.ndarray) -> list[Pane]:
+def soft_tissue_panes(take: Take, frames: np.ndarray) -> list[Pane]:
     """Frames with soft tissue, coloured by how far it moves the skin; the fixed shape can be laid over each."""
     change, light, looks = soft_change(take, frames), take.light, list[list[Shape]]()
     end = max(float(np.percentile(np.abs(change), 99.5)), LITTLE)
@@ -142,7 +142,7 @@ STATES = {"believed": "#e3eaf0", "not believed": "#f0c46c", "missing": "#9aa3ab"
           "slipped": "#8557a8", "noisy": "#b3592f", "stray": "#c02a3c"}
 
 
-def _thinned(values: np.ndarray, most: int = 900) -> np.ndarray:
+def _average_stretches(values: np.ndarray, most: int = 900) -> np.ndarray:
     """Means (n, ...) of stretches of the rows (T, ...), at most so many."""
     return np.stack([mean_over(part, 0) for part in np.array_split(values, min(most, len(values)))])
 
@@ -157,7 +157,7 @@ def chart_frames(take: Take) -> Any:
         lines.append(("held-out markers", take.held.shown, "#2f8f4e"))
     for label, residuals, color in lines:
         values = mean_over(residuals, 1)
-        shown = _thinned(MM * values)
+        shown = _average_stretches(MM * values)
         axes.plot(np.linspace(0, take.motion.times[-1], len(shown)), shown, color=color, linewidth=1.1,
                   label=f"{label}: {MM * np.nanmean(values):.1f} mm")
     axes.set(xlabel="time (s)", ylabel="distance (mm)", ylim=(0, None), xlim=(0, max(take.motion.times[-1], 1e-9)))
@@ -171,7 +171,8 @@ def chart_map(take: Take) -> Any:
     used = np.flatnonzero(np.isfinite(off).any(axis=0))
     used = used[np.argsort(-mean_over(off[:, used], 0))]
     figure, axes = chart(7.8, 0.7 + 0.13 * len(used))
-    drawn = axes.imshow(MM * _thinned(off[:, used]).T, aspect="auto", interpolation="nearest", cmap="magma_r", vmin=0,
+    drawn = axes.imshow(MM * _average_stretches(off[:, used]).T, aspect="auto", interpolation="nearest", cmap="magma_r",
+                        vmin=0,
                         vmax=float(np.nanpercentile(MM * off, 99)),
                         extent=(0, max(take.motion.times[-1], 1e-9), len(used) - 0.5, -0.5))
     axes.set_yticks(range(len(used)), [take.motion.labels[i] for i in used], fontsize=6)

@@ -94,7 +94,7 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
         rows = [(folder_name(name), f, grouping.who, "files that were named together") for f in found]
     else:
         rows = [(folder_name(name), f, who, rule) for f in found for name, who, rule in _people(f, grouping)]
-    return [Actor(person, _named(person, [(f, who) for name, f, who, _ in rows if name == person]),
+    return [Actor(person, _name_recordings(person, [(f, who) for name, f, who, _ in rows if name == person]),
                   next(rule for name, *_, rule in rows if name == person))
             for person in sorted({name for name, *_ in rows})]
 
@@ -160,7 +160,7 @@ def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, 
         yield own if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
 
 
-def _named(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recording, ...]:
+def _name_recordings(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recording, ...]:
     """The recordings of a person, each named as its file, with its ending where that is not enough."""
     def name(file: _File, ending: bool) -> str:
         folders = file.folders[1:] if file.folders and folder_name(file.folders[0]) == person else file.folders

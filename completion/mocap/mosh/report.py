@@ -72,7 +72,7 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     if before.loose:
         page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
     page.section("Frames that shape and markers were found from")
-    page.bodies(_chosen_frames(result, takes), height=200)
+    page.bodies(_choose_frames(result, takes), height=200)
     return closing(page, metrics, settings)
 
 
@@ -108,7 +108,7 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
         page.section("Soft tissue", "The skin may move in every frame, as flesh does and as a pose model with one "
                      "fixed shape cannot. What it takes up may also be markers that slide with the skin.")
         page.bodies([pictures.soft_pane(take, frames)], "where the body changes most")
-        page.bodies(pictures.changed_panes(take, pictures.most_changed(take, frames, 4)),
+        page.bodies(pictures.soft_tissue_panes(take, pictures.most_changed(take, frames, 4)),
                     "frames that change most", 300)
     page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
                  "swapped with another, has slipped, jitters or strays.")
@@ -149,7 +149,7 @@ def take_picture(take: Take, count: int = 6) -> np.ndarray:
     return pictures.picture_large(take, frames, 260)
 
 
-def _chosen_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
+def _choose_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
     person, subject, light = result.person, takes[0].subject, takes[0].light
     panes, vertical = [], upwards(takes[0].shown, subject)
     for (number, t), pose, trans in zip(person.frames.tolist(), person.poses, person.trans, strict=True):

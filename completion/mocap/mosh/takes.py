@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from model.body import BodyModel
-from model.fitting.energy import lifted
+from model.fitting.energy import rise_above_skin
 from model.linear import Subject
 
 from ...motion import Motion
@@ -76,8 +76,9 @@ class Take:
         return self.shown.vertices(self.subject, np.asarray(frames)).astype(float)
 
 
-def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], markers: MarkerSequence, motion: Motion,
-             soft: SoftTissue | None) -> HeldOut | None:
+def measure_held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], markers: MarkerSequence,
+                     motion: Motion,
+                     soft: SoftTissue | None) -> HeldOut | None:
     """How far a motion is from markers of the layout that it was not made from; None where there are none of them."""
     wanted = {layout.aliases.get(label, label) for label in labels}
     known = layout.matched(markers.labels, 0)
@@ -89,7 +90,7 @@ def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], mark
     lift, seen = np.asarray(places.distances), markers.select(names).positions
     assert motion.betas is not None, "a person of a shape space"
     points = model.points(ids, weights, len(motion.betas)).operator(motion.betas)
-    fixed = np.linalg.norm(lifted(points.evaluate(motion.poses, motion.trans), lift) - seen, axis=2)
+    fixed = np.linalg.norm(rise_above_skin(points.evaluate(motion.poses, motion.trans), lift) - seen, axis=2)
     if soft is None:
         return HeldOut(names, fixed, None)
-    return HeldOut(names, fixed, np.linalg.norm(lifted(soft.points(model, ids, weights), lift) - seen, axis=2))
+    return HeldOut(names, fixed, np.linalg.norm(rise_above_skin(soft.points(model, ids, weights), lift) - seen, axis=2))

@@ -28,7 +28,7 @@ from ...motion_pictures import picture_bodies
 from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
-from ..files.opensim import centre_sequence, known_centres
+from ..files.opensim import centre_sequence, mask_unknown_centres
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
@@ -40,7 +40,7 @@ from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
 from .pictures import standing
 from .recordings import Actor, Recording
 from .report import closing, person_page, person_picture, take_page, take_picture
-from .takes import LightMesh, Take, held_out
+from .takes import LightMesh, Take, measure_held_out
 
 # held out first; what soft tissue was fitted to is no error: its heads stay rigid, and little is left over
 ERRORS = ("held-out error, fixed shape", "held-out error, soft tissue", "markers to the body, fixed shape",
@@ -194,7 +194,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     light, takes = LightMesh.of(model.template), []
     for i, (source, unit, markers) in enumerate(zip(recordings, units, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
-        held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
+        held = measure_held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
         takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
                           held, light))
     return _Found(model, guess, result, takes, usual, layout_name, Judgement().joined(*labelling)), failures
@@ -257,7 +257,7 @@ def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor:
     path = take.source.path
     write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
                   take.source.who, take.unit,
-                  centre_sequence(known_centres(joint_centres(motion, body), body.skeleton, told), body.skeleton,
+                  centre_sequence(mask_unknown_centres(joint_centres(motion, body), body.skeleton, told), body.skeleton,
                                   motion.rate))
     # swapped labels, bad spans and how much was filled in, and the spans as a table
     storage.write_json(folder / "artefacts.json", artefact_table(take.artefacts))

@@ -102,7 +102,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     """
     T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x = between_keys(body, targets, rate, config) if start is None else start.copy()
-    moved, feet, inside = np.zeros(T), None, seen_span(targets)
+    moved, feet, inside = np.zeros(T), None, span_with_markers(targets)
     free = max(config.smoothing, 1)
     rounds = free + 2 * (config.ground and T > 2)                       # the last ones with the feet held
     for i in range(rounds):
@@ -134,7 +134,7 @@ def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     return body.retract(keys[i], share[:, None] * body.step_to(keys[i], keys[i + 1]))
 
 
-def seen_span(targets: np.ndarray) -> slice:
+def span_with_markers(targets: np.ndarray) -> slice:
     """From the first to the last frame in which any of the markers (T, L, 3) was seen."""
     some = np.flatnonzero(~np.isnan(targets[..., 0]).all(axis=1))
     return slice(int(some[0]), int(some[-1]) + 1)

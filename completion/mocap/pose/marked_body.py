@@ -24,7 +24,7 @@ from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt,
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
 
-from ...smoothing import coupled_steps, inertia
+from ...smoothing import inertia, solve_coupled_steps
 from ..marker_sets.layout import MarkerLayout
 from .part_shapes import PartShapes, part_shapes
 
@@ -139,7 +139,7 @@ class MarkedBody:
 
     def smoothed(self, x: np.ndarray, stiffness: np.ndarray, system: Callable[..., Dense], *of_frames: np.ndarray
                  ) -> np.ndarray:
-        """Frames (T, P) that follow each other after one Gauss-Newton step, coupled as of `coupled_steps`.
+        """Frames (T, P) that follow each other after one Gauss-Newton step, coupled as of `solve_coupled_steps`.
 
         `system` makes the equations of some frames from their unknowns and their rows of `of_frames`.
         """
@@ -154,7 +154,7 @@ class MarkedBody:
                 _, gradient[some], hessian[some] = system(*rows)
             return gradient, hessian
 
-        step = coupled_steps(x, equations, stiffness)
+        step = solve_coupled_steps(x, equations, stiffness)
         # radians or metres that a step may go
         return self.retract(x, step * np.minimum(1, 0.5 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)))
 
@@ -196,13 +196,13 @@ def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlie
 def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
     """Squared distances (..., L) without what is common to all, and the length (..., 1) that makes an outlier."""
     off = positions - targets
-    off = off - known_median(off, -2)[..., None, :]
+    off = off - median_of_known(off, -2)[..., None, :]
     squared = np.einsum("...d,...d->...", off, off)
     # metres; a marker farther off is an outlier on however bad a fit
-    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(known_median(squared)), 5.0))[..., None]
+    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(median_of_known(squared)), 5.0))[..., None]
 
 
-def known_median(values: np.ndarray, axis: int = -1) -> np.ndarray:
+def median_of_known(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """The median of values that are not NaN, 0 without any; on few values much faster than numpy's."""
     ordered = np.sort(values, axis=axis)                                # NaN comes last
     seen = (~np.isnan(ordered)).sum(axis=axis, keepdims=True)
@@ -243,7 +243,7 @@ def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray,
         return shapes
     poses = _sample_poses(subject)
     supports = subject.points(vertex_ids, weights).evaluate(poses)
-    normals = energy.lifted(supports, np.ones(len(distances))) - supports[:, ::3]         # (S, L, 3)
+    normals = energy.rise_above_skin(supports, np.ones(len(distances))) - supports[:, ::3]         # (S, L, 3)
     back = np.swapaxes(shapes.skeleton.part_rotations(poses), -1, -2)
     local = (back[:, :, None] @ normals[:, None, ..., None])[..., 0]                      # (S, J, L, 3)
     part = np.argmin(local.var(axis=0).sum(axis=-1), axis=0)
@@ -293,7 +293,7 @@ def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarr
         for axis in range(2):
             pull = direction[:, axis] / len(ring)
             rows.append((np.concatenate([mine, ring, [centre]]), np.concatenate([share, pull, [-pull.sum()]])))
-    return padded(rows)
+    return pad_combinations(rows)
 
 
 def ring_around(mesh: Mesh, centre: int) -> tuple[np.ndarray, np.ndarray]:
@@ -305,7 +305,7 @@ def ring_around(mesh: Mesh, centre: int) -> tuple[np.ndarray, np.ndarray]:
     return ring, (mesh.vertices[ring] - mesh.vertices[centre]) @ np.stack([u, np.cross(normal, u)]).T
 
 
-def padded(rows: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def pad_combinations(rows: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Points as vertices and weights of different number, as two arrays (n, k), padded by repeats and zeros."""
     width = max(len(ids) for ids, _ in rows)
     return (np.array([np.pad(ids, (0, width - len(ids)), mode="edge") for ids, _ in rows]),

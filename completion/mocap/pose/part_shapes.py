@@ -43,8 +43,8 @@ class PartShapes:
     def _arrange(self) -> None:
         """Lay the bends out part by part and joint by joint, padded with zeros to one length."""
         J, L, m = self.joints, self.count, self.lift.width
-        self._joint_of, by_part = _padded([[j for q, j in self.bends if q == p] for p in range(J)])
-        self._part_of, by_joint = _padded([[p for p, q in self.bends if q == j] for j in range(J)])
+        self._joint_of, by_part = _pad_lists([[j for q, j in self.bends if q == p] for p in range(J)])
+        self._part_of, by_joint = _pad_lists([[p for p, q in self.bends if q == j] for j in range(J)])
         self._by_part = np.zeros((*by_part.shape, m, 3, L))
         self._by_joint = np.zeros((*by_joint.shape, m, 3, L))
         for p, i in np.argwhere(by_part):
@@ -146,7 +146,7 @@ def part_shapes(operator: PointOperator) -> PartShapes:
     return SkinnedShapes(operator)
 
 
-def _padded(lists: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+def _pad_lists(lists: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
     """Lists of different lengths as rows (n, width), and which entries are real."""
     width = max(1, max(len(row) for row in lists))
     return (np.array([row + [0] * (width - len(row)) for row in lists]),

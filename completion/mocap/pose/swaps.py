@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 
-from .marked_body import AnimateConfig, distances_apart, known_median
+from .marked_body import AnimateConfig, distances_apart, median_of_known
 
 TORN = 10.0                          # most that a torn track counts, in half squared standard deviations
 AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
@@ -98,7 +98,7 @@ def _mean_of_known(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (np.nan_to_num(a) + np.nan_to_num(b)) / np.maximum(known, 1)
 
 
-def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
+def apply_order(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Markers (T, L, 3) under the labels that an order (T, L) gives them."""
     return np.take_along_axis(positions, order[..., None], axis=1)
 
@@ -154,7 +154,7 @@ def find_order(positions: np.ndarray, rate: float, places: np.ndarray | None = N
         if not touched:
             break
         columns = np.array(sorted(touched))
-        tracks.change(columns, relabelled(positions, order[:, columns]))
+        tracks.change(columns, apply_order(positions, order[:, columns]))
     return order
 
 
@@ -241,7 +241,7 @@ def label_order(positions: np.ndarray, targets: np.ndarray, rate: float, outlier
     squared, scale = distances_apart(positions, targets, outlier)
     if ((squared > (0.5 * scale)**2).sum(axis=1) < 2).all():            # nothing is far off, or everything is believed
         return np.tile(np.arange(targets.shape[1]), (len(targets), 1))
-    shift = known_median(positions - targets, -2)[..., None, :]
+    shift = median_of_known(positions - targets, -2)[..., None, :]
     # on a body that fits badly a marker is as much farther from its place as one must be to be an outlier
     deviation = DEVIATION * scale[..., 0] / AnimateConfig.outlier
     return find_order(targets, rate, positions - shift, deviation)
@@ -266,7 +266,7 @@ class LabelWatch:
         changed = self.order != np.arange(len(self.order))
         if suspect.sum() < 2 and not changed.any():
             return self.order
-        shift = known_median(positions - taken, 0)
+        shift = median_of_known(positions - taken, 0)
         some = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
         apart = np.linalg.norm(positions[some, None] - shift - taken[some], axis=2)
         for i, j in zip(*np.triu_indices(len(some), 1), strict=True):

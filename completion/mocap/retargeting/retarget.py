@@ -49,8 +49,8 @@ def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
     return replace(motion, trans=trans, betas=target.betas, residuals=none, labels=(), trusted=none.astype(bool))
 
 
-def morphed_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping[float, np.ndarray],
-                     frames: np.ndarray | slice = slice(None), grounded: bool = True) -> np.ndarray:
+def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping[float, np.ndarray],
+                   frames: np.ndarray | slice = slice(None), grounded: bool = True) -> np.ndarray:
     """The meshes (n, N, 3), metres, of a motion while the body changes.
 
     Vertices are affine in betas, so a change along a line needs no more than two bodies. Few frames of a body that

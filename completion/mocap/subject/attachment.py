@@ -15,7 +15,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface, barycentric
 
-from ..pose.marked_body import padded, ring_around
+from ..pose.marked_body import pad_combinations, ring_around
 
 Attachment = Literal["triangle", "neighbourhood"]
 
@@ -61,7 +61,7 @@ def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle"
     off = np.linalg.norm(mesh.vertices[corners] - points[:, None], axis=2)
     nearest = np.take_along_axis(corners, off.argmin(axis=1)[:, None], axis=1)[:, 0]
     rows = [row for centre in nearest for row in _ring_supports(mesh, int(centre))]
-    return LatentMarkers(kind, *padded(rows), corners)
+    return LatentMarkers(kind, *pad_combinations(rows), corners)
 
 
 def _ring_supports(mesh: Mesh, centre: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -88,7 +88,8 @@ def _frames(kind: Attachment, supports: np.ndarray) -> tuple[np.ndarray, np.ndar
     return p[..., 0, :], np.stack([a, b, n], axis=-1)
 
 
-def simulated(kind: Attachment, supports: MovingPoints, coefficients: np.ndarray) -> tuple[MovingPoints, np.ndarray]:
+def simulate_markers(kind: Attachment, supports: MovingPoints, coefficients: np.ndarray) -> tuple[MovingPoints,
+                                                                                                  np.ndarray]:
     """The simulated markers on 3 L supports, and their derivative (..., L, 3, 3) by their own coefficients: the frame.
 
     [MoSh] Eq. 4, Eq. 16

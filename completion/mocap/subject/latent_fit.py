@@ -14,7 +14,7 @@ from model.bilinear import ShapedPoints
 from model.body import BodyModel
 from model.fitting import energy
 from model.fitting.energy import MovingPoints
-from model.linear import picked
+from model.linear import combination_weights
 from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 from scanprep.ranges import Count, Positive, Seed, Settings
@@ -22,7 +22,7 @@ from scanprep.ranges import Count, Positive, Seed, Settings
 from ..marker_sets.layout import DISTANCE, MarkerLayout
 from ..marker_sets.symmetry import label_pairs
 from ..pose.marked_body import supports
-from .attachment import Attachment, LatentMarkers, above_triangles, latent_markers, simulated
+from .attachment import Attachment, LatentMarkers, above_triangles, latent_markers, simulate_markers
 from .frame_starts import find_loose
 
 CENTIMETRES = 100.0                  # in a metre
@@ -123,7 +123,7 @@ class LatentPoints:
 def latent_places(kind: Attachment, points: LatentPoints, z: np.ndarray) -> MovingPoints:
     """The latent markers (L) in the latent coordinate system, from their 3 L supports. [MoSh] Eq. 16"""
     K = points.by_betas.shape[-1]
-    found, frame = simulated(kind, points.moving(z), z[K:].reshape(-1, 3))
+    found, frame = simulate_markers(kind, points.moving(z), z[K:].reshape(-1, 3))
     found.jacobian[..., K:] += each_own(frame)
     return found
 
@@ -303,11 +303,12 @@ class LatentFit:
             self._column |= {key: len(self._column) + i for i, key in enumerate(new)}
             self._made = made if self._made is None else self._made.joined(made)
         assert self._made is not None, "at least one marker"
-        return self._made.combined(picked(self._made.count, np.array([self._column[key] for key in keys]), None))
+        return self._made.combined(combination_weights(self._made.count, np.array([self._column[key] for key in keys]),
+                                                       None))
 
     def usual_places(self, layout: MarkerLayout, betas: np.ndarray) -> np.ndarray:
         """Where a layout has the markers (L, 3) on a body of these betas in the latent pose, metres. [MoSh] Eq. 15"""
-        return energy.lifted(self._usual(layout).at(betas), np.asarray(layout.distances))
+        return energy.rise_above_skin(self._usual(layout).at(betas), np.asarray(layout.distances))
 
     def _usual(self, layout: MarkerLayout) -> LatentPoints:
         return self.latent.combined(*supports(self.model.template, layout))
@@ -317,7 +318,7 @@ class LatentFit:
         K, (pose, trans) = self.n_betas, self.split(x)
         positions, d_pose = state.points.operator(z[:K]).jacobian(pose, trans)
         moving = energy.moving_points(positions, d_pose, state.points.shape_jacobian(pose))
-        found, frame = simulated(state.markers.kind, moving, z[K:].reshape(-1, 3))
+        found, frame = simulate_markers(state.markers.kind, moving, z[K:].reshape(-1, 3))
         return MovingPoints(found.positions, np.concatenate([found.jacobian, each_own(frame)], axis=-1))
 
     def residuals(self, state: State) -> np.ndarray:

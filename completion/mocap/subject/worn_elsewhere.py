@@ -215,8 +215,8 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     """
     # few betas do not follow a wrong marker
     rough = replace(config, n_betas=20, annealing=(40.0, 10.0, 2.0, 1.0))
-    sides, sequences, at = _exchanged_sides(model, sequences, layout,
-                                            _Frames(model, person, sequences, layout, config.wand), rough)
+    sides, sequences, at = _find_exchanged_sides(model, sequences, layout,
+                                                 _Frames(model, person, sequences, layout, config.wand), rough)
     # who is far off on the body of the others; at first, on one that all have drawn, 4 cm are enough
     suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else 0.04
     for _ in range(4):
@@ -230,7 +230,7 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
         at, far = _without(model, sequences, layout, suspects, rough), FAR
     if suspects:
         at = _without(model, sequences, layout, suspects, config)
-    found = _explained(at, suspects)
+    found = _explain(at, suspects)
 
     # two exchanged names on a leg can draw all its markers away: what was found nowhere is sought on the body without
     if found.unplaced and (found.moved or found.exchanged):
@@ -238,7 +238,7 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
         again = _without(model, renamed, placed, (), config)
         off, limit = dict(zip(again.layout.labels, again.off, strict=True)), again.far(FAR)
         gone = [label for label in found.unplaced if off[label] > limit]
-        rest = _explained(_without(model, renamed, placed, gone, config), gone) if gone else Worn()
+        rest = _explain(_without(model, renamed, placed, gone, config), gone) if gone else Worn()
         found = Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
     found = _with_whole_parts(at, found, model.skeleton.names)
     back = set(sides) & set(found.exchanged)                            # exchanged, and put back
@@ -267,8 +267,8 @@ def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mark
     return _Frames(model, find_person(model, sequences, others, config), sequences, layout, config.wand)
 
 
-def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
-                     rough: PersonConfig) -> tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames]:
+def _find_exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
+                          rough: PersonConfig) -> tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames]:
     """Left and right exchanged on a limb or the whole body, where many markers are far off: others do not tell then.
 
     Returned are the pairs, the sequences under their right names, and the body on them.
@@ -313,7 +313,7 @@ def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
     return [pairs, *limbs.values()] if pairs else []
 
 
-def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
+def _explain(at: _Frames, suspects: Collection[str]) -> Worn:
     """What explains the suspects: a pair of exchanged names, or another place on the skin."""
     if not suspects:
         return Worn()

@@ -80,7 +80,7 @@ def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray
             is_open[number[min(a, b), max(a, b)]] = True
     sides = np.argsort(mesh.face_edges.ravel(), kind="stable").reshape(-1, 2)[~is_open]    # the two at every edge
     begin, end = sides, sides - sides % 3 + (sides + 1) % 3            # corners; the two sides run in opposite ways
-    fan = sparse.connected_pieces(np.r_[begin[:, 0], end[:, 0]], np.r_[end[:, 1], begin[:, 1]], mesh.faces.size)
+    fan = sparse.label_components(np.r_[begin[:, 0], end[:, 0]], np.r_[end[:, 1], begin[:, 1]], mesh.faces.size)
     _, first = np.unique(fan, return_index=True)
     return fan.reshape(-1, 3).astype(np.int64), mesh.faces.ravel()[first]
 

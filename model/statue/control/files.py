@@ -95,7 +95,7 @@ def _read_skinned(path: Path) -> ControlModel:
         motion = glb.joint_matrices(tree, binary, skin, places)
         joint_places = np.stack([places[number] for number in joints])[:, :3, 3]
         points, weights, uv, faces = _corners(tree, binary, glb.item(tree["meshes"], skinned[0]["mesh"]), len(joints))
-        points = glb.skinned(points, weights, motion)
+        points = glb.apply_skin(points, weights, motion)
         if not np.isfinite(points).all():
             raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
         # the joint next above every joint, -1 where there is none
@@ -106,7 +106,7 @@ def _read_skinned(path: Path) -> ControlModel:
             while up is not None and up not in joints:
                 up = above.get(up)
             parents.append(-1 if up is None else joints.index(up))
-        return _control(_welded(points, weights, uv, faces), joint_places, np.array(parents),
+        return _control(_weld(points, weights, uv, faces), joint_places, np.array(parents),
                         [str(glb.item(tree["nodes"], number).get("name", f"joint{number}")) for number in joints])
 
 
@@ -158,8 +158,8 @@ def _control(surface: tuple[Mesh, np.ndarray, Chart | None], places: np.ndarray,
     return control
 
 
-def _welded(points: np.ndarray, weights: np.ndarray, uv: np.ndarray | None, corners: np.ndarray
-            ) -> tuple[Mesh, np.ndarray, Chart | None]:
+def _weld(points: np.ndarray, weights: np.ndarray, uv: np.ndarray | None, corners: np.ndarray
+          ) -> tuple[Mesh, np.ndarray, Chart | None]:
     """Mesh, weights and chart with one vertex at every place."""
     _, first, place = np.unique(points.astype(np.float32), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))                              # vertices in the order of the file

@@ -201,7 +201,7 @@ def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: n
     apart = np.linalg.norm(points[a] - points[b], axis=1)
     # steps of less than 3 mm are noise, or views that differ
     jump = np.abs(heights[a] - heights[b]) > np.maximum(3.0 * apart, 0.003)
-    patch = sparse.connected_pieces(a[~jump], b[~jump], len(heights))
+    patch = sparse.label_components(a[~jump], b[~jump], len(heights))
     beside = np.zeros(len(heights), dtype=bool)
     beside[a[jump]] = beside[b[jump]] = True
     area = np.bincount(patch, texel_areas(control, texels))

@@ -72,7 +72,7 @@ def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
     """(H, W) uint16 grey values of an image that an editor saved: 16 bits of grey, or three equal channels."""
     expected = f"an image of {size[1]} x {size[0]} pixels with 16 bits of grey"
     with taking_apart(path, expected):
-        image, depth = _decoded(Path(path))
+        image, depth = _decode_image(Path(path))
     if image.ndim == 3:
         image = image[..., :3] if image.shape[2] > 2 else image[..., :1]        # without opacity
         if (image != image[..., :1]).any():
@@ -110,14 +110,14 @@ def _read(path: Path, size: tuple[int, ...], kind: Any) -> np.ndarray:
             image = np.asarray(file.pages[0].asarray())
     else:
         with taking_apart(path, "a PNG image"):
-            image = _decoded(path)[0]
+            image = _decode_image(path)[0]
     if image.shape != tuple(size) or image.dtype != kind or not np.isfinite(image).all():
         raise StorageError(f"{path}: expected {np.dtype(kind).name} numbers of shape {tuple(size)}, all finite, "
                            f"got {image.dtype} of shape {image.shape}")
     return image
 
 
-def _decoded(path: Path) -> tuple[np.ndarray, int]:
+def _decode_image(path: Path) -> tuple[np.ndarray, int]:
     """An image file and its bits per channel."""
     from PIL import Image
 

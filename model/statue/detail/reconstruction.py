@@ -69,7 +69,7 @@ def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, 
     return np.where(found == OUTSIDE, MEASURED, found)
 
 
-def displaced_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
+def displace_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
     """Where the detailed surface is above any places of the control mesh, for `subdivide_adaptive`."""
     def displaced(faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
         p, n = interpolate(control.mesh, faces, bary)
@@ -110,7 +110,7 @@ class Level:
     shown: np.ndarray  # (f,), triangles that are not in a hole of the scan
 
 
-def measured_levels(statue: Statue, scan: Mesh, count: int = 4) -> tuple[list[Level], Subdivision]:
+def measure_levels(statue: Statue, scan: Mesh, count: int = 4) -> tuple[list[Level], Subdivision]:
     """The reconstruction at every level with its distance to the scan, and the finest subdivision.
 
     [Statues] Eq. 22, 23
@@ -125,7 +125,7 @@ def measured_levels(statue: Statue, scan: Mesh, count: int = 4) -> tuple[list[Le
 def adaptive_level(statue: Statue, scan: Mesh, tolerance: float = 0.0005, level: int = 4) -> Level:
     """The reconstruction on triangles that are small only where the displacement asks for it by a tolerance, metres."""
     control = statue.control
-    fine = subdivide_adaptive(control.mesh, control.chart, displaced_surface(control, statue.map), tolerance, level)
+    fine = subdivide_adaptive(control.mesh, control.chart, displace_surface(control, statue.map), tolerance, level)
     return _level(f"adaptive, {1000 * tolerance:g} mm", statue, fine, scan)
 
 
@@ -173,8 +173,8 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
     return SurfaceError.of(np.linalg.norm(stored - points[good], axis=1))
 
 
-def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
-                       ) -> np.ndarray:
+def find_inverted(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
+                  ) -> np.ndarray:
     """Fine triangles, ascending, with vertices `detailed` (n, 3), whose normal opposes the interpolated one of the
     control surface below, with vertices (N, 3): a steep flank is not inverted where the control mesh has an edge.
     """

@@ -66,7 +66,7 @@ def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarra
 
 def subdivide(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
     """Every triangle in four, `level` times over."""
-    return _subdivided(mesh, chart, level, lambda now: np.ones(now.vertex.shape, dtype=bool))
+    return _subdivide(mesh, chart, level, lambda now: np.ones(now.vertex.shape, dtype=bool))
 
 
 def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance: float, level: int) -> Subdivision:
@@ -77,10 +77,10 @@ def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance
     decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge. Fig. 16 of [Statues]
     splits where the displacement is greater; a flat part needs no triangles, however far it is displaced.
     """
-    return _subdivided(mesh, chart, level, lambda now: _bent(now, displaced, tolerance))
+    return _subdivide(mesh, chart, level, lambda now: _find_curved_sides(now, displaced, tolerance))
 
 
-def _subdivided(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners], np.ndarray]) -> Subdivision:
+def _subdivide(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners], np.ndarray]) -> Subdivision:
     """Sides (f, 3) that `choose` marks are split, `level` times over or until it marks none."""
     now = _Corners(mesh.faces, chart.faces, np.tile(np.eye(3), (len(mesh.faces), 1, 1)), np.arange(len(mesh.faces)),
                    chart.uv)
@@ -137,7 +137,7 @@ def _with_middles(faces: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, np
     return np.concatenate([faces, number[edge]], axis=1), ends
 
 
-def _bent(now: _Corners, displaced: Displaced, tolerance: float) -> np.ndarray:
+def _find_curved_sides(now: _Corners, displaced: Displaced, tolerance: float) -> np.ndarray:
     """(f, 3) sides along which the displaced surface is farther than the tolerance from the edge, or beside which."""
     first, edge = _sides(now.vertex)
     face, side = np.divmod(first, 3)

@@ -8,7 +8,7 @@ import numpy as np
 from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.pictures.textures import Look, Texture, bilinear, padded
+from scanprep.pictures.textures import Look, Texture, bilinear, pad_charts
 
 from ..control.chart import Chart, barycentric
 from ..control.model import ControlModel, DisplacementMap
@@ -223,7 +223,7 @@ def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdi
     out, covered = np.full((size, size, 3), (128, 128, 255), dtype=np.uint8), np.zeros((size, size), dtype=bool)
     out[rows, columns] = np.round(127.5 * (local + 1))
     covered[rows, columns] = True
-    return padded(out, covered)
+    return pad_charts(out, covered)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -25,8 +25,8 @@ from ...motion.amass import moving_body
 from ...motion.bvh import read_bvh
 from ...motion.files import StoredMotion, read_motion_file
 from ...motion.moving import MovingSkeleton
-from ...motion.retarget import Pairing, Retargeted, retargeted
-from ...motion.same import copied
+from ...motion.retarget import Pairing, Retargeted, retarget_pair
+from ...motion.same import copy_motion
 from ...rig import check_motion, joint_places
 from ..control.model import ControlModel, Statue
 from ..detail.reconstruction import Reconstruction
@@ -40,20 +40,21 @@ def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) ->
     """
     control, people = statue.control, 16
     if path.suffix.lower() == ".bvh":
-        return _named(path, bvh_motion, control, statue.pose, read_bvh(path, "cm", rate))   # travel: by the legs
+        # travel: by the legs
+        return _with_file_name(path, bvh_motion, control, statue.pose, read_bvh(path, "cm", rate))
     stored = read_motion_file(path, rate=rate)
     count, own = stored.poses.shape[1], len(control.skeleton.parents)
     if count == own:
         return _own(control, path, stored)
     if stored.of_family:
-        return _named(path, bvh_motion, control, statue.pose, moving_body(stored)[0])
+        return _with_file_name(path, bvh_motion, control, statue.pose, moving_body(stored)[0])
     if count != people:
         raise StorageError(f"{path}: expected the {own} parts of the statue or the {people} of the synthetic people, "
                            f"found {count}; for a motion of a learned model name it with --model")
     return people_motion(control, statue.pose, stored.poses, stored.trans, stored.rate)
 
 
-def _named(path: Path, make: Callable[..., Retargeted], *given: object) -> Retargeted:
+def _with_file_name(path: Path, make: Callable[..., Retargeted], *given: object) -> Retargeted:
     """What a function makes; its ValueError names the file."""
     try:
         return make(*given)
@@ -105,7 +106,7 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = MovingSkeleton(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
                        joint_places(skeleton, poses, trans), rate)
-    return retargeted(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
+    return retarget_pair(Pairing(control.skeleton, control.rig.vertices, moving, pose), True, girdle, True)
 
 
 @lru_cache(maxsize=1)
@@ -125,8 +126,8 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> 
     Upwards is the axis of the file that is nearest to the trunk at rest: y, as BVH says, but some programs write z.
     ValueError for names that say too little.
     """
-    same = copied(control.skeleton, control.mesh, control.rig.vertices, bvh)
-    return same or retargeted(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
+    same = copy_motion(control.skeleton, control.mesh, control.rig.vertices, bvh)
+    return same or retarget_pair(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
 
 
 class Follower:

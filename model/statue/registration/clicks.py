@@ -10,7 +10,7 @@ from scanprep.geometry.format_common import metres_of
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import numbers, read_json, taking_apart
-from scanprep.geometry.surface import checked_surface
+from scanprep.geometry.surface import check_surface
 
 from ..control.model import ControlModel
 
@@ -24,7 +24,7 @@ def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | Non
     Any landmark file is read, in its `unit`. In JSON a joint may also be a click, `{"ray": [origin, direction],
     "depth": d}`: its centre is then on the ray, where that is nearest to the medial axis of the scan, and d farther.
     """
-    rays, found = _clicked(path, unit) if path.suffix == ".json" else ({}, {})
+    rays, found = _read_clicks(path, unit) if path.suffix == ".json" else ({}, {})
     if not rays:
         found = read_landmarks(path, scan, unit)
     known = {*control.skeleton.names, *control.landmarks}
@@ -43,8 +43,8 @@ def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | Non
     return joints, {name: place for name, place in found.items() if name in control.landmarks}
 
 
-def _clicked(path: Path, unit: str | None) -> tuple[dict[str, tuple[np.ndarray, np.ndarray, float]],
-                                                    dict[str, np.ndarray]]:
+def _read_clicks(path: Path, unit: str | None) -> tuple[dict[str, tuple[np.ndarray, np.ndarray, float]],
+                                                        dict[str, np.ndarray]]:
     """Origin, direction and depth of the clicks of a file, and its plain places; nothing where it has no click."""
     tree, metre = read_json(path, WANTED), metres_of(unit)
     with taking_apart(path, WANTED):
@@ -71,7 +71,7 @@ class MedialAxis:
         import igl
         from skimage.morphology import skeletonize
 
-        vertices, faces = checked_surface(mesh)
+        vertices, faces = check_surface(mesh)
         self.voxel = voxel
         self._origin = vertices.min(axis=0) - 1.5 * voxel
         shape = np.ceil(np.ptp(vertices, axis=0) / voxel) + 4

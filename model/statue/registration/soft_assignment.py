@@ -92,7 +92,7 @@ def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float
         np.maximum.at(top, row, log_k + v[column])
         u = -np.where(np.isfinite(top), top, 0.0)
         M = csr_array((np.exp(log_k + u[row] + v[column]), (row, column)), shape=(len(near), len(used)))
-        a, b, changed = _balanced(M, np.exp(np.minimum(-v, 50.0)) if slack == "rest" else None, log_s + v, tolerance)
+        a, b, changed = _balance(M, np.exp(np.minimum(-v, 50.0)) if slack == "rest" else None, log_s + v, tolerance)
         u, v = u + np.log(a), v + np.log(b)
         if changed <= tolerance:
             break
@@ -102,8 +102,8 @@ def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float
     return SoftAssignment(matches, np.maximum(left, 0), float(max(0, -left.min())))
 
 
-def _balanced(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, rounds: int = 20
-              ) -> tuple[np.ndarray, np.ndarray, float]:
+def _balance(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, rounds: int = 20
+             ) -> tuple[np.ndarray, np.ndarray, float]:
     """Factors of rows (I,) and columns (J,), rows last, and the largest relative change in the last round. Columns come
     to 1 together with a slack of exp(log_s); or at most to 1, by factors of at most `most`.
     """

@@ -16,7 +16,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.sparse import Factored, conjugate_gradients
-from scanprep.geometry.surface import Surface, checked_points
+from scanprep.geometry.surface import Surface, check_points
 from scanprep.geometry.target import Target, target_of
 from scanprep.ranges import Count, Positive, Range, Settings
 from scanprep.registration.folds import inverted_triangles, unfold
@@ -114,7 +114,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     """
     config = config or SurfaceFitConfig()
     check_template(rest, "rest")
-    start = checked_points(start, "start")
+    start = check_points(start, "start")
     if start.shape != rest.vertices.shape:
         raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
