@@ -78,7 +78,7 @@ class Motion:
         few = (self.trusted & seen).sum(axis=0) < 0.1 * seen.sum(axis=0)
         return tuple(label for label, is_few in zip(self.labels, few, strict=True) if is_few)
 
-    def told(self) -> np.ndarray:
+    def residuals_of_trusted(self) -> np.ndarray:
         """The residuals (T, L) of the markers that tell of the body, metres, NaN for those that are `distrusted`."""
         return np.where(np.isin(self.labels, self.distrusted), np.nan, self.residuals)
 

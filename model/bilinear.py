@@ -30,11 +30,11 @@ class ShapedPoints(Points):
         """Derivative (..., L, 3, K) of the points with respect to betas at poses (..., J, 3), metres."""
 
     @abstractmethod
-    def combined(self, weights: np.ndarray | sparray) -> ShapedPoints:
+    def combine(self, weights: np.ndarray | sparray) -> ShapedPoints:
         """Linear combinations of the points, with weights (n, L) whose rows sum to 1."""
 
     @abstractmethod
-    def joined(self, other: ShapedPoints) -> ShapedPoints:
+    def concatenate(self, other: ShapedPoints) -> ShapedPoints:
         """These points and then others of the same model."""
 
     @abstractmethod
@@ -45,7 +45,7 @@ class ShapedPoints(Points):
     def first(self, n_betas: int) -> ShapedPoints:
         """The same with the first betas only."""
 
-    def _checked(self, betas: np.ndarray) -> np.ndarray:
+    def _check_betas(self, betas: np.ndarray) -> np.ndarray:
         betas = np.asarray(betas, dtype=np.float64)
         if betas.ndim != 1 or len(betas) > self.n_betas:
             raise ValueError(f"betas: expected at most {self.n_betas} numbers, got shape {betas.shape}")

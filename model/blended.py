@@ -78,26 +78,26 @@ class Blended(PointOperator):
         """(L,) what the weights of each point sum to: 1, but for columns that motions are made of."""
         return np.ones(self.count) if self.mix is None else np.asarray(self.mix.sum(axis=1)).ravel()
 
-    def turned(self, pose: np.ndarray) -> np.ndarray:
+    def relative_positions(self, pose: np.ndarray) -> np.ndarray:
         poses, n = pose.reshape(-1, *pose.shape[-2:]), len(self.rest)
         out = np.empty((len(poses), 3, self.count), dtype=self.rest.dtype)
         step = max(1, AT_ONCE // max(1, 12 * n))
         for start in range(0, len(poses), step):
             some = slice(start, start + step)
-            M, x = self._motions(*self._rigid(poses[some])), self._bent(poses[some])
+            M, x = self._motions(*self._rigid(poses[some])), self._correct_rest(poses[some])
             y = M[:, :, 3]
             for k in range(3):
                 y += M[:, :, k] * x[:, k, None]
             out[some] = _mix(y, self.mix)
         if self.middle is not None:
-            out -= self.middle.turned(poses) * self._share
+            out -= self.middle.relative_positions(poses) * self._share
         return out.reshape(*pose.shape[:-2], 3, self.count)
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         poses, (n, J), leading = pose.reshape(-1, *pose.shape[-2:]), self.weights.shape, pose.shape[:-2]
         B, descends = len(poses), self.skeleton.descends.astype(float)
         R, t, moved = self._rigid(poses)
-        each = R @ self._bent(poses)[:, None] + t[..., None]                  # (B, J, 3, n) where a part alone takes it
+        each = R @ self._correct_rest(poses)[:, None] + t[..., None]          # (B, J, 3, n) where a part alone takes it
         each *= self.weights.T[:, None]
         carried = (descends.T @ each.reshape(B, J, -1)).reshape(each.shape)   # all that hangs below each joint
         carried -= (self.weights @ descends).T[:, None] * moved[..., None]
@@ -128,7 +128,7 @@ class Blended(PointOperator):
         M = np.swapaxes(motion, 1, 2).astype(self.rest.dtype, copy=False) @ self.weights.T
         return M.reshape(len(R), 3, 4, -1)
 
-    def _bent(self, poses: np.ndarray) -> np.ndarray:
+    def _correct_rest(self, poses: np.ndarray) -> np.ndarray:
         """(B, 3, n) rest vertices with what the joints do to them."""
         x = np.ascontiguousarray(self.rest.T)
         if not self.bent or not self.bends.size:
@@ -136,14 +136,14 @@ class Blended(PointOperator):
         f = self.bent * lift_twists(self.features.lift, poses)[:, 1:].reshape(len(poses), -1)
         return (f.astype(x.dtype, copy=False) @ self.bends.reshape(f.shape[1], -1)).reshape(-1, *x.shape) + x
 
-    def combined(self, weights: np.ndarray | sparray) -> Blended:
+    def combine(self, weights: np.ndarray | sparray) -> Blended:
         used, mix = _needed_vertices(self.mix, weights)
         return replace(self, weights=self.weights[used], rest=self.rest[used],
                        bends=np.ascontiguousarray(self.bends[..., used]), mix=mix)
 
     def joints(self, regressor: sparray) -> Blended:
         if self.middle is not None:
-            return self.combined(regressor)
+            return self.combine(regressor)
         above = np.maximum(self.skeleton.parents, 0)              # a joint hangs on the part above it
         return replace(self, weights=np.eye(len(above))[above], rest=self.places, bends=np.zeros((0, 0, 3, len(above))),
                        mix=None)
@@ -155,15 +155,15 @@ class Blended(PointOperator):
                        places=self.places + factor * other.places, origin=self.origin + factor * other.origin,
                        bent=self.bent + factor * other.bent)
 
-    def scaled(self, factor: float) -> Blended:
+    def scale_by(self, factor: float) -> Blended:
         return replace(self, rest=(factor * self.rest).astype(self.rest.dtype), places=factor * self.places,
-                       bent=factor * self.bent, middle=None if self.middle is None else self.middle.scaled(factor))
+                       bent=factor * self.bent, middle=None if self.middle is None else self.middle.scale_by(factor))
 
     def astype(self, dtype: Any) -> Blended:
         weights, rest, bends = (a.astype(dtype, copy=False) for a in (self.weights, self.rest, self.bends))
         return replace(self, weights=weights, rest=rest, bends=bends)
 
-    def joined(self, other: Blended) -> Blended:
+    def concatenate(self, other: Blended) -> Blended:
         """These points and then others of the same body."""
         mix = csr_array(block_diag([eye_array(one.count) if one.mix is None else one.mix for one in (self, other)]))
         weights, rest = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in ("weights", "rest"))
@@ -230,7 +230,7 @@ class ShapedBlended(ShapedPoints):
     def operator(self, betas: np.ndarray | None = None) -> Blended:
         if betas is None:
             return self.own
-        betas, mean = self._checked(betas), self.mean
+        betas, mean = self._check_betas(betas), self.mean
         rest, joints, origin, middle = (np.tensordot(betas, by_beta[:len(betas)], axes=1)
                                         for by_beta in (self.rest, self.joints, self.origin, self.middle))
         held = None if mean.middle is None else replace(mean.middle, basis=mean.middle.basis + middle)
@@ -248,7 +248,7 @@ class ShapedBlended(ShapedPoints):
             out += G[:, :, :, k] * self.rest[:, None, :, k]
         out = _mix(out, self.mean.mix)
         if self.mean.middle is not None:
-            out -= np.swapaxes(self._middles.turned(poses), -1, -2)[..., None]
+            out -= np.swapaxes(self._middles.relative_positions(poses), -1, -2)[..., None]
         out += self.origin[..., None]
         return np.moveaxis(out, -1, 1).swapaxes(-1, -2).reshape(*pose.shape[:-2], self.count, 3, self.n_betas)
 
@@ -258,13 +258,13 @@ class ShapedBlended(ShapedPoints):
         assert self.mean.middle is not None, "a body that is held by its middle"
         return replace(self.mean.middle, basis=np.moveaxis(self.middle[..., 0], 0, -1))
 
-    def combined(self, weights: np.ndarray | sparray) -> ShapedBlended:
+    def combine(self, weights: np.ndarray | sparray) -> ShapedBlended:
         used, _ = _needed_vertices(self.mean.mix, weights)
-        return replace(self, own=self.own.combined(weights), mean=self.mean.combined(weights), rest=self.rest[:, used])
+        return replace(self, own=self.own.combine(weights), mean=self.mean.combine(weights), rest=self.rest[:, used])
 
-    def joined(self, other: ShapedPoints) -> ShapedBlended:
+    def concatenate(self, other: ShapedPoints) -> ShapedBlended:
         assert isinstance(other, ShapedBlended), "of the same model"
-        return replace(self, own=self.own.joined(other.own), mean=self.mean.joined(other.mean),
+        return replace(self, own=self.own.concatenate(other.own), mean=self.mean.concatenate(other.mean),
                        rest=np.concatenate([self.rest, other.rest], axis=1))
 
     def along(self, directions: np.ndarray) -> ShapedBlended:

@@ -78,7 +78,7 @@ class BlendedTemplate:
         kinds, which = self._kinds
         return np.tensordot(kinds, self.skeleton.part_rotations(pose), axes=1)[which]
 
-    def posed(self, Q: np.ndarray) -> np.ndarray:
+    def deform_edges(self, Q: np.ndarray) -> np.ndarray:
         """`Q v̂` (..., F, 2, 3) for Q (..., F, 3, 3)."""
         return self.v_hat @ np.swapaxes(Q, -1, -2)
 
@@ -95,12 +95,12 @@ class BlendedTemplate:
         back = np.linalg.inv(np.tensordot(kinds, self.skeleton.part_rotations(pose), axes=1))
         return edges(vertices, self.template.faces) @ np.swapaxes(back, -1, -2)[which]
 
-    def stitched(self, Q: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def stitch(self, Q: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Vertices (N, 3) for Q, or S Q, (F, 3, 3) at one pose, the root's joint in the origin.
 
         [SCAPE] Eq. 2
         """
-        return self.stitching.stitch(self.posed(self.rotations(pose) @ Q))
+        return self.stitching.stitch(self.deform_edges(self.rotations(pose) @ Q))
 
     def terms(self, features: PoseFeatures) -> Terms:
         """The products of features and rotations in which a body is linear, block by block."""
@@ -121,7 +121,7 @@ class BlendedTemplate:
         tables = tuple(self._tables(space, S[None], p)[0] for p in range(len(self.skeleton.parents)))
         return Condensed(self.condensation, self.terms(space.features), tables, self.skeleton.joints[0])
 
-    def shaped(self, space: PoseSpace, shapes: ShapeSpace) -> ShapedCondensed:
+    def as_shaped(self, space: PoseSpace, shapes: ShapeSpace) -> ShapedCondensed:
         """All vertices as a function of pose and betas.
 
         [SCAPE] Eq. 9

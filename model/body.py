@@ -42,8 +42,8 @@ class BodyModel(ABC):
     """A body as a function of pose, shape and place, with derivatives.
 
     A kind of model says its features, betas and surface points (`points`), what its file holds besides (`arrays`,
-    `restored`), and stands in the table of `model.files`; all else follows from these. What can be made faster or
-    better than that for a kind, it overrides; what needs to know how it is made (`resampled`, `recentred`,
+    `restore`), and stands in the table of `model.files`; all else follows from these. What can be made faster or
+    better than that for a kind, it overrides; what needs to know how it is made (`resample`, `recentre`,
     `exact_subject`) is refused until it does.
 
     Attributes
@@ -177,11 +177,11 @@ class BodyModel(ABC):
         """
         return None
 
-    def resampled(self: Model, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> Model:
+    def resample(self: Model, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> Model:
         """The model on other triangles of its template's surface, which have these parts; see `change_resolution`."""
         raise ValueError(f"model: the resolution of the kind '{self.kind}' cannot be changed")
 
-    def recentred(self: Model, vertices: np.ndarray, pose: np.ndarray) -> Model:
+    def recentre(self: Model, vertices: np.ndarray, pose: np.ndarray) -> Model:
         """The model whose mean person is in the pose (J, 3) the character with vertices (N, 3), metres."""
         raise ValueError(f"model: the kind '{self.kind}' cannot take a character")
 
@@ -208,7 +208,7 @@ class BodyModel(ABC):
         header, arrays = storage.load(path, cls.kind, (1, 2, VERSION))
         with storage.taking_apart(path, "a whole model"):
             parts = restore_parts(header, arrays)
-            return cls.restored(parts, restore_features(parts["skeleton"], header, arrays), header, arrays)
+            return cls.restore(parts, restore_features(parts["skeleton"], header, arrays), header, arrays)
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
@@ -220,8 +220,8 @@ class BodyModel(ABC):
 
     @classmethod
     @abstractmethod
-    def restored(cls: type[Model], parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
-                 arrays: Mapping[str, np.ndarray]) -> Model:
+    def restore(cls: type[Model], parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
+                arrays: Mapping[str, np.ndarray]) -> Model:
         """The model of a file: fields that all kinds have (`restore_parts`), features, the header, the arrays.
 
         KeyError, TypeError or ValueError for what is missing or does not fit the rest.

@@ -120,7 +120,7 @@ def corrective_shapes(body: Library, plain: SkinningModel, j: int, rng: np.rando
     controls = body.draw([j], BENT, POSES, rng)
     poses = body.poses(controls)
     off = body.vertices(controls) - plain.subject(None).vertices(poses)
-    lacking = np.stack([invert_blended(plain.blended(pose)) @ each[..., None]
+    lacking = np.stack([invert_blended(plain.blend_rotations(pose)) @ each[..., None]
                         for pose, each in zip(poses, off, strict=True)])
     X = (rotations.exp(poses[:, j]) - np.eye(3)).reshape(POSES, 9)
     # mean square of a number of R - I that counts as nothing
@@ -159,11 +159,11 @@ class Library:
 
     def vertices(self, controls: np.ndarray, identity: np.ndarray | None = None) -> np.ndarray:
         """(T, N, 3) metres, of controls (T, C) and identities (T, I); without, the mean person."""
-        return self._asked(self.theirs.forward_vertices, controls, identity)
+        return self._evaluate(self.theirs.forward_vertices, controls, identity)
 
     def skeleton(self, controls: np.ndarray, identity: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (T, J, 3, 3) of our joints in the world, and where they are (T, J, 3), metres."""
-        G = self._asked(self.theirs.forward_skeleton, controls, identity)[:, self.joints]
+        G = self._evaluate(self.theirs.forward_skeleton, controls, identity)[:, self.joints]
         return turns(G), G[..., :3, 3]
 
     def poses(self, controls: np.ndarray) -> np.ndarray:
@@ -247,7 +247,7 @@ class Library:
         it turns none, but changes place or size of joints below the pelvis, else `NOTHING`.
         """
         parents, pelvis = np.array(self.theirs.parents), self._common[0]
-        G = self._asked(self.theirs.forward_skeleton, np.r_[self.rest, STEP * np.eye(self.rest.shape[1])], None)
+        G = self._evaluate(self.theirs.forward_skeleton, np.r_[self.rest, STEP * np.eye(self.rest.shape[1])], None)
         R = turns(G)
         R = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)
         turned = np.linalg.norm(rotations.log(np.swapaxes(R[0], -1, -2) @ R[1:]), axis=-1) / STEP           # (C, all)
@@ -275,7 +275,7 @@ class Library:
         """Which of our joints the joint j of the library is or hangs on; the pelvis for what it hangs on itself."""
         return next((int(np.flatnonzero(self.joints == p)[0]) for p in self._above(j) if p in self.joints), 0)
 
-    def _asked(self, forward: Callable[..., Any], controls: np.ndarray, identity: np.ndarray | None) -> np.ndarray:
+    def _evaluate(self, forward: Callable[..., Any], controls: np.ndarray, identity: np.ndarray | None) -> np.ndarray:
         """What the library makes of controls (T, C) and identities (T, I), a few at a time."""
         out = []
         for rows in np.array_split(np.arange(len(controls)), -(-len(controls) // AT_ONCE)):

@@ -175,7 +175,7 @@ class Condensed(PointOperator):
     def load(self) -> int:
         return self.terms.count + 4 * len(self.skeleton.parents)
 
-    def turned(self, pose: np.ndarray) -> np.ndarray:
+    def relative_positions(self, pose: np.ndarray) -> np.ndarray:
         dtype = self.tables[0].dtype
         W = np.moveaxis(self.terms.weights(pose).astype(dtype, copy=False), -3, -2)        # (..., i, m, j)
         W = W.reshape(-1, self.terms.count, 3)
@@ -226,20 +226,20 @@ class Condensed(PointOperator):
         return np.concatenate([table.reshape(-1, table.shape[2])[:, len(part.inside):] @ answer[part.loads]
                                for part, table in zip(self.system.parts, self.tables, strict=True)])
 
-    def combined(self, weights: np.ndarray | sparray) -> Products:
+    def combine(self, weights: np.ndarray | sparray) -> Products:
         used, mixed = find_needed_vertices(weights)
         # more than a tenth of the vertices are asked for again and again, as a fit matches others in every round
         if "products" in self.__dict__ or len(used) * MANY > self.count:
-            return self.products.combined(weights)
+            return self.products.combine(weights)
         some = self.of_vertices(used)
-        return some if mixed is None else some.combined(mixed)
+        return some if mixed is None else some.combine(mixed)
 
     def plus(self, factor: float, other: PointOperator) -> Condensed:
         assert isinstance(other, Condensed), "of the same kind of model"
         tables = tuple(a + a.dtype.type(factor) * b for a, b in zip(self.tables, other.tables, strict=True))
         return replace(self, tables=tables, origin=self.origin + factor * other.origin)
 
-    def scaled(self, factor: float) -> Condensed:
+    def scale_by(self, factor: float) -> Condensed:
         return replace(self, tables=tuple((factor * table).astype(table.dtype) for table in self.tables))
 
     def astype(self, dtype: Any) -> Condensed:
@@ -316,7 +316,7 @@ class ShapedCondensed(ShapedPoints):
     def operator(self, betas: np.ndarray | None = None) -> Condensed:
         if betas is None:
             return self.own
-        betas = self._checked(betas)
+        betas = self._check_betas(betas)
         flat = betas @ self.flat[:len(betas)]
         tables = tuple(mean + flat[some].reshape(mean.shape) for some, mean in
                        zip(self._slices, self.mean.tables, strict=True))
@@ -352,7 +352,7 @@ class ShapedCondensed(ShapedPoints):
         y = assemble_vertices(self.mean.system, local).reshape(*pose.shape[:-2], 3, K, self.count)
         return np.moveaxis(y, -1, -3)
 
-    def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
+    def combine(self, weights: np.ndarray | sparray) -> ShapedProducts:
         used, mixed = find_needed_vertices(weights)
         system, L, basis = self.mean.system, len(used), []
         reach, place = system.reach(used), system.place_of[used]
@@ -367,10 +367,10 @@ class ShapedCondensed(ShapedPoints):
             basis.append(found.reshape(2 + self.n_betas, len(mean), 3, L))
         T = np.concatenate(basis, axis=1)
         points = ShapedProducts(self.mean.terms, T[0], T[1], T[2:], self.mean.origin)
-        return points if mixed is None else points.combined(mixed)
+        return points if mixed is None else points.combine(mixed)
 
-    def joined(self, other: ShapedPoints) -> ShapedProducts:
-        return self.combined(eye_array(self.count, format="csr")).joined(other)
+    def concatenate(self, other: ShapedPoints) -> ShapedProducts:
+        return self.combine(eye_array(self.count, format="csr")).concatenate(other)
 
     def along(self, directions: np.ndarray) -> ShapedCondensed:
         return replace(self, flat=directions @ self.flat)

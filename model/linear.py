@@ -59,7 +59,7 @@ class PointOperator(Points):
     origin: np.ndarray
 
     @abstractmethod
-    def turned(self, pose: np.ndarray) -> np.ndarray:
+    def relative_positions(self, pose: np.ndarray) -> np.ndarray:
         """Places (..., 3, L) relative to `origin` at checked poses (..., J, 3), coordinates before points."""
 
     @abstractmethod
@@ -67,7 +67,7 @@ class PointOperator(Points):
         """As `jacobian`, with the derivatives as (..., 3J, 3, L), contiguous for each parameter."""
 
     @abstractmethod
-    def combined(self, weights: np.ndarray | sparray) -> PointOperator:
+    def combine(self, weights: np.ndarray | sparray) -> PointOperator:
         """Linear combinations of the points, with weights (K, L); `origin` counts once, whatever their rows sum to."""
 
     @abstractmethod
@@ -75,7 +75,7 @@ class PointOperator(Points):
         """The sum with a multiple of another operator of the same model and points, origins included."""
 
     @abstractmethod
-    def scaled(self, factor: float) -> PointOperator:
+    def scale_by(self, factor: float) -> PointOperator:
         """The same body larger or smaller about the root's joint."""
 
     @abstractmethod
@@ -84,16 +84,16 @@ class PointOperator(Points):
 
     def joints(self, regressor: sparray) -> PointOperator:
         """The joints of a whole body: combinations (J, L) of the surface around them, unless they are its own."""
-        return self.combined(regressor)
+        return self.combine(regressor)
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """Positions (..., L, 3) of the points at poses (..., J, 3) and trans (..., 3)."""
         pose, trans = check_pose(self.skeleton, pose, trans)
         step = self._at_once(12)
         if pose.ndim == 2 or len(pose) <= step:
-            y = self.turned(pose)
+            y = self.relative_positions(pose)
         else:
-            y = np.concatenate([self.turned(pose[i:i + step]) for i in range(0, len(pose), step)])
+            y = np.concatenate([self.relative_positions(pose[i:i + step]) for i in range(0, len(pose), step)])
         y += (self.origin + trans)[..., None].astype(y.dtype)
         return np.swapaxes(y, -1, -2)
 
@@ -208,7 +208,7 @@ class Subject:
         ValueError
             Indices out of range, shapes that do not agree, weights that do not sum to 1.
         """
-        return self.operator.combined(combination_weights(self.n_vertices, vertex_ids, weights)).astype(np.float64)
+        return self.operator.combine(combination_weights(self.n_vertices, vertex_ids, weights)).astype(np.float64)
 
 
 def combination_weights(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None) -> csr_array:

@@ -78,7 +78,7 @@ class Products(PointOperator):
     def _flat(self) -> np.ndarray:
         return self.basis.reshape(3 * self.terms.count, self.count)
 
-    def turned(self, pose: np.ndarray) -> np.ndarray:
+    def relative_positions(self, pose: np.ndarray) -> np.ndarray:
         W = np.moveaxis(self.terms.weights(pose), -3, -2)                     # (..., i, m, j)
         W = W.reshape(-1, self._flat.shape[0]).astype(self._flat.dtype, copy=False)
         return (W @ self._flat).reshape(*pose.shape[:-2], 3, self.count)
@@ -106,7 +106,7 @@ class Products(PointOperator):
         y = np.swapaxes(carried[..., 0, :, :], -1, -2) + (self.origin + trans)[..., None, :]
         return y, columns.reshape(*leading, 3 * J, 3, L)
 
-    def combined(self, weights: np.ndarray | sparray) -> Products:
+    def combine(self, weights: np.ndarray | sparray) -> Products:
         return replace(self, basis=_combine(self.basis, weights))
 
     def plus(self, factor: float, other: PointOperator) -> Products:
@@ -114,7 +114,7 @@ class Products(PointOperator):
         return replace(self, basis=self.basis + self.basis.dtype.type(factor) * other.basis,
                        origin=self.origin + factor * other.origin)
 
-    def scaled(self, factor: float) -> Products:
+    def scale_by(self, factor: float) -> Products:
         return replace(self, basis=(factor * self.basis).astype(self.basis.dtype))
 
     def astype(self, dtype: Any) -> Products:
@@ -166,12 +166,12 @@ class ShapedProducts(ShapedPoints):
     def operator(self, betas: np.ndarray | None = None) -> Products:
         if betas is None:
             return Products(self.terms, self.own, self.origin)
-        betas = self._checked(betas)
+        betas = self._check_betas(betas)
         return Products(self.terms, self.mean + np.tensordot(betas, self.change[:len(betas)], axes=1), self.origin)
 
     def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
         pose = np.asarray(pose, dtype=np.float64)
-        by_beta = self._changes.turned(pose).reshape(*pose.shape[:-2], 3, self.n_betas, self.count)
+        by_beta = self._changes.relative_positions(pose).reshape(*pose.shape[:-2], 3, self.n_betas, self.count)
         return np.moveaxis(by_beta, -1, -3)
 
     @cached_property
@@ -180,11 +180,11 @@ class ShapedProducts(ShapedPoints):
         K, M, _, L = self.change.shape
         return Products(self.terms, np.moveaxis(self.change, 0, 2).reshape(M, 3, K * L), np.zeros(3))
 
-    def combined(self, weights: np.ndarray | sparray) -> ShapedProducts:
+    def combine(self, weights: np.ndarray | sparray) -> ShapedProducts:
         own, mean, change = (_combine(T, weights) for T in (self.own, self.mean, self.change))
         return replace(self, own=own, mean=mean, change=change)
 
-    def joined(self, other: ShapedPoints) -> ShapedProducts:
+    def concatenate(self, other: ShapedPoints) -> ShapedProducts:
         assert isinstance(other, ShapedProducts), "of the same model"
         own, mean, change = (np.concatenate([getattr(self, name), getattr(other, name)], axis=-1)
                              for name in ("own", "mean", "change"))

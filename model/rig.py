@@ -109,16 +109,16 @@ class Rig:
         changes = SLIDER * np.stack([self.shapes, -self.shapes], axis=1)
         return names, changes.reshape(-1, *self.mesh.vertices.shape)
 
-    def moved(self, R: np.ndarray, shift: np.ndarray | float = 0.0) -> Rig:
+    def transform(self, R: np.ndarray, shift: np.ndarray | float = 0.0) -> Rig:
         """The same body turned by R (3, 3) and then shifted, metres; see `carried` for its poses and places."""
         extra = self.correctives and replace(self.correctives, shapes=self.correctives.shapes @ R.T)
         return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices @ R.T + shift), shapes=self.shapes @ R.T,
                        skeleton=replace(self.skeleton, joints=self.skeleton.joints @ R.T + shift), axes=R @ self.axes,
                        correctives=extra)
 
-    def turned(self, up: int) -> Rig:
+    def with_up(self, up: int) -> Rig:
         """The same body with the axis `up` turned to +y; poses and trans turn with `turn_up`."""
-        return self.moved(turn_up(up))
+        return self.transform(turn_up(up))
 
 
 def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0, weights: np.ndarray | None = None
@@ -202,7 +202,7 @@ def transform_rig(rig: Rig, poses: np.ndarray, trans: np.ndarray, rest: tuple[np
     Poses (T, J, 3) radians, trans (T, 3) metres; T may be 0.
     """
     (Q, shift), (W, step) = rest, world
-    moved = rig.moved(Q, shift)
+    moved = rig.transform(Q, shift)
     places = (rig.skeleton.joints[0] + trans) @ W.T + step
     turns = poses @ Q.T
     if len(poses) and not np.array_equal(Q, W):

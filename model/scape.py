@@ -86,9 +86,9 @@ class ScapeModel(BodyModel):
         """The products of features and rotations that a fixed body is linear in."""
         return self.parts.terms(self.pose_space.features)
 
-    def posed_edges(self, pose: np.ndarray) -> np.ndarray:
+    def deform_edges(self, pose: np.ndarray) -> np.ndarray:
         """`Q v̂` (F, 2, 3) of every triangle at one pose (J, 3)."""
-        return self.parts.posed(self.pose_space.gradients(pose))
+        return self.parts.deform_edges(self.pose_space.gradients(pose))
 
     def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
         """By the sparse solve.
@@ -96,7 +96,7 @@ class ScapeModel(BodyModel):
         [SCAPE] Eq. 6, Eq. 9
         """
         RS = self.parts.rotations(pose) @ self.shape_space.gradients(betas)
-        return self.stitching.stitch(self.posed_edges(pose) @ np.swapaxes(RS, -1, -2))
+        return self.stitching.stitch(self.deform_edges(pose) @ np.swapaxes(RS, -1, -2))
 
     def bodies_of(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
         return self.everywhere.bodies(poses, betas)
@@ -107,7 +107,7 @@ class ScapeModel(BodyModel):
 
     @cached_property
     def everywhere(self) -> ShapedCondensed:
-        return self.parts.shaped(self.pose_space, self.shape_space)
+        return self.parts.as_shaped(self.pose_space, self.shape_space)
 
     def operator(self, betas: np.ndarray | None = None) -> Condensed:
         # the tables of all betas are made when they are first asked for
@@ -117,7 +117,7 @@ class ScapeModel(BodyModel):
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedPoints:
         whole = self.everywhere if n_betas is None else self.everywhere.first(n_betas)
-        return whole.combined(combination_weights(len(self.template.vertices), vertex_ids, weights))
+        return whole.combine(combination_weights(len(self.template.vertices), vertex_ids, weights))
 
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         pose, _ = check_pose(self.skeleton, pose, None)
@@ -145,7 +145,7 @@ class ScapeModel(BodyModel):
         by_pose += np.tensordot(delta, space.features.derivative(pose), axes=1)
         return by_pose.ravel(), by_betas.astype(np.float64)
 
-    def recentred(self, vertices: np.ndarray, pose: np.ndarray) -> ScapeModel:
+    def recentre(self, vertices: np.ndarray, pose: np.ndarray) -> ScapeModel:
         """S by Eq. 8, and again for what the stitched character then lacks.
 
         Two edges leave open how a triangle thickens. People are smooth enough to share it with their neighbours; where
@@ -158,7 +158,7 @@ class ScapeModel(BodyModel):
             normal = cross / np.maximum(length, np.finfo(float).tiny)
             return np.concatenate([pairs, NORMAL * normal[:, None]], axis=1)
 
-        posed, target = with_normals(self.posed_edges(pose)), with_normals(self.parts.local_edges(vertices, pose))
+        posed, target = with_normals(self.deform_edges(pose)), with_normals(self.parts.local_edges(vertices, pose))
         # a tenth of the paper's smoothness: a character's triangles share less of their shape than people's
         solver, S = ShapeSolver(GradientSystem(self.template, 0.0001), posed), np.zeros((len(posed), 3, 3))
         for _ in range(3):                      # twice what is left of the character is added to its shape
@@ -171,14 +171,14 @@ class ScapeModel(BodyModel):
         Eq. 8 for the whole body would take what stitching did to it near the borders of parts, in this one pose, for
         its shape.
         """
-        parts, Q, posed = self.parts, self.pose_space.gradients(pose), self.posed_edges(pose)
+        parts, Q, posed = self.parts, self.pose_space.gradients(pose), self.deform_edges(pose)
         system, S = GradientSystem(self.template), self.shape_space.gradients(betas)
         for _ in range(2):                      # twice what is left of the body is added to its shape
-            left = vertices - parts.stitched(S @ Q, pose)
+            left = vertices - parts.stitch(S @ Q, pose)
             S += shape_gradients(system, posed, posed + parts.local_edges(left, pose)) - np.eye(3)
         return self.subject_of(parts.operator(self.pose_space, S), None)
 
-    def resampled(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> ScapeModel:
+    def resample(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> ScapeModel:
         """Q and S carried part by part; then, in rounds, what is left in many poses is regressed and added, as in
         learning.
 
@@ -202,7 +202,7 @@ class ScapeModel(BodyModel):
             shapes.mean[piece.new_faces], shapes.components[:, piece.new_faces] = S[0], S[1:]
         space = PoseSpace(replace(self.features, skeleton=skeleton), tuple(coefficients))
         moved = replace(self, template=template, skeleton=skeleton, pose_space=space, shape_space=shapes,
-                        **self._resampled_fields(pieces))
+                        **self._resample_fields(pieces))
         if not rounds:
             return moved
         # three poses for each feature of the part that has most
@@ -211,7 +211,7 @@ class ScapeModel(BodyModel):
         moved = _with_pose_space(moved, poses, follow.positions(self.subject(None).vertices(poses)), rounds)
         return _with_shape_space(moved, self, follow, poses[:8], rounds, progress) if self.n_betas else moved
 
-    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, Any]:
+    def _resample_fields(self, pieces: list[Piece]) -> dict[str, Any]:
         """What a kind built on this one keeps besides, on other triangles."""
         return {}
 
@@ -222,8 +222,8 @@ class ScapeModel(BodyModel):
                 "shape_total_variance": np.array(self.shape_space.total_variance)}
 
     @classmethod
-    def restored(cls, parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
-                 arrays: Mapping[str, np.ndarray]) -> ScapeModel:
+    def restore(cls, parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
+                arrays: Mapping[str, np.ndarray]) -> ScapeModel:
         F, skeleton = len(parts["template"].faces), parts["skeleton"]
         if parts["template"].vertex_component.any():
             raise ValueError("vertices: expected one connected surface, which alone can be stitched")
@@ -281,7 +281,7 @@ def _with_shape_space(model: ScapeModel, teacher: ScapeModel, follow: Follower, 
         for i, (pose, (y, dy)) in enumerate(zip(poses, wanted, strict=True), start=1):
             mean, slope = people(model, pose)
             local = model.parts.local_edges(np.concatenate([(y - mean)[None], dy - slope]), pose)
-            posed = model.posed_edges(pose)
+            posed = model.deform_edges(pose)
             square = square + np.swapaxes(posed, -1, -2) @ posed
             product = product + np.swapaxes(local, -1, -2) @ posed
             progress(number * len(poses) + i, total)
@@ -323,7 +323,7 @@ class BlendScapeModel(ScapeModel):
     def arrays(self) -> dict[str, np.ndarray]:
         return {**super().arrays(), "blend": self.blend}
 
-    def _resampled_fields(self, pieces: list[Piece]) -> dict[str, Any]:
+    def _resample_fields(self, pieces: list[Piece]) -> dict[str, Any]:
         blend = np.empty((sum(len(piece.new_faces) for piece in pieces), self.blend.shape[1]))
         for piece in pieces:
             blend[piece.new_faces] = piece.average(self.blend[piece.old_faces])

@@ -148,7 +148,7 @@ class SkinningModel(BodyModel):
         ids, share = self._root
         return np.asarray(y - share @ y[ids])
 
-    def blended(self, pose: np.ndarray) -> np.ndarray:
+    def blend_rotations(self, pose: np.ndarray) -> np.ndarray:
         """(N, 3, 3) the weighted mean of the rotations that carry each vertex, at a pose (J, 3)."""
         return np.tensordot(self.weights, self.skeleton.part_rotations(pose), axes=1)
 
@@ -206,15 +206,15 @@ class SkinningModel(BodyModel):
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedBlended:
         whole = self.everywhere if n_betas is None else self.everywhere.first(n_betas)
-        return whole.combined(combination_weights(len(self.rest), vertex_ids, weights))
+        return whole.combine(combination_weights(len(self.rest), vertex_ids, weights))
 
-    def unposed(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def unpose(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(N, 3) rest vertices that the model carries onto a body (N, 3) exactly, joints of their own included.
 
         The root's joint is where the template has it. `x = B⁻¹ (y - Σ_j below_j turn_j j_j) - c` with joints j = A x is
         first solved for the joints alone.
         """
-        back, A, J = invert_blended(self.blended(pose)), self.joint_regressor, len(pose)
+        back, A, J = invert_blended(self.blend_rotations(pose)), self.joint_regressor, len(pose)
         bare = np.einsum("nij,nj->ni", back, vertices) - self.corrections(pose)
         pull = np.einsum("nj,nik,jkl->nijl", self.below, back, self.joint_turns(pose)).reshape(len(vertices), -1)
         coupling = (A @ pull).reshape(3 * J, 3 * J)
@@ -222,11 +222,11 @@ class SkinningModel(BodyModel):
         x = bare - (pull.reshape(-1, 3 * J) @ joints).reshape(-1, 3)
         return np.asarray(x + self.skeleton.joints[0] - (A @ x)[0])
 
-    def recentred(self, vertices: np.ndarray, pose: np.ndarray) -> SkinningModel:
-        return replace(self, shape_mean=self.unposed(vertices, pose))
+    def recentre(self, vertices: np.ndarray, pose: np.ndarray) -> SkinningModel:
+        return replace(self, shape_mean=self.unpose(vertices, pose))
 
     def exact_subject(self, vertices: np.ndarray, pose: np.ndarray, betas: np.ndarray | None) -> Subject:
-        return replace(self, rest=self.unposed(vertices, pose)).subject(None)
+        return replace(self, rest=self.unpose(vertices, pose)).subject(None)
 
     @property
     def skin_weights(self) -> np.ndarray:
@@ -237,7 +237,7 @@ class SkinningModel(BodyModel):
         rotations_alone = self.features.lift.kind == RotationLift.kind and len(self.correctives)
         return np.moveaxis(self.correctives, 0, -1) if rotations_alone else None
 
-    def resampled(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> SkinningModel:
+    def resample(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> SkinningModel:
         follow = Follower(self.template, template)
 
         def displaced(field: np.ndarray) -> np.ndarray:
@@ -278,8 +278,8 @@ class SkinningModel(BodyModel):
         return {"own_joints": self.regressor is not None}
 
     @classmethod
-    def restored(cls, parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
-                 arrays: Mapping[str, np.ndarray]) -> SkinningModel:
+    def restore(cls, parts: dict[str, Any], features: PoseFeatures, header: Mapping[str, Any],
+                arrays: Mapping[str, np.ndarray]) -> SkinningModel:
         stored: dict[str, Any] = {name: storage.numbers(arrays, name, *(None,) * axes)
                                   for name, axes in _STORED.items()}
         stored["shape_variances"], stored["shape_total"] = restore_variances(arrays, "shape_total")

@@ -450,8 +450,8 @@ class BodyLayer(nn.Module):
             found.append(found[-1][:, above] @ relative[:, parts])
         return torch.cat(found, 1)[:, self.back]
 
-    def _named(self, poses: Tensor | None, trans: Tensor | None, global_orient: Tensor | None,
-               body_pose: Tensor | None, transl: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+    def _resolve_names(self, poses: Tensor | None, trans: Tensor | None, global_orient: Tensor | None,
+                       body_pose: Tensor | None, transl: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         """Poses and trans, whichever names they came under."""
         if transl is not None:
             if trans is not None:

@@ -95,7 +95,7 @@ class _Settings:
         early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         early.add_argument("--config", type=Path)
         early.add_argument("--preset", default="default")
-        published = getattr(next(iter(values.values()), None), "published", None)       # of the command's own method
+        published = getattr(next(iter(values.values()), None), "from_paper", None)       # of the command's own method
         self.presets = published is not None
         self.values, self.about = values, ""
         if not values or {"-h", "--help"} & {*argv}:
@@ -105,7 +105,7 @@ class _Settings:
             if self.presets and given.preset == "published":
                 self.about = config_files.comment(inspect.getdoc(published) or "")
                 own = next(iter(values))           # other settings of one kind may stand for something else
-                self.values = {name: _as_published(value) if hasattr(value, "published") and (
+                self.values = {name: _as_published(value) if hasattr(value, "from_paper") and (
                     name == own or value == type(value)()) else value for name, value in values.items()}
             if given.config is not None:
                 self.values = config_files.read(given.config, self.values)
@@ -124,7 +124,7 @@ class _Settings:
                                      "setting means, and do nothing else.")
         return found
 
-    def taken_from(self, given: dict[str, Any]) -> dict[str, Any]:
+    def build_arguments(self, given: dict[str, Any]) -> dict[str, Any]:
         """The arguments of the command's function: settings in place of flags."""
         values = dict(self.values)
         for name, flag in self.flags.items():
@@ -139,7 +139,7 @@ def _as_published(value: Any) -> Any:
     """The published settings, but for the fields in which those of the command are not the usual ones anyway."""
     usual = type(value)()
     own = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    return dataclasses.replace(type(value).published(), **{
+    return dataclasses.replace(type(value).from_paper(), **{
         name: mine for name, mine in own.items() if mine != getattr(usual, name)})
 
 
@@ -192,7 +192,7 @@ class _Call:
         self.function, self.command = function, f"{prog} {' '.join(argv)}"
         self.arguments = Arguments(function, prog, argv)
         self.read = self.arguments.read(argv)
-        self.given = self.arguments.settings.taken_from(dict(self.read))
+        self.given = self.arguments.settings.build_arguments(dict(self.read))
         self.force = self.given.pop(FORCE, False)
         self.output: Path | None = self.given.get(self.arguments.output_name)
         self._staged: Path | None = None
@@ -233,7 +233,7 @@ class _Call:
             if outcome.judgement is None:
                 assert outcome.output is None, "what was made has a judgement"
                 return outcome
-            return dataclasses.replace(outcome, judgement=outcome.judgement.joined(before))
+            return dataclasses.replace(outcome, judgement=outcome.judgement.merge(before))
 
         if self.output is None:
             return call(), None

@@ -142,7 +142,7 @@ def add_entry(page: Page, name: str, lines: Iterable[str], shown: str | None = N
 
 def load_results(space: Workspace, names: Sequence[str]) -> Results:
     """What is known of things by their names, from a folder that need not be open."""
-    kept = set(space.kept(""))
+    kept = set(space.list_results(""))
     failures = (space.value(PAGE) if PAGE in kept else None) or {}
     values = {name: space.value(name) for name in names if name in kept}
     return Results(values, {name: line for name, line in failures.items() if name in names and name not in values}, ())

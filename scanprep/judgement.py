@@ -70,7 +70,7 @@ class Judgement:
         """The reasons where it is to be looked at."""
         return self.reasons if self.verdict == "check" else ()
 
-    def joined(self, *others: Judgement) -> Judgement:
+    def merge(self, *others: Judgement) -> Judgement:
         """The judgement of something of which all these speak: the gravest verdict, its reasons first."""
         every = (self, *others)
         return Judgement.of([reason for one in every for reason in one.problems],

@@ -39,7 +39,7 @@ def half_view(body: Mesh, toward: np.ndarray, count: int = 4000, noise: float = 
     def visible(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         to = camera - points
         to = to / np.linalg.norm(to, axis=1, keepdims=True)
-        return (np.einsum("nd,nd->n", to, normals) > 0.15) & ~rays.occluded(points + 1e-3 * normals, to)
+        return (np.einsum("nd,nd->n", to, normals) > 0.15) & ~rays.test_occlusion(points + 1e-3 * normals, to)
 
     points, face, _ = body.sample(3 * count, rng)
     points = points[visible(points, body.face_normals[face])][:count]

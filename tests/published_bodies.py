@@ -49,7 +49,7 @@ def synthetic_smpl(faces: int = 2400, people: int = 3, poses: int = 8, seed: int
     body = man.mesh.vertices[own]
     rig = Rig(template.with_vertices(body), Skeleton(skeleton.part_of_face, PARENTS, regressor @ body), weights,
               np.zeros((0, *body.shape)))
-    ours, exact = np.zeros((poses, 24, 3)), np.stack([man.posed(pose)[own] for pose in at])
+    ours, exact = np.zeros((poses, 24, 3)), np.stack([man.in_pose(pose)[own] for pose in at])
     ours[:, [JOINT[name] for name in PARTS]] = at
     root = weights[:, 0]**4 / (weights[:, 0]**4).sum()
     exact += np.einsum("n,mnd->md", root, rig.vertices(ours) - exact)[:, None]

@@ -29,7 +29,7 @@ def away(betas=BETAS):
     truth = MODEL.vertices(POSE, betas, TRANS)
     off = np.random.default_rng(0).normal(0, 0.15, (4, 3))
     R, start = MODEL.skeleton.part_rotations(POSE + off), 0 * betas
-    now = Blocks(R, Alternation(MODEL).predicted(R, start) + MODEL.skeleton.joints[0] + TRANS, start)
+    now = Blocks(R, Alternation(MODEL).predict(R, start) + MODEL.skeleton.joints[0] + TRANS, start)
     return truth, now, Markers(np.arange(len(truth)), truth, np.full(len(truth), 1.0))
 
 
@@ -38,17 +38,17 @@ def test_each_step_lowers_the_energy_over_its_own_block():
     steps = Alternation(MODEL)
     for _ in range(4):
         before = steps.energy(now, markers)
-        stretched = steps.stretched(now, markers)
-        shaped = steps.shaped(stretched)
+        stretched = steps.solve_vertices(now, markers)
+        shaped = steps.solve_shape(stretched)
         assert steps.energy(shaped, markers) < steps.energy(stretched, markers) < before
         assert stretched.R is now.R and stretched.betas is now.betas and shaped.R is now.R and shaped.Y is stretched.Y
-        now = steps.rotated(shaped, 0.0)
+        now = steps.solve_rotations(shaped, 0.0)
 
 
 def test_the_surface_and_the_betas_are_where_the_gradient_vanishes():
     _, now, markers = away()
     steps, rng = Alternation(MODEL), np.random.default_rng(1)
-    for found, name, h in ((steps.stretched(now, markers), "Y", 1e-4), (steps.shaped(now), "betas", 1e-3)):
+    for found, name, h in ((steps.solve_vertices(now, markers), "Y", 1e-4), (steps.solve_shape(now), "betas", 1e-3)):
         direction = rng.normal(size=getattr(found, name).shape)
 
         def at(step, found=found, name=name, direction=direction):
@@ -63,7 +63,7 @@ def test_turns_reach_the_truth_when_every_point_is_known():
     steps = Alternation(MODEL)
     markers = replace(markers, weights=100 * markers.weights)        # the more they weigh, the fewer turns it takes
     for _ in range(30):
-        now = steps.shaped(steps.stretched(steps.rotated(now, 0.01), markers))
+        now = steps.solve_shape(steps.solve_vertices(steps.solve_rotations(now, 0.01), markers))
     assert np.linalg.norm(now.Y - truth, axis=1).mean() < 1e-3
     true = Blocks(MODEL.skeleton.part_rotations(POSE), truth, BETAS)
     assert steps.energy(now, markers) <= steps.energy(true, markers)     # not zero: the edges do not quite fit together

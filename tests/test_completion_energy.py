@@ -127,15 +127,15 @@ def test_derivatives_by_betas_are_carried_with_the_bones():
     pose = x[:12].reshape(4, 3)
     anchor = anchor_at(MODEL, pose)
     ids = np.arange(0, 398, 7)
-    np.testing.assert_allclose(anchor.carried(ids, pose), MODEL.shape_jacobian(pose, ids), atol=1e-12)
+    np.testing.assert_allclose(anchor.carry(ids, pose), MODEL.shape_jacobian(pose, ids), atol=1e-12)
     whole = pose.copy()
     whole[0] = rotations.log(rotations.exp(np.array([1.0, -0.4, 0.3])) @ rotations.exp(pose[0]))
-    np.testing.assert_allclose(anchor.carried(ids, whole), MODEL.shape_jacobian(whole, ids), atol=1e-12)
-    np.testing.assert_allclose(anchor.turned(whole), np.linalg.norm([1.0, -0.4, 0.3]), atol=1e-9)
+    np.testing.assert_allclose(anchor.carry(ids, whole), MODEL.shape_jacobian(whole, ids), atol=1e-12)
+    np.testing.assert_allclose(anchor.largest_angle(whole), np.linalg.norm([1.0, -0.4, 0.3]), atol=1e-9)
     bent = pose + np.random.default_rng(5).normal(0, 0.1, (4, 3)) * [[0], [1], [1], [1]]
     exact = MODEL.shape_jacobian(bent, ids)
-    off = np.linalg.norm(anchor.carried(ids, bent) - exact) / np.linalg.norm(exact)
-    still = np.linalg.norm(anchor.carried(ids, pose) - exact) / np.linalg.norm(exact)
+    off = np.linalg.norm(anchor.carry(ids, bent) - exact) / np.linalg.norm(exact)
+    still = np.linalg.norm(anchor.carry(ids, pose) - exact) / np.linalg.norm(exact)
     assert off < 0.05 and off < 0.6 * still
 
 

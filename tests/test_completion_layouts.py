@@ -110,8 +110,8 @@ def test_a_template_that_kept_some_vertices_carries_the_markers_there(name, pers
 
 def test_aliases_stand_in_where_the_marker_is_missing(person):
     layout = load_layout("cmu41", person)
-    assert layout.matched(["RBAK", "C7", "T10"]) == ("RBAK", "C7", "T10")
-    assert layout.matched(["RBAK", "C7", "T10", "RBAC"]) == ("C7", "T10", "RBAC")
+    assert layout.match_labels(["RBAK", "C7", "T10"]) == ("RBAK", "C7", "T10")
+    assert layout.match_labels(["RBAK", "C7", "T10", "RBAC"]) == ("C7", "T10", "RBAC")
     np.testing.assert_array_equal(layout.select(["RBAK"]).vertices, layout.select(["RBAC"]).vertices)
     assert layout.select(["RBAK", "C7"]).loose == ("RBAK",)
     with pytest.raises(ValueError, match="aliases: expected new labels for markers of the layout, got 'X' for 'Y'"):
@@ -121,7 +121,7 @@ def test_aliases_stand_in_where_the_marker_is_missing(person):
 
 
 def test_loose_markers_and_aliases_are_kept_in_files(person, tmp_path):
-    layout = load_layout("cmu41", person).moved({"RBAK": 17})
+    layout = load_layout("cmu41", person).with_places({"RBAK": 17})
     layout.save(tmp_path / "a.json")
     back = MarkerLayout.load(tmp_path / "a.json")
     assert set(back.loose) == set(layout.loose) and back.aliases == layout.aliases
@@ -146,7 +146,7 @@ def test_markers_that_some_wear_on_wands_are_said_and_kept(person, tmp_path):
     layout.save(tmp_path / "a.json")
     assert set(MarkerLayout.load(tmp_path / "a.json").wands) == set(layout.wands)
     assert layout.select(["RSHN", "C7"]).wands == ("RSHN",) and not layout.without(layout.wands).wands
-    assert layout.without(layout.wands).joined(layout.select(layout.wands)).wands == layout.wands
+    assert layout.without(layout.wands).merge(layout.select(layout.wands)).wands == layout.wands
     with pytest.raises(ValueError, match="wands: B not among A"):
         MarkerLayout(("A",), np.array([0]), wands=("B",))
 

@@ -61,7 +61,7 @@ def test_every_step_is_the_direct_solve(groups, sign):
     inside = np.flatnonzero(sets.inside)
     for g in np.flatnonzero(~sets.inside)[:4]:
         with_it = [c for h in (*inside, g) for c in groups[h]]
-        assert sets.tried(np.array([g]), ADD)[0] == pytest.approx(linear.rmse(with_it)**2, rel=1e-8)
+        assert sets.score_groups(np.array([g]), ADD)[0] == pytest.approx(linear.rmse(with_it)**2, rel=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -116,7 +116,7 @@ def test_pairs_come_and_go_together_and_kept_markers_stay():
 
 def test_full_refits_end_where_their_energy_is_least():
     chosen = list(range(11))
-    x = FITS.refitted(chosen, CONFIG)
+    x = FITS.refit(chosen, CONFIG)
     points, goal = FITS.markers.some(np.array(chosen)), FITS.places[:, chosen]
 
     def energy(x):

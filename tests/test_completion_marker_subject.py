@@ -120,7 +120,7 @@ def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
     person = Person(BodyShape.like("male", stature=1.88, weight=1.0))
     on_skin = load_layout("cmu41", person.mesh)
     poses, trans = walk(40, 40.0)
-    bodies = np.stack([person.posed(p, t) for p, t in zip(poses, trans, strict=True)])
+    bodies = np.stack([person.in_pose(p, t) for p, t in zip(poses, trans, strict=True)])
     places = np.stack([on_skin.place(person.mesh.with_vertices(v)) for v in bodies])
     sequence = MarkerSequence(places, on_skin.labels, 40.0)
     found = find_person(model, sequence, layout, CONFIG)

@@ -50,11 +50,11 @@ def test_a_layout_of_several_sets_mixed_with_points(tmp_path):
 
 
 def test_matching_and_selecting():
-    assert LAYOUT.matched(["X", "C", "A", "B"]) == ("C", "A", "B")
+    assert LAYOUT.match_labels(["X", "C", "A", "B"]) == ("C", "A", "B")
     picked = LAYOUT.select(["C", "A"])
     np.testing.assert_array_equal(picked.place(MESH), LAYOUT.place(MESH)[[2, 0]])
     with pytest.raises(ValueError, match=r"at least 3 .* found 2; layout: A, B, C; sequence: A, B, D"):
-        LAYOUT.matched(["A", "B", "D"])
+        LAYOUT.match_labels(["A", "B", "D"])
     with pytest.raises(ValueError, match="labels: D not among A, B, C"):
         LAYOUT.select(["D"])
 
@@ -62,9 +62,9 @@ def test_matching_and_selecting():
 def test_labels_spelled_otherwise_are_known_where_only_one_is_meant():
     layout = MarkerLayout(("L.Knee", "RBAC", "a.b", "AB"), np.arange(4), aliases={"RBAK": "RBAC"})
     labels = ("l_knee", "rbak", "RBAC-1", "A B", "L.Knee")
-    found = layout.spelled(labels)
+    found = layout.with_spellings(labels)
     assert dict(found.aliases) == {"RBAK": "RBAC", "l_knee": "L.Knee", "rbak": "RBAC"}     # A B may be either
-    assert found.matched(labels, 0) == ("rbak", "L.Knee") and layout.spelled(("RBAK", "AB")) is layout
+    assert found.match_labels(labels, 0) == ("rbak", "L.Knee") and layout.with_spellings(("RBAK", "AB")) is layout
 
 
 def test_markers_are_left_out_with_their_aliases():

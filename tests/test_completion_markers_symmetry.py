@@ -62,13 +62,13 @@ def test_the_mirror_image_is_found_whatever_the_triangulation(person, mirror):
 def test_the_mirror_image_moves_with_the_body(person, mirror):
     raised = np.zeros((16, 3))
     raised[4] = [0, -0.6, 0]                                         # one arm
-    posed = person.with_vertices(Person().posed(raised))
+    posed = person.with_vertices(Person().in_pose(raised))
     off = np.linalg.norm(mirror.image(posed) - posed.vertices[load().mirror], axis=1)
     assert off.max() < 0.002 and np.linalg.norm(posed.vertices - person.vertices, axis=1).max() > 0.3
 
 
 def test_who_does_not_stand_symmetrically_needs_landmarks(person):
-    body = person.with_vertices(Person().posed(np.random.default_rng(0).normal(0, 0.4, (16, 3))))
+    body = person.with_vertices(Person().in_pose(np.random.default_rng(0).normal(0, 0.4, (16, 3))))
     with pytest.raises(ValueError, match=r"template: expected one that stands symmetrically, .* landmarks"):
         find_skin_mirror(body)
     with pytest.raises(ValueError, match="landmarks: expected at least 3 pairs of left and right, found 1 among"):

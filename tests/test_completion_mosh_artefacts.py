@@ -151,11 +151,11 @@ def test_frames_are_smoothed_and_solved_some_at_a_time(subject, layout, moved, m
     config, weights = AnimateConfig(), np.full(positions.shape[:2], 1e4)
     x = body.body.join(moved[0] + 0.02, moved[1])
     arguments = x, config.inertia(RATE, body.n_unknowns), body.system, positions, weights
-    whole, alone = body.smoothed(*arguments), body.solve(x, positions, weights, 5, 1e-6)
+    whole, alone = body.smooth_step(*arguments), body.solve(x, positions, weights, 5, 1e-6)
     monkeypatch.setattr(smoothing, "WINDOW", 50)
     monkeypatch.setattr(smoothing, "OVERLAP", 50)
     monkeypatch.setattr(marked_body, "MOST", 50)
-    assert np.abs(body.smoothed(*arguments) - whole).max() < 1e-6
+    assert np.abs(body.smooth_step(*arguments) - whole).max() < 1e-6
     pieces = body.solve(x, positions, weights, 5, 1e-6)
     for one, other in ((pieces.x, alone.x), (pieces.energy, alone.energy), (pieces.converged, alone.converged)):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)

@@ -42,7 +42,7 @@ def place(tmp_path_factory):
     layout = MarkerLayout.load(place / "true.json")
     body = worm_with_prior().template.vertices
     far = np.linalg.norm(body - body[layout.vertices[layout.labels.index(MOVED)]], axis=1)
-    layout.moved({MOVED: int(np.abs(far - 0.3).argmin())}).save(place / "layout.json")
+    layout.with_places({MOVED: int(np.abs(far - 0.3).argmin())}).save(place / "layout.json")
     walk = read_markers(place / "people" / "ann" / "walk.csv")
     names = dict(zip(EXCHANGED, EXCHANGED[::-1], strict=True))
     write_markers(place / "walk.csv", MarkerSequence(

@@ -215,7 +215,7 @@ def test_what_cannot_be_used_is_named():
 
 def test_weights_of_the_paper_are_those_of_the_engine():
     """[MoSh] Eq. 17, 21, 22: a residual of 1/√λ costs one."""
-    found = PoseConfig.weighted(data=0.25, pose=0.7, velocity=4.0)
+    found = PoseConfig.from_weights(data=0.25, pose=0.7, velocity=4.0)
     assert found.marker_sd == pytest.approx(0.02) and found.prior_weight == 0.7
     assert found.angle_acceleration == pytest.approx(0.5 * 120**2)
     ours = MoshConfig().poses                    # those of `animate`, but for markers that are held closer
@@ -305,7 +305,7 @@ def test_a_marker_that_is_never_believed_is_left_out_of_the_mean():
     floating[3] += [0.0, 0.0, 0.3]
     motion = animate(MODEL.subject(beside().betas), sequence(floating), beside().layout)
     assert motion.distrusted == ("M03",)
-    assert np.nanmean(motion.told()) < 5e-3 and np.nanmean(motion.residuals) > 0.01
+    assert np.nanmean(motion.residuals_of_trusted()) < 5e-3 and np.nanmean(motion.residuals) > 0.01
     assert markers_told([motion]).value == "25 of 26, without M03"
     assert "M03" in hardly_believed([motion])[0]
 
@@ -318,7 +318,7 @@ def test_left_and_right_exchanged_on_many_markers_are_put_right_together():
     markers = MarkerSequence(data[:, [*range(20, 25), *range(5, 20), *range(5), 25]], names, 60.0)
     found = find_worn(MODEL, [markers], layout, find_person(MODEL, markers, layout, USUAL), USUAL)
     assert found.exchanged == tuple(sides) and not found.moved and not found.unplaced
-    np.testing.assert_array_equal(found.named(markers, layout).positions, data)
+    np.testing.assert_array_equal(found.restore_names(markers, layout).positions, data)
 
 
 def test_where_the_body_is_at_fault_no_marker_is_moved():
@@ -357,7 +357,7 @@ def test_markers_in_their_places_are_let_be():
 
 def test_the_published_preset_is_the_patent():
     """Stage one, poses and soft tissue of [MoSh]; every marker believed alike and nothing repaired."""
-    found = MoshConfig.published()
+    found = MoshConfig.from_paper()
     person, poses, soft = found.person, found.poses, found.soft
     assert (person.data, person.surface, person.initial, person.shape, person.pose) == (0.75, 100, 0.25, 1, 0.25)
     assert (person.frames, person.choice, person.annealing) == (12, "random", (40, 20, 10, 4, 2, 1))

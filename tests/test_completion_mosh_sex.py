@@ -21,7 +21,7 @@ def models():
     rng = np.random.default_rng(0)
     betas = rng.normal(size=(24, 3)) * [0.2, 1, 1] + np.repeat([[-SIDE, 0, 0], [SIDE, 0, 0]], 12, axis=0)
     plane = learn_sex_plane(betas, ["female"] * 12 + ["male"] * 12)
-    found = {"neutral": replace(neutral, info={PLANE: plane.kept(), "sex": "neutral"})}
+    found = {"neutral": replace(neutral, info={PLANE: plane.to_arrays(), "sex": "neutral"})}
     for sex, side in (("female", -SIDE), ("male", SIDE)):
         space = replace(neutral.shape_space, mean=neutral.shape_space.gradients(np.array([side])))
         found[sex] = replace(neutral, shape_space=space, info={"sex": sex})

@@ -181,7 +181,7 @@ def test_the_movement_is_the_mean_of_a_gaussian_process() -> None:
     size = follow.LOOSE * np.sqrt(np.maximum(variances(off, share) - 1e-6, 1e-8))
     root, some = size[:, None] * follower.root, np.arange(20) != 5
     K = root @ root.T
-    found = follower.displaced(off, share)
+    found = follower.solve_displacements(off, share)
     for t, used in ((3, some), (7, np.full(20, True))):
         wanted = K[:, used] @ np.linalg.solve(K[np.ix_(used, used)] + 1e-6 * np.eye(used.sum()), off[t, used])
         np.testing.assert_allclose(found[t], wanted, atol=1e-6)
@@ -276,7 +276,7 @@ def test_betas_that_changed_are_found(kind: str) -> None:
 
 def test_betas_are_those_of_the_papers_energy() -> None:
     """At the poses found, no other betas have less of Eq. 24; markers that are missing count nothing."""
-    model, where, config = body(), layout(body(), 0.01, 20), SoftTissueConfig.published()
+    model, where, config = body(), layout(body(), 0.01, 20), SoftTissueConfig.from_paper()
     markers, motion = seen(model, where)
     gone = markers.positions.copy()
     gone[5:9, 3] = np.nan
@@ -299,7 +299,7 @@ def test_betas_are_those_of_the_papers_energy() -> None:
 def test_changes_of_velocity_weigh_as_in_the_paper(rate: float) -> None:
     """[MoSh] Eq. 24: lambda_u at 120 frames a second; in twice as many frames the same motion changes a fourth each."""
     markers, motion = seen(body(), layout(body()))
-    config = SoftTissueConfig.published()
+    config = SoftTissueConfig.from_paper()
     follower = ShapeFollower(body(), motion, replace(markers, rate=rate), layout(body()), config)
     np.testing.assert_allclose(follower.inertia[:-3], 6.25 * (rate / 120)**4)
     assert (config.data, config.pose, config.shape_change) == (0.75, 1.0, 0.25)

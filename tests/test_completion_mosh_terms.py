@@ -58,9 +58,9 @@ def of_latent(make):
     """A term of the latent markers of both attachments, as a function of z."""
     def build(kind):
         markers, c = hung(kind)
-        at = LATENT.combined(markers.ids, markers.weights)
-        corners = LATENT.combined(markers.corners.reshape(-1, 1), np.ones((3 * L, 1)))
-        usual = LATENT.combined(*supports(MODEL.template, LAYOUT))
+        at = LATENT.combine(markers.ids, markers.weights)
+        corners = LATENT.combine(markers.corners.reshape(-1, 1), np.ones((3 * L, 1)))
+        usual = LATENT.combine(*supports(MODEL.template, LAYOUT))
         return lambda z: make(terms.latent_places(kind, at, z), corners.moving(z),
                               energy.above_skin(usual.moving(z), np.full(L, 0.02))), shared()(c)
     return build
@@ -133,7 +133,7 @@ def test_priors_are_annealed_and_data_and_distance_from_the_skin_are_not():
     z, weights, usual = state.z + rng.normal(0, 0.01, K + 3 * L), fit.weights(state), fit._usual(state.layout)
 
     def energies(factor):
-        found = fit.of_frames(state, state.x, z, weights, factor) | fit.shared(state, usual, z, factor)
+        found = fit.of_frames(state, state.x, z, weights, factor) | fit.shared_terms(state, usual, z, factor)
         return {name: float(term.energy.sum()) for name, term in found.items()}
 
     once, begun = energies(1.0), energies(40.0)
@@ -158,9 +158,9 @@ def test_what_both_sides_say_of_their_distance_counts_where_they_are_worn_alike(
         layout = MarkerLayout(labels, LAYOUT.vertices, 0.0095, wands=labels[:2])
         fit = terms.LatentFit(MODEL, layout, beside(mean_mesh())[None], terms.PersonConfig(n_betas=K))
         places = replace(layout, distances=0.0095 + off).place(mean_mesh())
-        state = fit._hung(np.zeros((1, 15)), np.zeros(K), places, layout, fit.reach, False)
-        np.testing.assert_allclose(fit._measured(state, False).layout.distances, 0.0095 + off, atol=1e-9)
-        last = np.asarray(fit._measured(state, True).layout.distances)
+        state = fit._attach(np.zeros((1, 15)), np.zeros(K), places, layout, fit.reach, False)
+        np.testing.assert_allclose(fit._measure_distances(state, False).layout.distances, 0.0095 + off, atol=1e-9)
+        last = np.asarray(fit._measure_distances(state, True).layout.distances)
         np.testing.assert_allclose(last[:2], [0.0095 if named else 0.0335, 0.0095], atol=1e-9)
 
 

@@ -125,6 +125,6 @@ def test_whole_numbers_are_rounded_or_do_not_reach(tmp_path, original):
 @pytest.mark.parametrize("processor", [84, 85, 86])
 def test_numbers_of_every_processor_come_back(processor):
     numbers, values = _Numbers(processor), np.random.default_rng(0).normal(0, 1e3, 50).astype(np.float32)
-    np.testing.assert_array_equal(numbers.floats(numbers.encoded(values.astype(float), "f4")), values)
+    np.testing.assert_array_equal(numbers.floats(numbers.encode(values.astype(float), "f4")), values)
     whole = np.arange(-5, 300, 7)
-    np.testing.assert_array_equal(numbers.words(numbers.encoded(whole, "i2"), "i2"), whole)
+    np.testing.assert_array_equal(numbers.words(numbers.encode(whole, "i2"), "i2"), whole)

@@ -31,7 +31,7 @@ def test_one_residual_of_three_rows_is_that_of_place_and_plane(body):
     to_planes = Residual(root * (NORMALS * off).sum(axis=-1),
                          root[:, None] * np.einsum("ld,...ldp->...lp", NORMALS, points.jacobian))
     plain = normal_equations([energy.point_to_point(points, TARGETS, TO_POINT), to_planes])
-    pull = Pull(*body.gathered(MATCHED, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
+    pull = Pull(*body.gather(MATCHED, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
     nothing = normal_equations([energy.stay_near(x[None], x, np.zeros(len(x)))])
     for ours, theirs in zip(pull.equations(x[None], nothing).dense, plain, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
@@ -68,7 +68,7 @@ def test_few_vertices_of_a_body_are_those_of_the_whole():
 @pytest.mark.parametrize("ids", [[4, 1, 4], [5, 0, 1, 5, 3, 2]], ids=["some", "most"])
 def test_vertices_are_found_among_the_points_that_are_gathered(ids):
     few, x = BODIES["known"].some(IDS), unknowns(BODIES["known"])
-    points, at = few.gathered(np.array(ids), x)
+    points, at = few.gather(np.array(ids), x)
     y, columns = points.columns(x)
     np.testing.assert_allclose(y[at], few.vertices(x)[ids], atol=1e-12)
     np.testing.assert_allclose(columns[..., at], few.near(np.array(ids), x).columns(x)[1], atol=1e-12)
@@ -85,7 +85,7 @@ def test_few_vertices_of_an_unknown_shape_are_rough_and_their_own_derivative():
     ahead[-1] += 1e-4
     np.testing.assert_allclose(columns[-1].T, (few.vertices(ahead) - few.vertices(x)) / 1e-4, atol=1e-8)
     assert np.linalg.norm(few.vertices(x) - whole.vertices(x)[IDS], axis=1).max() < 0.02
-    held = few.held(x)
+    held = few.fix_shape(x)
     np.testing.assert_allclose(held.vertices(x[:held.n_angles + 3]), whole.vertices(x)[IDS], atol=1e-9)
 
 

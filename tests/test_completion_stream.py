@@ -297,7 +297,7 @@ def test_the_floor_is_found_whatever_axis_is_up(walker):
     turned = Floor.below(vertices @ rotations.exp(np.array([np.pi / 2, 0, 0])).T)  # z becomes -y
     assert turned.normal.tolist() == [0, -1, 0] and abs(turned.height - floor.height) < 1e-9
     with pytest.raises(ValueError, match="expected a normal and a height"):
-        Floor.given((0, 0, 0, 1))
+        Floor.from_numbers((0, 0, 0, 1))
 
 
 def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
@@ -305,13 +305,13 @@ def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
     body = MarkedBody(subject, layout, 0.3, 0.3)
     x = body.body.join(*motions["stand"])
     feet = FootContact(body, x, 60.0)
-    places = feet.held(x)
+    places = feet.target_positions(x)
     held = ~np.isnan(places[..., 0])
     assert held.all(axis=0).sum() >= 4 and (feet.floor.above(places[held]) > -1e-9).all()
     raised = x.copy()
     raised[:, -1] += 1
     floor = *feet.floor.normal, feet.floor.height
-    assert np.isnan(FootContact(body, raised, 60.0, floor).held(raised)).all()
+    assert np.isnan(FootContact(body, raised, 60.0, floor).target_positions(raised)).all()
 
 
 def test_a_motion_keeps_which_markers_were_trusted(tmp_path):

@@ -182,7 +182,7 @@ def test_a_set_is_mended_from_the_view(place):  # noqa: F811
     mend(page, place)
     page.handle(Message("register", {}), lambda message: None)
     wait_for(page)
-    app.returned(page)
+    app.on_return(page)
     assert app.entries[-1] is other and app.contents[app.shown[0]] is not before
     assert "set/body1" in [entry.name for entry in app.entries]
     assert len(app.entries) == 5 and len(app.shown) == 2 and not app.problems

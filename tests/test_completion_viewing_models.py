@@ -84,11 +84,11 @@ def test_a_dragged_vertex_follows_the_hand_and_the_rest_stays(model):
     start = drag.operator.evaluate(pose, trans)[0]
     target = start + [-0.05, 0.25, 0.1]
     for _ in range(4):
-        pose, trans = drag.moved(pose, trans, target)
+        pose, trans = drag.drag_to(pose, trans, target)
     assert np.linalg.norm(drag.operator.evaluate(pose, trans)[0] - target) < 0.01
     assert not pose[[0, 1]].any() and not trans.any()    # only the chain from the trunk turns
     for _ in range(30):
-        pose, trans = drag.moved(pose, trans, np.array([50.0, -30, 20]))
+        pose, trans = drag.drag_to(pose, trans, np.array([50.0, -30, 20]))
     assert np.isfinite(pose).all() and np.linalg.norm(pose, axis=1).max() <= np.pi + 1e-9
 
 
@@ -96,7 +96,7 @@ def test_the_trunk_moves_as_a_whole(model):
     body, pose = MovableBody(model), np.zeros((4, 3))
     vertex = int(np.flatnonzero(body.part_of_vertex == 0)[0])
     drag = Drag(body, vertex, np.zeros(3), pose)
-    turned, trans = drag.moved(pose, np.zeros(3), drag.operator.evaluate(pose)[0] + [0.1, 0.2, 0])
+    turned, trans = drag.drag_to(pose, np.zeros(3), drag.operator.evaluate(pose)[0] + [0.1, 0.2, 0])
     assert not turned.any() and np.allclose(trans, [0.1, 0.2, 0])
 
 

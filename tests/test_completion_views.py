@@ -49,7 +49,7 @@ def test_two_views_are_one_scan(body, views):
     np.testing.assert_array_equal(scan.points, np.vstack([points for points, _ in views]))
     np.testing.assert_array_equal(scan.index, np.arange(len(scan.points)))
     np.testing.assert_array_equal(np.bincount(scan.view), [len(points) for points, _ in views])
-    thin = scan.thinned(500)
+    thin = scan.thin(500)
     np.testing.assert_array_equal(scan.points[np.isin(scan.index, thin.index)], thin.points)
 
 
@@ -157,7 +157,7 @@ def test_a_scaled_body_in_metres_is_the_body(model):
     real, factor = scaled.in_metres(x)
     assert factor == pytest.approx(np.exp(-0.6 * LOOSE))
     np.testing.assert_allclose(inner.vertices(real), factor * scaled.vertices(x), atol=1e-12)
-    held = scaled.held(x)
+    held = scaled.fix_shape(x)
     np.testing.assert_allclose(held.vertices(x[:15]), scaled.vertices(x), atol=1e-6)
 
 
@@ -200,4 +200,4 @@ def test_meshes_and_their_viewpoints_are_scaled_together(body, views):
     np.testing.assert_allclose(small.points, here.points, atol=1e-12)
     np.testing.assert_allclose(small.normals, here.normals, atol=1e-9)
     np.testing.assert_allclose(small.viewpoints, here.viewpoints)
-    assert small.scaled(2).spacing == pytest.approx(2 * here.spacing)
+    assert small.scale_by(2).spacing == pytest.approx(2 * here.spacing)

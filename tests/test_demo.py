@@ -246,7 +246,7 @@ def test_a_set_with_more_scans_becomes_one_with_fewer(tmp_path, monkeypatch):
     held = []
 
     def prepared(names):
-        held.append(sorted(space.kept(chain.SCANS)))
+        held.append(sorted(space.list_results(chain.SCANS)))
         with space.staging("tables") as staged:
             (staged.folder / "set.csv").write_text("\n".join(names))
         for name in names:

@@ -39,7 +39,7 @@ def test_its_bodies_are_those_of_the_population(model, seed):
     shape = BodyShape.random(rng, ("female", "male")[seed % 2])
     person, subject = Person(shape), model.subject(np.array(shape.betas))
     for pose, most in ((np.zeros((16, 3)), 0.0008), (random_pose(rng), 0.006)):
-        truth = person.posed(pose)[kept]
+        truth = person.in_pose(pose)[kept]
         assert np.linalg.norm(fit_pose(subject, truth).vertices - truth, axis=1).mean() < most
 
 

@@ -132,7 +132,7 @@ def test_a_body_of_another_size_has_the_same_pose_and_betas(known):
     y, columns = points.columns(x)
     np.testing.assert_allclose(y, large.vertices(x)[ids], atol=1e-6)
     np.testing.assert_allclose(np.swapaxes(columns, 0, 2), differences(points.positions, x), atol=1e-6)
-    np.testing.assert_allclose(large.held(x).vertices(x[:person.n_angles + 3]), large.vertices(x), atol=1e-6)
+    np.testing.assert_allclose(large.fix_shape(x).vertices(x[:person.n_angles + 3]), large.vertices(x), atol=1e-6)
     own, factor = large.in_metres(x)
     np.testing.assert_allclose(person.vertices(own), factor * large.vertices(x), atol=1e-6)
 

@@ -45,7 +45,7 @@ def test_smoothness_is_a_thousandth_of_the_mean_edge(body):
     """[SCAPE] Eq. 5: w_s = 0.001 ρ, in the system and in what learning sets."""
     sides = np.unique(np.sort(body.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     rho = np.linalg.norm(body.vertices[sides[:, 0]] - body.vertices[sides[:, 1]], axis=1).mean()
-    for smoothness in (GradientSystem(body).smoothness, LearnConfig().smoothness, LearnConfig.published().smoothness):
+    for smoothness in (GradientSystem(body).smoothness, LearnConfig().smoothness, LearnConfig.from_paper().smoothness):
         assert GradientSystem(body, smoothness).w_s == pytest.approx(0.001 * rho)
         assert GradientSystem(body.with_vertices(2 * body.vertices), smoothness).w_s == pytest.approx(0.002 * rho)
 

@@ -107,7 +107,7 @@ def test_blended_points_are_sums_of_products():
     ours, ids = model.operator(None), rng.choice(len(x), (20, 3))
     np.testing.assert_allclose(ours.evaluate(poses, trans), dense.evaluate(poses, trans), rtol=0, atol=1e-12)
     weights = csr_array((rng.dirichlet(np.ones(3), 20).ravel(), ids.ravel(), 3 * np.arange(21)), (20, len(x)))
-    for a, b in zip(ours.combined(weights).jacobian(poses, trans), dense.combined(weights).jacobian(poses, trans),
+    for a, b in zip(ours.combine(weights).jacobian(poses, trans), dense.combine(weights).jacobian(poses, trans),
                     strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 

@@ -147,7 +147,7 @@ def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(tmp_path):
     somebody = Person(BodyShape.like("female", weight=0.8))
     template = decimate(somebody.mesh, 5000)
     place = Surface(somebody.mesh).closest(template.vertices)
-    scan = somebody.posed(find_pose("lunge_left")) @ exp(np.array([0.3, 1.4, 0.2])).T
+    scan = somebody.in_pose(find_pose("lunge_left")) @ exp(np.array([0.3, 1.4, 0.2])).T
     truth = np.einsum("nk,nkd->nd", place.bary, scan[somebody.mesh.faces[place.faces]])
     write_mesh(tmp_path / "scan.ply", somebody.mesh.with_vertices(scan))
     write_mesh(tmp_path / "template.ply", template)

@@ -100,7 +100,7 @@ def test_a_mix_takes_every_mesh_of_the_set(folder, tmp_path):
 def test_the_published_preset_learns_as_the_paper(folder, tmp_path, capsys):
     learn_set = ["learn", "--poses", str(folder / "set"), "--shapes", str(folder / "set"), "--preset", "published"]
     assert main([*learn_set, "-o", str(tmp_path / "m.npz")]) == 0
-    assert load_model(tmp_path / "m.npz").info["pruning"] == LearnConfig.published().prunings[0]
+    assert load_model(tmp_path / "m.npz").info["pruning"] == LearnConfig.from_paper().prunings[0]
     assert main([*learn_set, "-o", str(tmp_path / "n.npz"), "--kind", "skinning"]) == 2
     assert "--kind skinning: the paper of --preset published has SCAPE alone" in capsys.readouterr().err
 

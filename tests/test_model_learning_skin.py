@@ -85,7 +85,7 @@ def test_new_people_of_the_truth_are_met(truth, learned):
 def test_a_person_is_unposed_exactly(truth):
     rng = np.random.default_rng(4)
     for pose, betas in zip(random_poses(truth, 3, rng, 0.4), rng.normal(size=(3, 3)), strict=True):
-        back = truth.unposed(truth.vertices(pose, betas, rng.normal(size=3)), pose)
+        back = truth.unpose(truth.vertices(pose, betas, rng.normal(size=3)), pose)
         x = truth.rest_vertices(betas)
         at = truth.skeleton.joints[0] - (truth.joint_regressor @ x)[0]
         np.testing.assert_allclose(back, x + at, rtol=0, atol=1e-12)

@@ -75,7 +75,7 @@ def test_sums_over_the_poses_tell_least_squares_as_much_as_every_pose(model, fea
                             (X - X.mean(axis=0)).T @ flat)
     fitted = flat.mean(axis=0) + (X - X.mean(axis=0)) @ slope
     np.testing.assert_allclose(space.gradients(poses)[:, faces].reshape(25, -1), fitted, atol=5e-6)   # float32
-    seen = design.seen(poses)
+    seen = design.prepare(poses)
     np.testing.assert_allclose(seen.of_space(space), seen.sums(space.gradients(poses)), atol=1e-12)
 
 

@@ -161,7 +161,7 @@ def test_refuses_what_cannot_be(model):
     with pytest.raises(ValueError, match="not usable as a template"):
         change_resolution(model, Mesh(model.template.vertices, model.template.faces[:0]))
     with pytest.raises(ValueError, match="kind 'scape'"):
-        BodyModel.resampled(model, model.template, model.skeleton, 0, print)
+        BodyModel.resample(model, model.template, model.skeleton, 0, print)
 
 
 def test_gradients_of_edges_and_the_rest():

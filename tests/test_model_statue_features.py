@@ -206,7 +206,7 @@ def test_features_that_were_found_pose_and_warp_as_those_that_were_clicked(contr
     clicked = pose_by_features(control, joints, points)
     on_scan = control.mesh.with_vertices(clicked.features.vertices + [0.0, 0.0, 0.01])
     found = Features(joints, points, (), on_scan, clicked.features, None)
-    published = pose_automatically(control, found, StatueConfig.published().start == "registered")
+    published = pose_automatically(control, found, StatueConfig.from_paper().start == "registered")
     np.testing.assert_array_equal(published.start, clicked.start)
     assert published.face == len(FACE) and np.abs(published.start - clicked.features.vertices).max() > 0.01
     usual = pose_automatically(control, found, StatueConfig().start == "registered")
@@ -254,7 +254,7 @@ def test_the_unit_is_told_by_the_height(length, unit):
 def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_arm(control):
     person = Person(BodyShape.like("female", stature=1.62, weight=1.0))
     pose = compose(left_arm={"direction": (0.8, 0.5, -0.3), "elbow": 40}, back={"turn": 15}, right_leg={"knee": 20})
-    vertices, joints = person.posed(pose), person.posed_joints(pose)
+    vertices, joints = person.in_pose(pose), person.joints_in_pose(pose)
     rng = np.random.default_rng(4)
     centres = vertices[person.mesh.faces].mean(axis=1)
     keep = ~np.isin(person.part_of_face, [8, 9])                              # the right forearm and hand are hidden
@@ -284,7 +284,7 @@ def test_half_a_person_is_found_at_that_end(control):
     person = Person()
     centres = person.mesh.vertices[person.mesh.faces].mean(axis=1)
     found = find_features(control, person.mesh.submesh(centres[:, 2] > np.median(person.mesh.vertices[:, 2]))[0])
-    joints = person.posed_joints(np.zeros((16, 3)))
+    joints = person.joints_in_pose(np.zeros((16, 3)))
     assert found.problem is None and {"l_knee", "r_knee", "l_ankle", "r_ankle"} <= set(found.missing)
     for name, part in {"l_elbow": 5, "r_elbow": 8, "skullbase": 3}.items():
         assert np.linalg.norm(found.joints[name] - joints[part]) < 0.05, name

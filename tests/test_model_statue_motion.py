@@ -33,7 +33,7 @@ def scanned(turn=(0, 0, 0)):
     pose = people_motion(control, GENERIC, find_pose("lunge_left")[None]).poses[0]
     pose[0] = rotations.log(rotations.exp(np.array(turn, float)) @ rotations.exp(pose[0]))
     trans = np.array([2.0, -1.0, 0.5])
-    return control.fitted(control.rig.vertices(pose, trans), joint_places(control.skeleton, pose, trans)), pose
+    return control.refit(control.rig.vertices(pose, trans), joint_places(control.skeleton, pose, trans)), pose
 
 
 def world(control, motion):
@@ -252,7 +252,7 @@ def learned():
     coarse = worm(17, 6)
     near = Surface(model.template).closest(coarse.vertices)
     off = rng.uniform(-0.01, 0.02, len(coarse.vertices))[:, None] * coarse.vertex_normals
-    return subject, pose, trans, coarse.with_vertices(near.transferred(body.vertices, body.faces) + off)
+    return subject, pose, trans, coarse.with_vertices(near.transfer(body.vertices, body.faces) + off)
 
 
 def test_a_control_mesh_follows_a_model(learned):
@@ -280,13 +280,13 @@ def test_points_of_the_skin_follow_exactly_and_a_registered_scan_says_which(lear
     body = subject.template.with_vertices(subject.vertices(pose, trans))
     slid = body.with_vertices(body.vertices + [0.3, 0, 0])               # stands elsewhere than the model has it
     on = Surface(body).closest(control.vertices)
-    mesh = control.with_vertices(on.transferred(slid.vertices, body.faces))
+    mesh = control.with_vertices(on.transfer(slid.vertices, body.faces))
     follower = Follower(mesh, subject, pose, trans, slid.vertices)
     assert np.abs(follower.vertices(pose, trans) - mesh.vertices).max() < 1e-9
     straight = Follower(control.with_vertices(on.points), subject, pose, trans)
     poses = np.random.default_rng(5).normal(0, 0.3, (2, 4, 3))
     for t, x in enumerate(straight.vertices(poses)):
-        assert np.abs(x - on.transferred(subject.vertices(poses[t]), body.faces)).max() < 1e-9
+        assert np.abs(x - on.transfer(subject.vertices(poses[t]), body.faces)).max() < 1e-9
     off = follower.vertices(poses[0]) - straight.vertices(poses[0])
     assert np.abs(np.linalg.norm(off, axis=1) - 0.3).max() < 1e-9, "the offset turns with the skin"
     with pytest.raises(ValueError, match=r"registered: expected shape \(398, 3\)"):

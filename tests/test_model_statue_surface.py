@@ -47,7 +47,7 @@ def restored(shape, x, steps):
     K = shape.plane.T @ diags_array(shape.weights) @ shape.plane
     nearly = Factored(csc_array(K + 1e-6 * eye_array(shape.count)))
     for _ in range(steps):
-        x = x + conjugate_gradients(lambda d, x=x: shape.transposed(x, w * shape.derivative(x, d)) + 1e-9 * d,
+        x = x + conjugate_gradients(lambda d, x=x: shape.apply_transpose(x, w * shape.derivative(x, d)) + 1e-9 * d,
                                     -shape.gradient(x) / 2, nearly.solve, 200)
     return x
 
@@ -61,7 +61,7 @@ def test_every_similar_copy_of_the_rest_shape_is_at_rest(body):
     assert np.abs(shape.gradient(copy)).max() < 1e-12
     moved = body.vertices + 0.01 * np.random.default_rng(0).standard_normal(body.vertices.shape)
     assert shape.energy(2.5 * moved @ R.T + 1) == pytest.approx(2.5**2 * shape.energy(moved), rel=1e-9)
-    assert shape.published_force(moved @ R.T) == pytest.approx(shape.published_force(moved) @ R.T, abs=1e-12)
+    assert shape.paper_force(moved @ R.T) == pytest.approx(shape.paper_force(moved) @ R.T, abs=1e-12)
 
 
 def test_gradient_is_the_finite_difference_of_the_energy_and_the_published_force_is_not(body):
@@ -73,8 +73,8 @@ def test_gradient_is_the_finite_difference_of_the_energy_and_the_published_force
         ahead = slope(lambda s, d=d: shape.residuals(x + s * d))
         assert shape.derivative(x, d) == pytest.approx(ahead, abs=1e-6 * np.abs(ahead).max())
         r = rng.standard_normal(ahead.shape)
-        assert (shape.transposed(x, r) * d).sum() == pytest.approx((shape.derivative(x, d) * r).sum(), rel=1e-9)
-    exact, published = -shape.gradient(x) / 2, shape.published_force(x)
+        assert (shape.apply_transpose(x, r) * d).sum() == pytest.approx((shape.derivative(x, d) * r).sum(), rel=1e-9)
+    exact, published = -shape.gradient(x) / 2, shape.paper_force(x)
     assert np.abs(exact - published).max() > 0.1 * np.abs(exact).max()
     # With all frames held still it would be: the residual of each vertex, averaged over its frames.
     v = 17
@@ -109,7 +109,7 @@ def test_the_constraint_alone_takes_noise_away(body):
 
     y = noisy
     for _ in range(200):
-        y = y + 0.5 * shape.published_force(y)                # Eq. 12
+        y = y + 0.5 * shape.paper_force(y)                # Eq. 12
     assert shape.energy(y) < 0.02 * shape.energy(noisy)
     assert off(y) < 0.5 * off(noisy)
     assert off(restored(shape, noisy, 6)) < 1e-3 * off(noisy)

@@ -114,9 +114,9 @@ def test_run(place, tmp_path, capsys, quick):
 
 def test_the_published_preset_registers_a_folder(place, tmp_path, monkeypatch):
     """With a tenth of its nodes and rounds."""
-    paper = RegistrationConfig.published()
+    paper = RegistrationConfig.from_paper()
     few = replace(paper, graph=tuple(replace(s, nodes=s.nodes // 10, rounds=2) for s in paper.graph))
-    monkeypatch.setattr(RegistrationConfig, "published", lambda: few)
+    monkeypatch.setattr(RegistrationConfig, "from_paper", lambda: few)
     words = "run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set"
     assert run(*words, "--preset", "published") == 0
     assert report(tmp_path / "set" / "report.json")["distance to the scan, mean"] < 5

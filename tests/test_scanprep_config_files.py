@@ -54,7 +54,7 @@ class Outer(Settings):
     cleaning: Inner | None = None
 
     @classmethod
-    def published(cls):
+    def from_paper(cls):
         """As on paper.
 
         Not as there: nothing.
@@ -97,7 +97,7 @@ def test_a_flag_wins_over_the_file_and_the_file_over_the_preset(tmp_path, capsys
     path = config_file(tmp_path, rounds=5)
     assert run(["--config", path], capsys)[0].rounds == 5
     assert run(["--config", path, "--rounds", 7], capsys)[0].rounds == 7
-    assert run(["--preset", "published"], capsys)[0] == Outer.published()
+    assert run(["--preset", "published"], capsys)[0] == Outer.from_paper()
     assert run(["--preset", "published", "--config", config_file(tmp_path, share=0.75)], capsys)[0].share == 0.75
 
 
@@ -149,13 +149,13 @@ def test_every_command_writes_its_settings_and_reads_them_again(prog, tmp_path):
 
 
 @pytest.mark.parametrize("prog", [prog for prog in CALLS if hasattr(next(iter(settings_of(prog).values()), None),
-                                                                    "published")])
+                                                                    "from_paper")])
 def test_the_preset_of_every_command_is_in_force(prog):
     """Also where the command's own settings are not the usual ones, as the size of a statue's images is not."""
     values = settings_of(prog)
     found = command_line._Settings(values, ["--preset", "published"])
     name, usual = next(iter(values.items()))
-    paper = type(usual).published()
+    paper = type(usual).from_paper()
     own = {f.name for f in dataclasses.fields(usual) if getattr(usual, f.name) != getattr(type(usual)(), f.name)}
     assert found.presets and found.values[name] != usual and own <= {"displacement"}
     for field in dataclasses.fields(usual):

@@ -42,7 +42,7 @@ def test_a_point_projects_to_its_pixel():
 
 def test_a_pixel_of_a_halved_picture_is_the_middle_of_four():
     picture = DepthPicture.of(np.full((240, 320), 2.0), K)
-    small = picture.halved()
+    small = picture.halve()
     row, column = np.indices((120, 160))
     assert (small.depth == 2).all()
     np.testing.assert_allclose(small.directions(column, row), picture.directions(2 * column + 0.5, 2 * row + 0.5))
@@ -77,7 +77,7 @@ def test_the_person_is_found():
     found = find_person(DepthPicture.of(depth + noise * depth**2, K), SIZE)
     truth = (depth < 1.55)[::2, ::2]
     assert (found.mask & truth).sum() > 0.93 * truth.sum() and (found.mask & ~truth).sum() < 0.05 * truth.sum()
-    points, normals, edge = found.oriented_points()
+    points, normals, edge = found.points_and_normals()
     assert (np.einsum("nd,nd->n", points, normals) < 0).mean() > 0.99 and 0 < edge.mean() < 0.2
 
 

@@ -26,8 +26,8 @@ def half(request, person):
     angle = 137.5 * np.pi / 180 * request.param
     towards = np.array([np.cos(angle), np.sin(angle), 0.1])
     middle = person.corners.mean(axis=1)
-    hidden = Rays(person).occluded(middle + 1e-4 * towards, np.broadcast_to(towards / np.linalg.norm(towards),
-                                                                            middle.shape))
+    hidden = Rays(person).test_occlusion(middle + 1e-4 * towards, np.broadcast_to(towards / np.linalg.norm(towards),
+                                                                                  middle.shape))
     return person.submesh((person.face_normals @ towards > 0.15) & ~hidden)[0]
 
 

@@ -47,7 +47,7 @@ def test_a_surface_point_is_carried_with_its_triangle():
     mesh = ball()
     found = Surface(mesh).closest(RNG(1).normal(size=(50, 3)))
     A, t = RNG(2).normal(size=(3, 3)), np.array([1, 2, 3])
-    carried = found.transferred(mesh.vertices @ A.T + t, mesh.faces)
+    carried = found.transfer(mesh.vertices @ A.T + t, mesh.faces)
     np.testing.assert_allclose(carried, found.points @ A.T + t, atol=1e-12)
 
 
@@ -116,9 +116,9 @@ def test_rays_hit_a_ball_where_they_should(centre):
 def test_a_ray_reaches_only_so_far():
     mesh = ball(2)
     rays, origin, down = Rays(mesh), np.array([[0, 0, 2.0]]), np.array([[0, 0, -1.0]])
-    assert rays.occluded(origin, down, reach=1.6).all() and not rays.occluded(origin, down, reach=1.4).any()
+    assert rays.test_occlusion(origin, down, reach=1.6).all() and not rays.test_occlusion(origin, down, reach=1.4).any()
     assert rays.cast(origin, down)[1][0] == pytest.approx(1.5, abs=1e-5)
-    assert not rays.occluded(origin, -down).any()
+    assert not rays.test_occlusion(origin, -down).any()
 
 
 QUERIES = {
@@ -128,7 +128,7 @@ QUERIES = {
     "match, among": lambda bad: OrientedPoints(bad, np.zeros((3, 3))),
     "cast": lambda bad: Rays(ball()).cast(bad, np.array([0, 0, 1.0])),
     "cast, directions": lambda bad: Rays(ball()).cast(np.zeros((3, 3)), bad),
-    "occluded": lambda bad: Rays(ball()).occluded(bad, np.array([0, 0, 1.0])),
+    "occluded": lambda bad: Rays(ball()).test_occlusion(bad, np.array([0, 0, 1.0])),
     "inside": lambda bad: inside(ball(), bad)}
 
 

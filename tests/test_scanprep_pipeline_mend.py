@@ -136,7 +136,7 @@ def test_new_landmark_files_lie_where_the_run_reads_them(place):
     assert scan.file == place / "scans" / "body2.pp" and not scan.places
     app.call = Call(app.call.scans, app.call.template, place / "marks", config=app.call.config)
     task = next(task for task in Call.read(place / "set").tasks() if task.name == "body2")
-    assert app._clicked(task, ".pp").file == place / "marks" / "body2.pp"
+    assert app._load_clicked(task, ".pp").file == place / "marks" / "body2.pp"
 
 
 def test_a_set_is_mended_in_the_browser(new_page, place):

@@ -71,11 +71,11 @@ def test_a_finer_graph_goes_on_from_the_coarser_one():
 
 
 def test_the_published_registration_bends_the_body_too():
-    stages = RegistrationConfig.published().graph
+    stages = RegistrationConfig.from_paper().graph
     assert [stage.stretch for stage in stages] == sorted((stage.stretch for stage in stages), reverse=True)
     x = bent(crab(), LEFT / 2, RIGHT / 2)
     marks = np.array([820, 821, 9 * 20, 9 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
-    config = replace(RegistrationConfig.published(), graph=tuple(replace(s, nodes=150) for s in stages))
+    config = replace(RegistrationConfig.from_paper(), graph=tuple(replace(s, nodes=150) for s in stages))
     found = register(crab(), Mesh(x, crab().faces), (marks, x[marks]), config)
     apart, before = (np.linalg.norm(y - x, axis=1).mean() for y in (found.mesh.vertices, crab().vertices))
     assert apart < 0.02 and apart < 0.8 * before        # point to point, matches slide along the skin

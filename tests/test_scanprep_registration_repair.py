@@ -157,7 +157,7 @@ def test_what_needs_no_repair_stays(person, parts):
     assert repair_limbs(person.mesh, scan, right, parts, config=QUICK) is right
     assert repair_limbs(person.mesh, scan, wrong, None, config=QUICK) is wrong                  # an animal, say
     assert repair_limbs(person.mesh, scan, wrong, parts, config=replace(QUICK, rolls=0)) is wrong
-    assert not RegistrationConfig.published().rolls and RegistrationConfig().rolls
+    assert not RegistrationConfig.from_paper().rolls and RegistrationConfig().rolls
 
 
 def test_fewer_doubts_are_not_bought(person, parts):

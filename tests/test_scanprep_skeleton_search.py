@@ -62,9 +62,9 @@ def test_the_plane_of_a_person_is_found_in_any_direction_and_order(seed):
 def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
     body, bent = Person(), np.zeros((16, 3))
     bent[[4, 5, 10]] = [[0, -1.5, 0.4], [0, 0.8, 0.8], [-1.4, 0, 0]]
-    crooked = body.mesh.with_vertices(body.posed(bent))
+    crooked = body.mesh.with_vertices(body.in_pose(bent))
     alone = find_symmetry(crooked)
-    helped = find_symmetry(crooked, np.stack([body.posed(bent / 2), body.mesh.vertices, body.posed(-bent / 2)]))
+    helped = find_symmetry(crooked, np.stack([body.in_pose(bent / 2), body.mesh.vertices, body.in_pose(-bent / 2)]))
     assert not alone.holds and alone.pose == -1
     assert helped.holds and helped.pose == 1 and abs(helped.normal[0]) > 0.999
 
@@ -73,10 +73,10 @@ def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
 def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
     body, bent = Person(), np.zeros((16, 3))
     bent[[4, 5, 10]] = [[0, -1.0, 0.4], [0, 0.8, 0.8], [-1.2, 0, 0]]
-    poses = np.stack([body.mesh.vertices, body.posed(bent)])
+    poses = np.stack([body.mesh.vertices, body.in_pose(bent)])
     template = body.mesh.with_vertices(poses[1]) if crooked else body.mesh
     found = mirror_poses(template, poses, find_symmetry(template, poses))
-    wanted = np.stack([body.mesh.vertices, body.posed(mirror_pose(bent))])
+    wanted = np.stack([body.mesh.vertices, body.in_pose(mirror_pose(bent))])
     for one, other in zip(found, wanted, strict=True):
         R, t = rotations.procrustes(one, other)
         assert np.linalg.norm(one @ R.T + t - other, axis=1).max() < 0.01
@@ -87,7 +87,7 @@ def test_parts_that_moved_on_one_side_alone_are_found_on_both():
     bent = np.zeros((5, 16, 3))
     for part in ("forearm_left", "thigh_right", "head", "upper_arm_left"):
         bent[1:, body.names.index(part)] = rng.normal(0, 0.5, (4, 3))
-    poses = np.stack([body.posed(pose) for pose in bent])
+    poses = np.stack([body.in_pose(pose) for pose in bent])
     found = search_skeleton(body.mesh, poses, CONFIG)
     assert found.symmetric and part_partners(body.mesh, found.skeleton, found.symmetry) is not None
     # no knee bends in these poses, so a leg is one part

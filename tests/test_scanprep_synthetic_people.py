@@ -141,7 +141,7 @@ def test_joints_lie_inside_the_body(bodies):
     for person in bodies:
         pose = people.find_pose("run")
         for mesh, joints in ((person.mesh, person.joints),
-                             (person.mesh.with_vertices(person.posed(pose)), person.posed_joints(pose))):
+                             (person.mesh.with_vertices(person.posed(pose)), person.joints_in_pose(pose))):
             inside = igl.fast_winding_number(mesh.vertices, mesh.faces, np.ascontiguousarray(joints))
             assert (np.asarray(inside) > 0.5).all(), np.array(PARTS)[np.asarray(inside) < 0.5]
 
@@ -199,8 +199,8 @@ def test_turning_the_root_turns_the_body(man):
     turned[0] = rotations.log(R @ rotations.exp(pose[0]))
     expected = (man.posed(pose) - man.joints[0]) @ R.T + man.joints[0] + [1, 2, 3]
     assert np.abs(man.posed(turned, np.array([1.0, 2, 3])) - expected).max() < 1e-9
-    joints = (man.posed_joints(pose) - man.joints[0]) @ R.T + man.joints[0]
-    assert np.abs(man.posed_joints(turned) - joints).max() < 1e-9
+    joints = (man.joints_in_pose(pose) - man.joints[0]) @ R.T + man.joints[0]
+    assert np.abs(man.joints_in_pose(turned) - joints).max() < 1e-9
 
 
 def test_root_part_stays_centred(man):
@@ -247,13 +247,13 @@ def test_muscles_bulge_with_strength():
         biceps = masks()[:, COLUMNS["biceps", "l"]].argmax()
         rest = person.mesh.vertices[biceps] - person.joints[4]
         R = person.part_rotations(bent)[4]
-        moved = R.T @ (person.posed(bent)[biceps] - person.posed_joints(bent)[4])
+        moved = R.T @ (person.in_pose(bent)[biceps] - person.joints_in_pose(bent)[4])
         rises.append((moved - rest) @ person.mesh.vertex_normals[biceps])
     assert 0.004 < rises[0] < 0.02 and rises[1] > rises[0] + 0.002
 
 
 def test_raised_arms_raise_the_shoulders(man):
-    rest, up = man.posed_joints(np.zeros((16, 3))), man.posed_joints(people.find_pose("arms_up"))
+    rest, up = man.joints_in_pose(np.zeros((16, 3))), man.joints_in_pose(people.find_pose("arms_up"))
     assert 0.03 < up[4, 2] - rest[4, 2] < 0.10
     assert up[4, 2] == pytest.approx(up[7, 2], abs=1e-9)
 
@@ -278,7 +278,7 @@ def test_poses_are_many_and_unknown_ones_refused():
     with pytest.raises(ValueError, match="no pose 'cartwheel'"):
         people.find_pose("cartwheel")
     with pytest.raises(ValueError, match="pose: expected finite"):
-        Person().posed(np.zeros((15, 3)))
+        Person().in_pose(np.zeros((15, 3)))
 
 
 def test_random_poses_are_repeatable_varied_and_scale_with_spread():

@@ -136,7 +136,7 @@ def test_synthetic_scans_are_complete_repeatable_and_resumable(tmp_path):
         assert Surface(truth.mesh).closest(mesh.vertices).distances.mean() < 0.003
         assert truth.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
         person = Person(truth.shape)
-        assert np.abs(person.posed(truth.pose, truth.trans) - truth.vertices).max() < 1e-9
+        assert np.abs(person.in_pose(truth.pose, truth.trans) - truth.vertices).max() < 1e-9
         clicked = json.loads(entry.landmarks.read_text())
         errors = np.array([np.linalg.norm(point - truth.vertices[people.LANDMARKS[name]]) for name,
                            point in clicked.items()])

@@ -24,7 +24,7 @@ class Front(Clicks):
             raise ValueError("no such page")
         return self.page
 
-    def returned(self, app):
+    def on_return(self, app):
         self.back.append(app)
         if self.broken:
             raise ValueError("it cannot be read")

@@ -56,8 +56,8 @@ def moved(points):
 
 
 def app_of(folder, names=TEN, ending=".landmarks.json", scans=("anna.ply",)):
-    return PickApp(Clicked.found(folder / "template.ply", ending),
-                   [Clicked.found(folder / name, ending) for name in scans], names)
+    return PickApp(Clicked.load(folder / "template.ply", ending),
+                   [Clicked.load(folder / name, ending) for name in scans], names)
 
 
 def sent(app, kind, **fields):
@@ -171,8 +171,8 @@ def test_a_unit_that_was_told_is_that_of_the_file(folder, person, ending, unit):
     place = person.mesh.vertices[landmarks()["top of head"]]
     if unit is None and ending == ".txt":
         ending = ".landmarks.txt"
-    ben = Clicked.found(folder / "ben.ply", ending, unit)
-    app = PickApp(Clicked.found(folder / "template.ply", ending), [ben], TEN)
+    ben = Clicked.load(folder / "ben.ply", ending, unit)
+    app = PickApp(Clicked.load(folder / "template.ply", ending), [ben], TEN)
     click(app, place, "top of head")
     np.testing.assert_allclose(read_landmarks(ben.file, None, unit)["top of head"][2], place[2], atol=1e-3)
 

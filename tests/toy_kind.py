@@ -41,7 +41,7 @@ class ToyModel(BodyModel):
         own, *longer = (self._carried(x * scale) for scale in (np.ones(3), *0.05 * np.eye(3)))
         whole = ShapedProducts(Terms(self.features, np.arange(J), self.features.starts), own, own, np.array(longer),
                                self.skeleton.joints[0])
-        return whole.first(n_betas).combined(combination_weights(len(x), vertex_ids, weights))
+        return whole.first(n_betas).combine(combination_weights(len(x), vertex_ids, weights))
 
     def _carried(self, x):
         """(J, 3, N) what each part carries of vertices (N, 3), about joints that follow them, the root's in place."""
@@ -51,7 +51,7 @@ class ToyModel(BodyModel):
         ring, share = self.skeleton.joint_weights(self.template, 0)
         return np.swapaxes(T - np.einsum("n,jnd->jd", share, T[:, ring])[:, None], 1, 2)
 
-    def resampled(self, template, skeleton, rounds, progress):
+    def resample(self, template, skeleton, rounds, progress):
         weights = np.maximum(Follower(self.template, template).values(self.weights), 0)
         return replace(self, template=template, skeleton=skeleton, weights=weights / weights.sum(axis=1)[:, None])
 
@@ -59,5 +59,5 @@ class ToyModel(BodyModel):
         return {"weights": self.weights}
 
     @classmethod
-    def restored(cls, parts, features, header, arrays):
+    def restore(cls, parts, features, header, arrays):
         return cls(weights=storage.numbers(arrays, "weights", None, None), **parts)

@@ -134,7 +134,7 @@ class Demo:
             done = self.space.run(ScanPerson(self.config.seed, self.scanner), tasks, progress=progress)
         if done.failures:
             raise ValueError("; ".join(done.failures.values()))
-        for name in set(self.space.kept(SCANS)) - set(done.values):         # of a run with more scans
+        for name in set(self.space.list_results(SCANS)) - set(done.values):         # of a run with more scans
             self.space.drop(name)
         scans = [replace(done.values[task.name], folder=self.folder / "scans") for task in tasks]
         rows = [(s.name, s.subject, s.pose, s.sex) for s in scans]
@@ -194,7 +194,7 @@ class Demo:
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
         with workspace(self.folder / "set", self.space.force) as space:
-            stale = set(space.kept(SCANS)) - {SCANS + task.name for task in tasks}
+            stale = set(space.list_results(SCANS)) - {SCANS + task.name for task in tasks}
             if stale:                                           # first what tells of them
                 space.drop("tables")
             for name in stale:
@@ -245,7 +245,7 @@ class Demo:
         rng = np.random.default_rng([self.config.seed, 7])
         return [stand(self.person, random_pose(rng)) for _ in range(self.config.held_out)]
 
-    def fitted(self, wanted: np.ndarray) -> np.ndarray:
+    def fit_pose(self, wanted: np.ndarray) -> np.ndarray:
         """The model's vertices (N, 3) in the pose that comes closest to `wanted` (N, 3)."""
         return fit_pose(self.subject, wanted).vertices
 
@@ -284,7 +284,7 @@ class Demo:
     def walk(self) -> tuple[MarkerSequence, MarkerLayout, np.ndarray]:
         """Markers of a walking subject, where they sit on the template, and the true vertices (T, N, 3)."""
         poses, trans = walk(self.config.frames, self.config.rate)
-        bodies = np.stack([self.person.posed(pose, place) for pose, place in zip(poses, trans, strict=True)])
+        bodies = np.stack([self.person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
         template, config = self.template, self.config
 
         def make(folder: Path) -> None:

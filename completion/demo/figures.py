@@ -27,7 +27,7 @@ def figures(demo: Demo) -> list[Metric]:
     template, at = demo.template, demo.truth_map
     # poses that the model never saw
     wanted = [at.vertices(truth) for truth in demo.held_out]
-    error = [mean_over_area(distance(demo.fitted(w), w), template) for w in wanted]
+    error = [mean_over_area(distance(demo.fit_pose(w), w), template) for w in wanted]
     rows = [Metric(f"model: {len(wanted)} poses it never saw, mean error", MM * float(np.mean(error)), "mm")]
     # the half view
     done, (half, _, truth) = demo.completion, demo.half_scan
@@ -40,7 +40,7 @@ def figures(demo: Demo) -> list[Metric]:
              Metric("completion: share of the body that was seen", 100 * float(seen.mean()), "%", detail=True)]
     # the walk
     motion, (_, _, bodies), faces = demo.motion, demo.walk, demo.person.mesh.faces
-    walked = [distance(body, at.places.transferred(true_body, faces))
+    walked = [distance(body, at.places.transfer(true_body, faces))
               for body, true_body in zip(motion.vertices(demo.subject), bodies, strict=True)]
     rows += [Metric("animation: mean error", MM * mean_over_area(np.mean(walked, axis=0), template), "mm"),
              Metric("animation: markers to their place on the body, mean", MM * float(np.nanmean(motion.residuals)),
@@ -72,5 +72,5 @@ def judge(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
     values = {metric.name: float(metric.value) for metric in metrics if not isinstance(metric.value, str)}
     doubts = [f"{name}: {value:.1f} mm" for name, value in values.items() for stage, limit in LIMITS.items()
               if name.startswith(f"{stage}: ") and value > limit]
-    return of_results.joined(Judgement.of(check=[
+    return of_results.merge(Judgement.of(check=[
         *([f"no part is called {', '.join(lacking)}"] if lacking else []), *doubts]))

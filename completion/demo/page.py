@@ -135,7 +135,7 @@ def _poses(demo: Demo, page: Page) -> None:
     panes = []
     for truth in demo.held_out:
         wanted = demo.truth_map.vertices(truth)
-        found = demo.fitted(wanted)
+        found = demo.fit_pose(wanted)
         error = distance(found, wanted)
         off = Heat(error, 0, 3 * FAR, "distance of corresponding points")
         panes += [_pane(demo, truth.mesh, found, "truth"),

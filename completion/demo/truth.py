@@ -28,7 +28,7 @@ class TruthMap:
 
     def vertices(self, truth: GroundTruth) -> np.ndarray:
         """True places (N, 3) of the template's vertices, metres."""
-        return self.places.transferred(truth.vertices, truth.faces)
+        return self.places.transfer(truth.vertices, truth.faces)
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ class Alternation:
     def _components(self) -> np.ndarray:
         return np.ascontiguousarray(self.model.shape_space.components)
 
-    def posed(self, R: np.ndarray) -> np.ndarray:
+    def deform_edges(self, R: np.ndarray) -> np.ndarray:
         """`Q v̂` (F, 2, 3) for rotations (J, 3, 3), from the joint angles between them."""
         Q = self.model.pose_space.gradients(self.skeleton.pose_of(R))
         return self.v_hat @ np.swapaxes(Q, -1, -2)
@@ -84,38 +84,38 @@ class Alternation:
         """S (F, 3, 3); a model without components means the template's own body."""
         return self.model.shape_space.gradients(betas if len(betas) else None)
 
-    def predicted(self, R: np.ndarray, betas: np.ndarray) -> np.ndarray:
+    def predict(self, R: np.ndarray, betas: np.ndarray) -> np.ndarray:
         """The minimum Ŷ (N, 3) of E_H, the root's joint in the origin."""
         turned = R[self.part] @ self.shape(betas)
-        return self.model.stitching.stitch(self.posed(R) @ np.swapaxes(turned, -1, -2))
+        return self.model.stitching.stitch(self.deform_edges(R) @ np.swapaxes(turned, -1, -2))
 
-    def rotated(self, now: Blocks, w_T: float) -> Blocks:
+    def solve_rotations(self, now: Blocks, w_T: float) -> Blocks:
         """R for fixed Y and betas, Q held, neighbouring twists damped.
 
         [SCAPE] Eq. 11
         """
-        e = self.posed(now.R) @ np.swapaxes(now.R[self.part] @ self.shape(now.betas), -1, -2)
+        e = self.deform_edges(now.R) @ np.swapaxes(now.R[self.part] @ self.shape(now.betas), -1, -2)
         t = solve_twists(self.skeleton, self.part, e, edges(now.Y, self.model.template.faces), w_T)
         return Blocks(rotations.exp(t) @ now.R, now.Y, now.betas)
 
-    def stretched(self, now: Blocks, markers: Markers) -> Blocks:
+    def solve_vertices(self, now: Blocks, markers: Markers) -> Blocks:
         """Y for fixed R and betas.
 
         [SCAPE] Eq. 10
         """
         L = len(markers.vertices)
         pick = csr_array((np.ones(L), (np.arange(L), markers.vertices)), shape=(L, len(now.Y)))
-        Y = self.surface.solve(self.predicted(now.R, now.betas), pick, markers.points, markers.weights)
+        Y = self.surface.solve(self.predict(now.R, now.betas), pick, markers.points, markers.weights)
         return Blocks(now.R, Y, now.betas)
 
-    def shaped(self, now: Blocks) -> Blocks:
+    def solve_shape(self, now: Blocks) -> Blocks:
         """Betas for fixed R and Y: a quadratic function in which R cancels.
 
         [SCAPE] §6
         """
         if not len(now.betas):
             return now
-        q = np.swapaxes(self.posed(now.R), -1, -2)                                                   # (F, 3, 2)
+        q = np.swapaxes(self.deform_edges(now.R), -1, -2)                                                   # (F, 3, 2)
         U = (self._components @ q.astype(self._components.dtype)).reshape(len(now.betas), -1)
         wanted = np.swapaxes(edges(now.Y, self.model.template.faces) @ now.R[self.part], -1, -2)      # Rᵀ v
         left = (wanted - self.model.shape_space.mean @ q).reshape(-1)
@@ -128,7 +128,7 @@ class Alternation:
 
         [SCAPE] Eq. 10
         """
-        e = self.posed(now.R) @ np.swapaxes(now.R[self.part] @ self.shape(now.betas), -1, -2)
+        e = self.deform_edges(now.R) @ np.swapaxes(now.R[self.part] @ self.shape(now.betas), -1, -2)
         off = now.Y[markers.vertices] - markers.points
         return float(((e - edges(now.Y, self.model.template.faces))**2).sum()
                      + (markers.weights * (off**2).sum(axis=1)).sum())
@@ -171,9 +171,9 @@ def solve_in_turns(model: ScapeModel, surface_weight: float, fit: ScanFit, few: 
     reaches = np.geomspace(REACH, FINAL_REACH, rounds)
     for i, reach in enumerate([*reaches, *[FINAL_REACH] * rounds]):
         markers, before = nearest_markers(fit, surface_weight, model.template.with_vertices(now.Y), reach), now.Y
-        now = steps.rotated(now, config.twist_weight)               # [SCAPE] Eq. 11
-        now = steps.stretched(now, markers)                         # [SCAPE] Eq. 10
-        now = steps.shaped(now)                                     # [SCAPE] §6
+        now = steps.solve_rotations(now, config.twist_weight)               # [SCAPE] Eq. 11
+        now = steps.solve_vertices(now, markers)                         # [SCAPE] Eq. 10
+        now = steps.solve_shape(now)                                     # [SCAPE] §6
         shift = float(np.sqrt(((now.Y - before)**2).sum(axis=1).mean()))
         tell(min(1 + i // MORE, config.rounds))
         if i >= rounds and shift < SETTLED / MORE:

@@ -137,7 +137,7 @@ def views_with_colors(scan: View | Sequence[View], viewpoint: object = None, met
             continue
         found_camera = None if cameras is not None else find_camera(prepare_scan(view))
         camera = cameras[i] if cameras is not None else None if found_camera is None else found_camera.viewpoint
-        found.append(ColoredView(view, camera, None if texture is None else texture.scaled(metres)))
+        found.append(ColoredView(view, camera, None if texture is None else texture.scale_by(metres)))
     if not found:
         raise ValueError("scan: expected colours at its points, found none")
     return found

@@ -167,7 +167,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     tell(2, total)
     solved = solve(fit, few, x, lambda done: tell(2 + done, total))       # [SCAPE] Eq. 10, Eq. 11
     x, factor = fit.body.in_metres(solved.x)
-    given, open_error = given.scaled(factor), factor * posterior_error(fit.body, solved.x, fit.precision(solved.x))
+    given, open_error = given.scale_by(factor), factor * posterior_error(fit.body, solved.x, fit.precision(solved.x))
     predicted = person.template.with_vertices(person.vertices(x))
     cloud = fit.without_ignored(given.cloud, predicted)
     completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
@@ -191,7 +191,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     found += beyond_closed(scan, completed) if isinstance(scan, Mesh) and not config.free_scale else []
     judgement = Judgement.of(problems, found)
     if isinstance(body, BodyModel):
-        judgement = judgement.joined(person_judgement(body, betas))
+        judgement = judgement.merge(person_judgement(body, betas))
     return replace(done, judgement=judgement)
 
 
@@ -267,7 +267,7 @@ def find_stray(fit: ScanFit, x: np.ndarray) -> list[str]:
     if fit.cloud.person is None:
         return []
     entered = free_space_violation(fit.data.cameras, fit.mesh(x).vertices[fit.sample.matched]).excess > 0
-    lost, found = fit.unexplained(x, fit.thin), []
+    lost, found = fit.find_unexplained(x, fit.thin), []
     if lost.mean() > LOST_LIMB:
         found.append(f"{100 * lost.mean():.1f}% of what was seen of the person has no body near")
     if entered.mean() > ENTERED:

@@ -25,9 +25,9 @@ class Given:
     points: np.ndarray      # (L, 3), metres, the landmarks
     metres: float = 1.0     # of one unit of the scan as it was given
 
-    def scaled(self, factor: float) -> Given:
+    def scale_by(self, factor: float) -> Given:
         """All lengths times a factor."""
-        return replace(self, cloud=self.cloud.scaled(factor), points=factor * self.points,
+        return replace(self, cloud=self.cloud.scale_by(factor), points=factor * self.points,
                        metres=factor * self.metres)
 
 
@@ -46,7 +46,7 @@ def in_metres(body: FixedBody, scan: Scan, landmarks: tuple[np.ndarray, np.ndarr
         vertices, points = check_landmarks((landmarks[0], metres * np.asarray(landmarks[1])), body.template)
     given = Given(prepare_scan(scan, config.viewpoint, masked, metres), vertices, points, metres)
     if config.free_scale and len(vertices):
-        return given.scaled(landmark_scale(body, vertices, points, config))
+        return given.scale_by(landmark_scale(body, vertices, points, config))
     return given
 
 

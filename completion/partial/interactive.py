@@ -82,17 +82,17 @@ class CompleteApp(PickApp):
         self.can_choose = model.n_betas > 0
         template = Clicked(Path(work.model), output / "template.landmarks.json", surface=Clickable(model.template))
         marks = far_apart_first({name: model.template.vertices[vertex] for name, vertex in work.marks.items()})
-        super().__init__(template, [self._clicked(path) for path in scans], labels, fixed=marks)
+        super().__init__(template, [self._load_clicked(path) for path in scans], labels, fixed=marks)
 
-    def _clicked(self, path: Path) -> Clicked:
+    def _load_clicked(self, path: Path) -> Clicked:
         """A scan; of one that was dropped the landmarks are saved with the results."""
         file = self.output / (name_of(path) + ENDING) if self.dropped.holds(path) else None
-        one = Clicked.found(path, ENDING, self.work.unit, file if file and file.exists() else None)
+        one = Clicked.load(path, ENDING, self.work.unit, file if file and file.exists() else None)
         one.file = file or one.file
         one.surface = self._surface(path)
         return one
 
-    def _given(self, path: Path) -> ScanFiles | DepthPicture:
+    def _load_input(self, path: Path) -> ScanFiles | DepthPicture:
         """What is in a file, read when it is first wanted."""
         if path not in self._read:
             self._read[path] = read_picture([path], self.work.unit) or read_views([path], self.work.unit)
@@ -100,7 +100,7 @@ class CompleteApp(PickApp):
 
     def _surface(self, path: Path) -> Clickable | None:
         """The first view of a scan; a depth picture has its own way to be shown."""
-        given = self._given(path)
+        given = self._load_input(path)
         if not isinstance(given, ScanFiles):
             return None
         view = given.views[0]
@@ -111,7 +111,7 @@ class CompleteApp(PickApp):
 
     def _files(self, path: Path, pairs: tuple[np.ndarray, np.ndarray] | None) -> ScanFiles:
         """The views of a scan; of a depth picture the person in it, whom landmarks tell from others."""
-        given = self._given(path)
+        given = self._load_input(path)
         return given if isinstance(given, ScanFiles) else person_in(given, self.model.template, pairs)
 
     # what the page is sent
@@ -131,7 +131,7 @@ class CompleteApp(PickApp):
             return None
         return completion_panes(list(made.files.views), made.completion, self.model.template, made.masked)[-1]
 
-    def _masked(self, scan: Clicked, files: ScanFiles) -> np.ndarray | None:
+    def _read_masks(self, scan: Clicked, files: ScanFiles) -> np.ndarray | None:
         masks = self._inputs(scan).masks
         return read_masks(masks, files, self.work.unit) if masks else None
 
@@ -147,7 +147,7 @@ class CompleteApp(PickApp):
         out["completed"] = {
             "verdict": judgement.verdict, "reasons": list(judgement.reasons), "landmarks": len(made.places),
             "rows": [[m.name, m.text(), m.unit] for m in self._figures(made)],
-            "outdated": self._outdated(made), "helpful": helpful(made.completion, self.work.marks, made.places),
+            "outdated": self._is_outdated(made), "helpful": helpful(made.completion, self.work.marks, made.places),
             "saved": str(saved.absolute() / COMPLETED) if saved else ""}
         return out
 
@@ -156,7 +156,7 @@ class CompleteApp(PickApp):
         pairs = pairs_of(made.places, self.work.marks)
         return figures(self.work, self._inputs(self.scan), made.completion, pairs, made.masked)
 
-    def _outdated(self, made: Made) -> bool:
+    def _is_outdated(self, made: Made) -> bool:
         """Whether landmarks, or anything else that it was made from, were changed since."""
         assert self.scan is not None
         now = {name: self.scan.places[name] for name in self._usable(self.scan)}
@@ -207,7 +207,7 @@ class CompleteApp(PickApp):
     def take(self, path: Path) -> None:
         """Show one more scan, or the same anew in its place."""
         self._read.pop(path, None)
-        one = self._clicked(path)
+        one = self._load_clicked(path)
         _ = one.shown                                            # what cannot be shown is refused
         with self._lock:
             known = [i for i, other in enumerate(self.scans) if other.path == path]
@@ -241,7 +241,7 @@ class CompleteApp(PickApp):
         def work(tell: Callable[[int, int], None]) -> str:
             begin, pairs = time.perf_counter(), pairs_of(places, self.work.marks)
             files = self._files(scan.path, pairs)
-            done, masked = self._found(scan, files, known, pairs, tell, start)
+            done, masked = self._find_body(scan, files, known, pairs, tell, start)
             with self._lock:
                 self.made[scan.path] = Made(done, files, time.perf_counter() - begin, places, known, masked)
                 self.saved.pop(scan.path, None)
@@ -260,7 +260,7 @@ class CompleteApp(PickApp):
 
         def work(tell: Callable[[int, int], None]) -> str:
             files = self._files(scan.path, pairs_of(places, self.work.marks))
-            done, _ = self._found(scan, files, known, None, tell)
+            done, _ = self._find_body(scan, files, known, None, tell)
             if done.judgement.verdict == "failed":
                 return "the body is not found without landmarks either"
             with self._lock:
@@ -271,11 +271,11 @@ class CompleteApp(PickApp):
 
         self.beside("finding the body without the landmarks", work, send, "it could not be found")
 
-    def _found(self, scan: Clicked, files: ScanFiles, known: bool, pairs: tuple[np.ndarray, np.ndarray] | None,
-               tell: Callable[[int, int], None], start: Completion | None = None
-               ) -> tuple[Completion, np.ndarray | None]:
+    def _find_body(self, scan: Clicked, files: ScanFiles, known: bool, pairs: tuple[np.ndarray, np.ndarray] | None,
+                   tell: Callable[[int, int], None], start: Completion | None = None
+                   ) -> tuple[Completion, np.ndarray | None]:
         """The body in a scan, and its points that are clothing or hair."""
-        given, masked = self._given(scan.path), self._masked(scan, files)
+        given, masked = self._load_input(scan.path), self._read_masks(scan, files)
         views = list(given.views) if isinstance(given, ScanFiles) else given
         return complete(self._body(known), views, pairs, self.work.config, tell, masked, start), masked
 

@@ -56,13 +56,13 @@ class CompletionsApp(ResultsApp, CompleteApp):
         super().__init__(model, self.plain, [self.tasks[name].given.scans[0] for name in worst], output)
         self._bring()
 
-    def _clicked(self, path: Path) -> Clicked:
+    def _load_clicked(self, path: Path) -> Clicked:
         """A scan with the landmarks that the command reads, or will; a file that cannot be read holds none."""
         found, unit = self.tasks[self._name_of[path]].given.landmarks, self.plain.unit
         if found is None:
             return Clicked(path, (self.call.landmarks or path.parent) / (self._name_of[path] + ENDING), unit)
         try:
-            return Clicked.found(path, ENDING, unit, found)
+            return Clicked.load(path, ENDING, unit, found)
         except ValueError:
             return Clicked(path, found, unit)
 
@@ -91,7 +91,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
         places = {name: scan.places[name] for name in self._usable(scan)}
         known = done.betas is None or isinstance(self.plain.body, Subject)
         files = self._files(scan.path, pairs_of(places, self.work.marks))
-        self.made[scan.path] = Made(done, files, 0.0, places, known, self._masked(scan, files),
+        self.made[scan.path] = Made(done, files, 0.0, places, known, self._read_masks(scan, files),
                                     not self._space.is_done(self.plain, task))
         if scan.surface is None:
             scan.surface = self._surface(scan.path)
@@ -138,7 +138,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
 
     def _save(self, scan: Clicked, made: Made) -> None:
         """Write what the command would have written, so that it counts as done there; and the folder's page anew."""
-        if self._outdated(made):
+        if self._is_outdated(made):
             raise ValueError("it has changed since: complete again, then save")
         if scan.path in self.saved:
             raise ValueError("it is saved: nothing has changed since")

@@ -42,10 +42,10 @@ class ScaledBody(FixedBody):
         self.left_out_error = inner.left_out_error
         self.subject = inner.subject
 
-    def held(self, x: np.ndarray) -> FixedBody:
+    def fix_shape(self, x: np.ndarray) -> FixedBody:
         """The body with the shape and size it has at x (P,), as one of known shape."""
-        subject = self.inner.held(x[:-1]).subject
-        return self._of(replace(subject, operator=subject.operator.scaled(float(np.exp(-LOOSE * x[-1])))))
+        subject = self.inner.fix_shape(x[:-1]).subject
+        return self._of(replace(subject, operator=subject.operator.scale_by(float(np.exp(-LOOSE * x[-1])))))
 
     def some(self, ids: np.ndarray) -> FixedBody:
         return ScaledBody(self.inner.some(ids))

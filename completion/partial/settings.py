@@ -39,7 +39,7 @@ class CompletionConfig(ScanFitConfig):
     tolerance: float = 0.01
 
     @classmethod
-    def published(cls) -> CompletionConfig:
+    def from_paper(cls) -> CompletionConfig:
         """The paper's way: a few markers become correspondences, then rotations, surface and shape in turns.
 
         Not as in the paper: the start is the best of several, from landmarks, typical poses and limbs held otherwise.

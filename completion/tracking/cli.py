@@ -87,7 +87,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     judgement = Judgement.of(wrong_size(found, person) or tracking_problem(motion),
                              tracking_doubts(motion, loaded.template))
     if not isinstance(body, Subject):
-        judgement = judgement.joined(person_judgement(loaded, motion.betas))
+        judgement = judgement.merge(person_judgement(loaded, motion.betas))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
                    judgement=judgement)
 

@@ -69,7 +69,7 @@ class FrameFit:
         for i in range(self.config.rounds):
             now, at = few if i < ROUGH else fit, x[None]
             places = now.skin(x).places
-            frame = by_rotations(now.matched_at(x, fit.cloud, _reach(i)).equations(at).dense, at, n)
+            frame = by_rotations(now.match_at(x, fit.cloud, _reach(i)).equations(at).dense, at, n)
             off = step_between(goal, at, n)
             step, _ = Dense(frame.energy + (off**2) @ held, frame.gradient + held * off,
                             frame.hessian + np.diag(held)).step(DAMPING)
@@ -97,7 +97,7 @@ def fit_shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarr
     fits = [scan_fit(ShapedBody(body.model), cloud, *NOTHING, config.scan) for cloud in clouds]
     rows = np.concatenate([x, np.tile(betas, (len(x), 1))], axis=1)
     for i in range(4):  # matchings of the frames that tell the shape
-        each = [one.matched_at(row, one.thin, _reach(i)).equations(row[None]).dense
+        each = [one.match_at(row, one.thin, _reach(i)).equations(row[None]).dense
                 for one, row in zip(fits, rows, strict=True)]
         together = Dense(*(np.concatenate(part) for part in zip(*each, strict=True)))
         shape = normal_equations([energy.shape_prior(rows[:1, x.shape[1]:], 0)])

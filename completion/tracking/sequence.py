@@ -186,11 +186,11 @@ class Tracker:
         cloud = prepare_frame(frame, config.frame_points, config.normal_points, self.viewpoints,
                               None if expected is None else self._mesh(expected))
         if expected is None and cloud is None:
-            self.state = replace(state, number=state.number + 1, kept=(*state.kept, self._tracked(state.number)))
+            self.state = replace(state, number=state.number + 1, kept=(*state.kept, self._track_frame(state.number)))
             return []
         found = None if cloud is None else self._begin(cloud) if expected is None else self._follow(cloud, expected)
         good = found is not None and (expected is None or self._fitter(cloud).good(found))
-        tracked = self._tracked(state.number, found.x if found is not None and good else expected, found, cloud)
+        tracked = self._track_frame(state.number, found.x if found is not None and good else expected, found, cloud)
         self.state = replace(self.state, number=state.number + 1, lost=0 if tracked.found else state.lost + 1,
                              past=(tracked.x, *state.past)[:2], kept=(*state.kept, tracked),
                              random_state=self._random_state())
@@ -252,23 +252,23 @@ class Tracker:
         self.state = replace(self.state, shape_known=True)
         if not seen:
             return
-        chosen = spread_poses(np.stack([self._known().vertices(x) for x, _ in seen]), self.config.shape_views)
+        chosen = spread_poses(np.stack([self._subject_so_far().vertices(x) for x, _ in seen]), self.config.shape_views)
         betas, _ = fit_shared_shape(self.person, [seen[i][1] for i in chosen], np.stack([seen[i][0] for i in chosen]),
                                     before, self.config)
         self._has_shape(betas)
-        kept = tuple(self._refined(f) for f in self.state.kept)
+        kept = tuple(self._refine(f) for f in self.state.kept)
         self.state = replace(self.state, kept=kept, past=tuple(f.x for f in kept[:-3:-1]),
                              random_state=self._random_state())
 
-    def _refined(self, frame: TrackedFrame) -> TrackedFrame:
+    def _refine(self, frame: TrackedFrame) -> TrackedFrame:
         if frame.cloud is None or not frame.found:
             return frame
         fitter = self._fitter(frame.cloud)
         found = fitter.refine(fitter.scan.on(frame.cloud), frame.x, frame.x)
-        return self._tracked(frame.number, found.x, found, frame.cloud)
+        return self._track_frame(frame.number, found.x, found, frame.cloud)
 
-    def _tracked(self, number: int, x: np.ndarray | None = None, found: Refined | None = None,
-                 cloud: ScanPoints | None = None) -> TrackedFrame:
+    def _track_frame(self, number: int, x: np.ndarray | None = None, found: Refined | None = None,
+                     cloud: ScanPoints | None = None) -> TrackedFrame:
         """A frame; what its data say is left out where it is lost, and x is zero before the body was seen."""
         size = self.person.n_angles + 3
         out = TrackedFrame(number, np.zeros(size) if x is None else x, False, np.nan, 0.0, np.zeros(size),
@@ -284,7 +284,7 @@ class Tracker:
         if isinstance(self.person, ShapedBody):
             self.resume(replace(self.state, betas=betas, random_state=None))
 
-    def _known(self) -> FixedBody:
+    def _subject_so_far(self) -> FixedBody:
         if self._body is None:
             self._body = FixedBody(self.person.model.subject(self.state.betas)) \
                 if isinstance(self.person, ShapedBody) else self.person
@@ -293,7 +293,7 @@ class Tracker:
     def _fitter(self, cloud: ScanPoints | None) -> FrameFit:
         if self._fit is None:
             assert cloud is not None, "the first fit is of a frame that shows something"
-            self._fit = FrameFit(self._known(), cloud, self.config, self.rate)
+            self._fit = FrameFit(self._subject_so_far(), cloud, self.config, self.rate)
             if self.state.random_state is not None:
                 self._fit.scan.rng.bit_generator.state = self.state.random_state
         return self._fit
@@ -302,4 +302,4 @@ class Tracker:
         return self.state.random_state if self._fit is None else dict(self._fit.scan.rng.bit_generator.state)
 
     def _mesh(self, x: np.ndarray) -> Mesh:
-        return self.person.template.with_vertices(self._known().vertices(x))
+        return self.person.template.with_vertices(self._subject_so_far().vertices(x))

@@ -81,7 +81,7 @@ class ViewApp(Things):
                          "about": self.about.get(i, "")} for i, entry in enumerate(self.entries)],
             "notes": list(self._notes), "problems": list(self.problems.values()),
             "saved": [str(path) for path in self.written], "note": self.note, "working": self.working,
-            "pages": self.inside.offered(self.entries),
+            "pages": self.inside.list_buttons(self.entries),
             "parts": list(sliders.turns), "models": [{"pane": one.pane, "layer": one.layer, "name": one.name}
                                                      for one in sliders.shown],
             **self._where()}, latest="state")
@@ -117,9 +117,9 @@ class ViewApp(Things):
         finally:
             self.working = None
 
-    def returned(self, app: App) -> None:
+    def on_return(self, app: App) -> None:
         """What a page has written joins the things that are shown."""
-        for folder in self.inside.written(app):
+        for folder in self.inside.folders_written(app):
             if folder not in self.files.folders(self.entries):
                 self.written.append(folder)
             self.join(folder)
@@ -144,9 +144,9 @@ class ViewApp(Things):
         self.controls.take(bodies)
         self._positions = {}
         for one in self.controls.shown:
-            self._moved(one)
+            self._vertices_now(one)
 
-    def _moved(self, one: Shown) -> Message:
+    def _vertices_now(self, one: Shown) -> Message:
         """Where the vertices of a body are now."""
         body = one.body
         y, shift = self.controls.vertices(body), (body.origin - self.cameras[one.pane].target).astype(np.float32)
@@ -164,7 +164,7 @@ class ViewApp(Things):
         if (move := MOVES.get(message.kind)) is not None:
             move(self.controls, **message.fields)
             for one in self.controls.shown:
-                send(self._moved(one))
+                send(self._vertices_now(one))
         elif (action := getattr(self, f"on_{message.kind}", None)) is not None:
             action(send, **message.fields)
         else:
@@ -181,7 +181,7 @@ class ViewApp(Things):
 
     def close(self) -> None:
         """Forget what was dropped; all else that was wanted was saved."""
-        self.written += [folder for page in self.inside.completions for folder in self.inside.written(page)]
+        self.written += [folder for page in self.inside.completions for folder in self.inside.folders_written(page)]
         self.dropped.close()
 
     def on_show(self, send: Send, entries: list[int]) -> None:

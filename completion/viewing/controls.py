@@ -130,5 +130,5 @@ class Controls:
             raise ValueError(f"target: expected three finite numbers, got {target}")
         if self.held is not None:
             one, held = self.held
-            pose, self.trans = held.moved(self.pose_of(one.body), self.trans, wanted)
+            pose, self.trans = held.drag_to(self.pose_of(one.body), self.trans, wanted)
             self.turns.update(zip(one.body.parts, pose, strict=True))

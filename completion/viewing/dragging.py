@@ -38,7 +38,7 @@ class Drag:
         self.precision = W.T @ W
         self.size = float(np.ptp(body.model.template.vertices, axis=0).max())
 
-    def moved(self, pose: np.ndarray, trans: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def drag_to(self, pose: np.ndarray, trans: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose (J, 3) and trans (3,) that bring the vertex towards a target (3,), metres; the trunk moves as a whole.
 
         A few Gauss-Newton steps, each taken only as far as the energy falls.

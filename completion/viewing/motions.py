@@ -44,9 +44,9 @@ def as_columns(motion: Motion, subject: Subject, frames: np.ndarray) -> tuple[np
     frames, and in all others the coefficients come from the fast path's own, without a vertex being made.
     """
     basis = columns_of(frames.astype(np.float64))
-    columns = subject.operator.combined(basis.T).astype(np.float64)
+    columns = subject.operator.combine(basis.T).astype(np.float64)
     place = (subject.origin + motion.trans)[:, None] * basis.sum(axis=0)[:, None]
-    out = np.concatenate([columns.turned(motion.poses[i:i + AT_ONCE])
+    out = np.concatenate([columns.relative_positions(motion.poses[i:i + AT_ONCE])
                           for i in range(0, len(motion.poses), AT_ONCE)])
     return basis, np.swapaxes(out, 1, 2) + place
 

@@ -44,7 +44,7 @@ class MovableBody:
         Relative to `origin`, so that single precision holds a few micrometres wherever the body is.
         """
         moved = not np.array_equal(pose, self._pose)
-        changed = self._changed(betas)
+        changed = self._find_changed(betas)
         if changed is None or len(changed) > (FEW if moved else KEPT):
             self._settle(betas)
             changed, moved = np.zeros(0, dtype=np.int64), True
@@ -66,7 +66,7 @@ class MovableBody:
     def point(self, vertex: int, betas: np.ndarray | None) -> PointOperator:
         """One vertex of the body with these betas, as a function of the pose."""
         self._settle(betas)
-        return self.operator.combined(combination_weights(self.operator.count, *self._below(vertex))).astype(np.float64)
+        return self.operator.combine(combination_weights(self.operator.count, *self._below(vertex))).astype(np.float64)
 
     def _below(self, vertex: int) -> tuple[np.ndarray, np.ndarray | None]:
         """The vertex of the model that it is, as for `Subject.points`."""
@@ -85,7 +85,7 @@ class MovableBody:
         """The body, made the exact way."""
         return self.model.template.with_vertices(self.model.vertices(pose, betas, trans))
 
-    def _changed(self, betas: np.ndarray | None) -> np.ndarray | None:
+    def _find_changed(self, betas: np.ndarray | None) -> np.ndarray | None:
         """Which betas are not those of the operator; None where it has to be made again."""
         if betas is None or self.betas is None:
             return np.zeros(0, dtype=np.int64) if betas is None and self.betas is None else None
@@ -95,7 +95,7 @@ class MovableBody:
 
     def _settle(self, betas: np.ndarray | None) -> None:
         """Give the operator these betas."""
-        changed = self._changed(betas)
+        changed = self._find_changed(betas)
         if changed is None or any(k not in self._differences for k in changed.tolist()):
             self.operator = self.model.operator(betas).astype(np.float32)
         elif len(changed):
@@ -109,7 +109,7 @@ class MovableBody:
         """(3, N) of the body, or of difference k, at the pose."""
         if k not in self._products:
             one, shift = (self.operator, self.origin) if k < 0 else (self._difference(k), np.zeros(3))
-            self._products[k] = one.turned(self._pose) + (one.origin - shift).astype(np.float32)[:, None]
+            self._products[k] = one.relative_positions(self._pose) + (one.origin - shift).astype(np.float32)[:, None]
         return self._products[k]
 
     def _difference(self, k: int) -> PointOperator:

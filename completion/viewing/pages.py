@@ -72,7 +72,7 @@ class Inside:
         self.files, self.output, self.dropped = files, output, dropped
         self.opened: dict[tuple[str, Path | None], App] = {}
 
-    def offered(self, entries: Sequence[Entry]) -> dict[str, Any]:
+    def list_buttons(self, entries: Sequence[Entry]) -> dict[str, Any]:
         """What the buttons are: pages of folders, and the scans and models of a completion, by number of the entry."""
         commands = {folder: command_of(folder) for folder in self.files.folders(entries)}
         return {"folders": [{"page": "mend", "folder": str(folder),
@@ -123,7 +123,7 @@ class Inside:
         """Those that were opened."""
         return [page for page in self.opened.values() if isinstance(page, CompletePage)]
 
-    def written(self, app: App) -> list[Path]:
+    def folders_written(self, app: App) -> list[Path]:
         """Folders that a page has written to since this was last asked."""
         if isinstance(app, CompletePage):
             fresh, app.fresh = app.fresh, []

@@ -75,9 +75,9 @@ def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tupl
     poses = soft.motion.poses
     out = soft.motion.trans[:, :, None] * whole.T
     for body, amount in zip((rest, *gained), amounts.T, strict=True):
-        columns, origin = body.combined(basis.T), body.origin[:, None] * whole.T
+        columns, origin = body.combine(basis.T), body.origin[:, None] * whole.T
         for i in range(0, len(poses), AT_ONCE):
             now = slice(i, i + AT_ONCE)
-            out[now] += amount[now, None, None] * (columns.turned(poses[now]) + origin)
+            out[now] += amount[now, None, None] * (columns.relative_positions(poses[now]) + origin)
     out = np.swapaxes(out, 1, 2)
     return basis, out if soft.skin is None else out + soft.skin.at(basis.T @ soft.skin.modes, poses)

@@ -128,7 +128,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
     off_marks = np.linalg.norm(mesh.vertices[vertices] - points, axis=1)
     limit = EXPLAINED * size
-    explained = float((apart(mesh, orient(target.thinned(0.01 * size), mesh, limit), limit) < limit).mean())
+    explained = float((apart(mesh, orient(target.thin(0.01 * size), mesh, limit), limit) < limit).mean())
     return ModelRegistration(mesh, predicted, twists(pose), trans, betas if person.n_betas else None, seen,
                              aligned.distances, aligned.rms, explained, _rms(off_model), _rms(off_marks),
                              aligned.inverted, aligned.confidence, tried)
@@ -139,7 +139,7 @@ def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray,
     few, tried, best = fit.few(), 0, None
     if given is not None:
         best, tried = reinitialise_limbs(few, best_starts(few, given)[0]), 1
-    explains = best is not None and few.unexplained(best, few.thin).mean() <= 1 - ENOUGH
+    explains = best is not None and few.find_unexplained(best, few.thin).mean() <= 1 - ENOUGH
     if best is None or not explains or limbs_amiss(few, best):
         starts = first_starts(fit, few)
         tried += len(starts)

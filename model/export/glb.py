@@ -72,7 +72,7 @@ def encode_skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndar
                        up: int = 2, material: Material | None = None) -> bytes:
     """The bytes of `write_skinned_glb`."""
     U = turn_up(up).T
-    rig, glb = rig.turned(up), Glb()
+    rig, glb = rig.with_up(up), Glb()
     names, targets = rig.beta_targets()
     if rig.correctives is not None:
         names += [f"corrective {k + 1}" for k in range(len(rig.correctives.shapes))]

@@ -81,7 +81,7 @@ class FixedBody:
         betas = np.zeros((*trans.shape[:-1], self.n_betas))
         return np.concatenate([pose.reshape(*pose.shape[:-2], -1), trans, betas], axis=-1)
 
-    def held(self, x: np.ndarray) -> FixedBody:
+    def fix_shape(self, x: np.ndarray) -> FixedBody:
         """The body with the shape it has at x (P,), as one of known shape."""
         return self
 
@@ -124,7 +124,7 @@ class FixedBody:
         """All vertices in float64."""
         return self.subject.operator.astype(np.float64)
 
-    def gathered(self, vertex_ids: np.ndarray, x: np.ndarray) -> tuple[NearPoints, np.ndarray]:
+    def gather(self, vertex_ids: np.ndarray, x: np.ndarray) -> tuple[NearPoints, np.ndarray]:
         """Points near x (P,) among which vertices (L,) are, some of them repeated, and the number of each (L,).
 
         Where they are most of the body's vertices, all of these: to choose some takes longer than to move the others.
@@ -156,7 +156,7 @@ class ShapedBody(FixedBody):
         self._anchor: Anchor | None = None
         self._last = (np.zeros(0), np.zeros((0, 3)))
 
-    def held(self, x: np.ndarray) -> FixedBody:
+    def fix_shape(self, x: np.ndarray) -> FixedBody:
         """The body with the shape it has at x (P,), as one of known shape."""
         betas = self.split(x)[2]
         return self._of(self.subject if np.array_equal(betas, self._at) else self.model.subject(betas))
@@ -173,7 +173,7 @@ class ShapedBody(FixedBody):
 
     def follow(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> Follow:
         """Surface points as a function of the unknowns (B, P), valid near x (P,)."""
-        near = self._carried(vertex_ids, x, weights)
+        near = self._carry(vertex_ids, x, weights)
 
         def move(x: np.ndarray) -> MovingPoints:
             pose, trans, betas = self.split(x)
@@ -184,17 +184,17 @@ class ShapedBody(FixedBody):
         return move
 
     def near(self, vertex_ids: np.ndarray, x: np.ndarray) -> NearPoints:
-        return self._carried(vertex_ids, x)
+        return self._carry(vertex_ids, x)
 
-    def _carried(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
+    def _carry(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
         pose, trans, betas = self.split(x)
         if np.linalg.norm(betas - self._at) > self.renew:
             self._at = betas.copy()
             self.subject = self.model.subject(betas)
-        if self._anchor is None or self._anchor.turned(pose) > self.turn:
+        if self._anchor is None or self._anchor.largest_angle(pose) > self.turn:
             self._anchor = anchor_at(self.model, pose)
         operator, at = self.subject.points(vertex_ids, weights), self._at
-        D, y = self._anchor.carried(vertex_ids.ravel(), pose), self.vertices(x)[vertex_ids]
+        D, y = self._anchor.carry(vertex_ids.ravel(), pose), self.vertices(x)[vertex_ids]
         D = D.reshape(*vertex_ids.shape, *D.shape[1:])
         if weights is not None:
             D, y = np.einsum("lk,lkdb->ldb", weights, D), np.einsum("lk,lkd->ld", weights, y)
@@ -237,24 +237,24 @@ class RoughBody(ShapedBody):
     def __init__(self, whole: ShapedBody, ids: np.ndarray) -> None:
         super().__init__(whole.model)
         self.known_poses, self._known_rotations = whole.known_poses, whole._known_rotations
-        self.ids, self._mean = ids, whole.held(np.zeros(self.n_angles + 3 + self.n_betas)).subject
+        self.ids, self._mean = ids, whole.fix_shape(np.zeros(self.n_angles + 3 + self.n_betas)).subject
         self.subject = replace(self._mean, operator=self._mean.points(ids))
         rest = anchor_at(self.model, np.zeros((len(self.skeleton.parents), 3)))
         self._rest = rest.some(ids)
         if whole._anchor is None:
             whole._anchor = rest                     # near enough where the joints turn little
 
-    def held(self, x: np.ndarray) -> FixedBody:
+    def fix_shape(self, x: np.ndarray) -> FixedBody:
         betas = self.split(x)[2]
         return self._of(self.model.subject(betas) if betas.any() else self._mean).some(self.ids)
 
     def vertices(self, x: np.ndarray) -> np.ndarray:
         pose, trans, betas = self.split(x)
-        return self.subject.vertices(pose, trans) + self._rest.shifted(pose, betas)
+        return self.subject.vertices(pose, trans) + self._rest.shift_by_betas(pose, betas)
 
-    def _carried(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
+    def _carry(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> CarriedPoints:
         assert weights is None, "single vertices only"
-        D = self._rest.carried(vertex_ids, self.split(x)[0])
+        D = self._rest.carry(vertex_ids, self.split(x)[0])
         return CarriedPoints(self.subject.points(vertex_ids), np.zeros(self.n_betas), D, 0.0)
 
 
@@ -265,16 +265,16 @@ class ResizedBody(FixedBody):
     """
 
     def __init__(self, inner: FixedBody, factor: float) -> None:
-        own = inner.held(np.zeros(inner.n_angles + 3 + inner.n_betas)).subject
-        super().__init__(replace(own, operator=own.operator.scaled(factor),
+        own = inner.fix_shape(np.zeros(inner.n_angles + 3 + inner.n_betas)).subject
+        super().__init__(replace(own, operator=own.operator.scale_by(factor),
                                  template=own.template.with_vertices(factor * own.template.vertices),
                                  skeleton=replace(own.skeleton, joints=factor * own.skeleton.joints)))
         self.inner, self.factor, self.n_betas = inner, factor, inner.n_betas
         self.known_poses = inner.known_poses
 
-    def held(self, x: np.ndarray) -> FixedBody:
+    def fix_shape(self, x: np.ndarray) -> FixedBody:
         """The body with the shape it has at x (P,), as one of known shape."""
-        return ResizedBody(self.inner.held(x), self.factor)
+        return ResizedBody(self.inner.fix_shape(x), self.factor)
 
     def some(self, ids: np.ndarray) -> FixedBody:
         return ResizedBody(self.inner.some(ids), self.factor)
@@ -333,7 +333,7 @@ class Anchor:
     joints: np.ndarray               # (J, 3, K), derivative of the joints
     local: np.ndarray                # (L, 3, K), of the vertices, less that of their parts' joints
 
-    def turned(self, pose: np.ndarray) -> float:
+    def largest_angle(self, pose: np.ndarray) -> float:
         """The largest angle by which a part is turned at a pose (J, 3), radians."""
         R = self.skeleton.part_rotations(pose)
         return float(np.linalg.norm(rotations.log(np.swapaxes(self.R, 1, 2) @ R), axis=1).max())
@@ -342,15 +342,15 @@ class Anchor:
         """That of some vertices (L,) alone."""
         return replace(self, part=self.part[ids], local=self.local[ids])
 
-    def carried(self, ids: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def carry(self, ids: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(L, 3, K) of some vertices at a pose (J, 3)."""
-        return self._carried(self.local[ids], self.part[ids], self.joints, pose)
+        return self._carry(self.local[ids], self.part[ids], self.joints, pose)
 
-    def shifted(self, pose: np.ndarray, betas: np.ndarray) -> np.ndarray:
+    def shift_by_betas(self, pose: np.ndarray, betas: np.ndarray) -> np.ndarray:
         """(L, 3) metres by which betas (K,) move the vertices at a pose (J, 3)."""
-        return self._carried((self.local @ betas)[..., None], self.part, (self.joints @ betas)[..., None], pose)[..., 0]
+        return self._carry((self.local @ betas)[..., None], self.part, (self.joints @ betas)[..., None], pose)[..., 0]
 
-    def _carried(self, local: np.ndarray, part: np.ndarray, at_joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def _carry(self, local: np.ndarray, part: np.ndarray, at_joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """What vertices have in the frames of their parts (L, 3, k), on that of the joints (J, 3, k), at a pose."""
         parents = self.skeleton.parents
         turn = self.skeleton.part_rotations(pose) @ np.swapaxes(self.R, 1, 2)

@@ -63,7 +63,7 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     """
     if not limbs_amiss(fit, x):
         return x
-    free, held = fit.body.n_angles + 3, fit.held(x)
+    free, held = fit.body.n_angles + 3, fit.fix_shape(x)
     moved = approach(held, x[:free], REACHES)
     tried: list[list[int]] = []                      # as the body is now
     for _ in range(ROUNDS * len(limbs(fit.body.skeleton))):
@@ -80,7 +80,7 @@ def limbs_amiss(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[
     wrong = np.zeros(len(fit.ids))
     for weight, ids, found in fit.objections(fit.skin(x)):
         wrong[ids] += weight * np.minimum(found.excess, CAP)**2 / len(ids)
-    lost, strange = fit.thin.points[fit.unexplained(x, fit.thin)], fit.strange(x)
+    lost, strange = fit.thin.points[fit.find_unexplained(x, fit.thin)], fit.strange(x)
     found_amiss = {tuple(limb): amiss(fit, x, limb, wrong, lost) + float(strange[limb].sum())
                    for limb in limbs(fit.body.skeleton)}
     return [list(limb) for limb in sorted(found_amiss, key=lambda limb: -found_amiss[limb])
@@ -144,24 +144,24 @@ class LimbSearch:
         ids = ids[spread(fit.body.template.vertices[fit.ids[ids]], SKIN)]
         away = cKDTree(skin.places[~mine]).query(fit.coarse.points)[0] > EXPLAINED
         return LimbSearch(fit, limb, ids, np.flatnonzero(fit.part[ids] == limb[-1]), fit.part[ids] != limb[0],
-                          fit.coarse.some(away).thinned(SCAN).points, float(away.mean()),
+                          fit.coarse.some(away).thin(SCAN).points, float(away.mean()),
                           InsideBody.of(skin.places[~mine], skin.normals[~mine]), fit.data.outside)
 
     def best(self, drawn: np.ndarray) -> np.ndarray:
         """Those few of unknowns (n, P) that explain most and differ, each after draws closer and closer around it."""
         angles = (3 * np.array(self.limb)[:, None] + np.arange(3)).ravel()
         for cap, noise in zip(CAPS, NOISES, strict=True):
-            places, cost = self.judged(drawn, cap)
+            places, cost = self.evaluate(drawn, cap)
             order = np.argsort(cost)
             kept = drawn[order[distinct(places[order][:, self.end], KEPT, noise / 4)]]
             near = np.repeat(kept, len(drawn) // len(kept), axis=0)
             near[:, angles] += self.fit.rng.normal(0, noise, (len(near), len(angles)))
             drawn = np.vstack([kept, near])
-        places, cost = self.judged(drawn, CAPS[-1])
+        places, cost = self.evaluate(drawn, CAPS[-1])
         order = np.argsort(cost)
         return drawn[order[distinct(places[order][:, self.end], FOLLOWED, APART)]]
 
-    def judged(self, drawn: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate(self, drawn: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
         """Places (n, L, 3), metres, of the limb's vertices for unknowns (n, P), and energies (n,) up to a constant.
 
         What is off by more than `cap`, metres, is as bad.

@@ -74,7 +74,7 @@ def meet_vertices(fit: ScanFit, x: np.ndarray, vertices: np.ndarray, weights: np
     to_point = np.concatenate([np.full(len(fit.vertices), config.landmark_sd**-2), near])
     targets = np.concatenate([fit.points, vertices[ids]])
     for _ in range(ALIGNINGS):
-        points, at = fit.body.gathered(np.concatenate([fit.vertices, ids]), x)
+        points, at = fit.body.gather(np.concatenate([fit.vertices, ids]), x)
         pull = Pull(points, at, targets, np.zeros_like(targets), to_point, np.zeros(len(targets)))
         x = levenberg_marquardt(partial(_equations, Matched(pull, len(fit.vertices), len(ids), fit.prior_terms),
                                         fit.body.n_angles + 3), x[None], 3, 1e-5).x[0]

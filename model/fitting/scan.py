@@ -53,13 +53,13 @@ class ScanPoints:
         return replace(self, points=self.points[keep], normals=self.normals[keep], border=self.border[keep],
                        view=self.view[keep], index=self.index[keep])
 
-    def thinned(self, count: int) -> ScanPoints:
+    def thin(self, count: int) -> ScanPoints:
         """At most about `count` of the points, spread evenly."""
         return self if len(self.points) <= count else self.some(spread(self.points, count))
 
-    def scaled(self, factor: float) -> ScanPoints:
+    def scale_by(self, factor: float) -> ScanPoints:
         """The scan in another unit: all lengths times a factor."""
-        masked = None if self.masked is None else self.masked.scaled(factor)
+        masked = None if self.masked is None else self.masked.scale_by(factor)
         seen_from = None if self.viewpoints is None else factor * self.viewpoints
         assert self.person is None or factor == 1, "a picture is in metres"
         return replace(self, points=factor * self.points, spacing=factor * self.spacing, masked=masked,
@@ -92,7 +92,7 @@ def prepare_picture(picture: DepthPicture, size: float, marks: np.ndarray) -> Sc
     `size`, metres, of the body, the root of its surface area; `marks` (L, 3), metres, points on the person.
     """
     person = find_person(picture, size, marks)
-    points, normals, edge = person.oriented_points()
+    points, normals, edge = person.points_and_normals()
     spacing = float(np.median(points[:, 2])) / person.picture.intrinsics[0, 0]
     every = np.arange(len(points))
     return ScanPoints(points, normals, edge, spacing, 0 * every, every, viewpoints=np.zeros((1, 3)), person=person)

@@ -58,7 +58,7 @@ class ScanData:
         self.tree = OrientedPoints(cloud.points, cloud.normals)
         self.cameras = find_cameras(cloud) if config.free_space_weight > 0 else ()
         self.clothing = None if cloud.masked is None else Clothing(cloud.masked)
-        self.thinned = lru_cache(maxsize=4)(cloud.thinned)
+        self.thinned = lru_cache(maxsize=4)(cloud.thin)
 
     @cached_property
     def outside(self) -> Outside | None:
@@ -162,9 +162,9 @@ class ScanFit:
         return replace(self, data=ScanData(cloud, self.config), template_vertices=np.zeros(0, dtype=np.int64),
                        points=np.zeros((0, 3)))
 
-    def held(self, x: np.ndarray) -> ScanFit:
+    def fix_shape(self, x: np.ndarray) -> ScanFit:
         """The same scan with the body that has the shape of unknowns (P,), as one of known shape."""
-        return replace(self, sample=replace(self.sample, body=self.body.held(x)))
+        return replace(self, sample=replace(self.sample, body=self.body.fix_shape(x)))
 
     def some(self, ids: np.ndarray, matched: int) -> ScanFit:
         """The same with some vertices of the body, whose normals rotate with their parts; so many are matched."""
@@ -189,11 +189,11 @@ class ScanFit:
             if len(places) == len(self.body.template.vertices):
                 normals = self.body.template.with_vertices(places).vertex_normals
             else:
-                normals = self._turned_normals(np.arange(len(places)), self.body.split(x)[0])
+                normals = self._rotate_normals(np.arange(len(places)), self.body.split(x)[0])
             self._last[:] = [(x.copy(), Skin(places, normals))]
         return self._last[0][1]
 
-    def unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
+    def find_unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
         """(n,) bool: points of the scan with nothing of the body near."""
         return ~self.skin(x).tree.match(scan.points, scan.normals, 0.05, MIN_COSINE).valid
 
@@ -229,12 +229,12 @@ class ScanFit:
         beyond = self.body.joints_from_known(self.body.split(x)[0]) - STRANGE
         return (np.maximum(beyond, 0) / ODD)**2
 
-    def posed_points(self, ids: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None
-                     ) -> tuple[np.ndarray, np.ndarray]:
+    def pose_points(self, ids: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None
+                    ) -> tuple[np.ndarray, np.ndarray]:
         """Some vertices (B, L, 3) in poses (B, J, 3), and normals that rotate with their parts."""
-        return self.body.subject.points(ids).evaluate(poses, trans), self._turned_normals(ids, poses)
+        return self.body.subject.points(ids).evaluate(poses, trans), self._rotate_normals(ids, poses)
 
-    def _turned_normals(self, ids: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    def _rotate_normals(self, ids: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """(..., L, 3) the normals of some vertices on the template, rotated with their parts in poses (..., J, 3)."""
         R = self.body.skeleton.part_rotations(poses)[..., self.part[ids], :, :]
         return (R @ self.body.template.vertex_normals[self.ids[ids], :, None])[..., 0]
@@ -258,7 +258,7 @@ class ScanFit:
         """Better unknowns (P,) for one matching, and that matching."""
         held = np.full(len(x), self.config.twist_weight)
         held[:3] = held[self.body.n_angles:] = 0
-        matched, betas = self.matched_at(x, scan, reach), self.body.n_angles + 3
+        matched, betas = self.match_at(x, scan, reach), self.body.n_angles + 3
         stiff = max(1.0, reach / LIKELY)             # far matches are often wrong, and shape gives way before pose does
 
         def equations(at: np.ndarray) -> Deferred:
@@ -273,14 +273,14 @@ class ScanFit:
     def precision(self, x: np.ndarray) -> np.ndarray:
         """(P, P) how sharply scan, landmarks and priors together determine unknowns (P,): the Gauss-Newton matrix."""
         shape = energy.shape_prior(x[None], self.body.n_angles + 3)
-        return self.matched_at(x, self.thin, FINAL_REACH).equations(x[None], shape).dense.hessian[0]
+        return self.match_at(x, self.thin, FINAL_REACH).equations(x[None], shape).dense.hessian[0]
 
-    def matched_at(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Matched:
+    def match_at(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Matched:
         """What draws the body near unknowns x (P,): landmarks, matches, and places where nothing can be."""
         skin, free = self.skin(x), np.full(len(self.vertices), self.config.landmark_sd**-2)
         ids, target, normal, weights = self.matches(skin, scan, reach)
         out_ids, out_target, out_normal, out_weights = self.violations(skin)
-        points, at = self.body.gathered(np.concatenate([self.vertices, ids, out_ids]), x)
+        points, at = self.body.gather(np.concatenate([self.vertices, ids, out_ids]), x)
         pull = Pull(points, at, np.concatenate([self.points, target, out_target]),
                     np.concatenate([np.zeros_like(self.points), normal, out_normal]),
                     np.concatenate([free, 0.1 * weights, 0 * out_weights]),

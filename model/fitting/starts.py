@@ -70,7 +70,7 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
     They are distinct.
     """
     mean = np.zeros(fit.body.n_angles + 3 + fit.body.n_betas)
-    body = fit.body.held(mean)
+    body = fit.body.fix_shape(mean)
     follow = body.follow(vertices, mean)
     x, _ = search(body, follow, points, sd, fit.prior, AXES)
     x = x[distinct(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), CANDIDATES)]
@@ -83,8 +83,8 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
 
 def at_a_glance(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     """How badly bodies (n, P) explain the scan, on very few points, whatever parts enter each other."""
-    scan, ids = fit.cloud.thinned(POINTS), spread(fit.body.template.vertices[fit.ids], VERTICES)
-    places, normals = fit.posed_points(ids, *fit.body.split(x)[:2])
+    scan, ids = fit.cloud.thin(POINTS), spread(fit.body.template.vertices[fit.ids], VERTICES)
+    places, normals = fit.pose_points(ids, *fit.body.split(x)[:2])
     apart = np.array([_distances(y, n, np.eye(3)[None], np.zeros((1, 3)), scan)[0]
                       for y, n in zip(places, normals, strict=True)])
     if fit.data.outside is not None:
@@ -115,7 +115,7 @@ def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
     """
     ends, free = np.array(starts), fit.body.n_angles + 3
     if len(ends) > FINALISTS:
-        held = fit.held(ends[0])
+        held = fit.fix_shape(ends[0])
         for reach, left in zip(COARSE[:2], (len(ends), THROUGH), strict=True):
             ends = ends[:left]
             ends[:, :free] = [approach(held, x[:free], (reach,)) for x in ends]
@@ -180,8 +180,8 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body = fit.body
     poses, (turns, lift, up) = starting_poses(fit), candidate_rotations(fit)
-    scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
-    places, normals = fit.posed_points(ids, poses)
+    scan, ids = fit.cloud.thin(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
+    places, normals = fit.pose_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.data.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     shift = np.array([_laid(y, n, turns, toward, scan.points) if up is None else

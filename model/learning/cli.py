@@ -81,9 +81,9 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         raise UsageError("--kind mixed: it learns one SCAPE model of --poses alone, without --shapes and --by-sex")
     if by_sex and (shapes is None or kind != "scape"):
         raise UsageError("--by-sex: it needs --shapes and the kind scape")
-    if kind not in ("scape", "blendscape") and scape == LearnConfig.published():
+    if kind not in ("scape", "blendscape") and scape == LearnConfig.from_paper():
         raise UsageError(f"--kind {kind}: the paper of --preset published has SCAPE alone")
-    with_prior = kind in WITH_PRIOR and scape != LearnConfig.published()
+    with_prior = kind in WITH_PRIOR and scape != LearnConfig.from_paper()
     if prior not in ("auto", "none") and not with_prior:
         raise UsageError(f"--prior {prior}: expected the kind {' or '.join(WITH_PRIOR)} and not --preset published")
     # what is learned from, and what the model is to know besides

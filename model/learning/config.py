@@ -43,7 +43,7 @@ class LearnConfig(Settings):
     components: int = 40
 
     @classmethod
-    def published(cls) -> LearnConfig:
+    def from_paper(cls) -> LearnConfig:
         """The paper's own way: joints pruned at 0.1, linear least squares, w_s = 0.001 ρ, nothing refined.
 
         The 0.1 has no unit in the paper. It is read as a standard deviation in radians, a variance of 0.01; the paper's

@@ -152,9 +152,9 @@ def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
         left = np.empty((len(poses), *parts.v_hat.shape))
         for i, (body, pose, q) in enumerate(zip(mix.bodies, poses, state.S[mix.who] @ Q, strict=True)):
             if step == 0:
-                left[i] = parts.local_edges(body, pose) - parts.posed(q)
+                left[i] = parts.local_edges(body, pose) - parts.deform_edges(q)
             else:
-                left[i] = parts.local_edges(body - parts.stitched(q, pose), pose)
+                left[i] = parts.local_edges(body - parts.stitch(q, pose), pose)
         Q += pose_gradients(gradients, parts.v_hat + left @ back[mix.who]) - np.eye(3)
         design = design or choose_within(parts.template, parts.skeleton, poses, Q, mix.who, config)
         space = fit_within(design, poses, Q, mix.who)
@@ -180,11 +180,11 @@ def _learn_people(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
     for person in range(P):
         bodies, mine = mix.bodies[mix.who == person], poses[mix.who == person]
         Q = space.gradients(mine)
-        posed = side_by_side(parts.posed(Q))
+        posed = side_by_side(parts.deform_edges(Q))
         solve = ShapeSolver(system, posed)
         found = solve(side_by_side(parts.local_edges(bodies, mine)))
         for _ in range(CORRECTIONS):
-            left = bodies - np.stack([parts.stitched(found @ q, pose) for q, pose in zip(Q, mine, strict=True)])
+            left = bodies - np.stack([parts.stitch(found @ q, pose) for q, pose in zip(Q, mine, strict=True)])
             found = solve(posed @ np.swapaxes(found, -1, -2) + side_by_side(parts.local_edges(left, mine)))
         S[person] = found
     return S

@@ -35,10 +35,10 @@ class Design:
 
     def fit(self, poses: np.ndarray, Q: np.ndarray) -> PoseSpace:
         """Q (M, F, 3, 3), seen at poses (M, J, 3), as a function of the features. [SCAPE] Eq. 4"""
-        seen = self.seen(poses)
+        seen = self.prepare(poses)
         return seen.fit(seen.sums(Q))
 
-    def seen(self, poses: np.ndarray) -> SeenPoses:
+    def prepare(self, poses: np.ndarray) -> SeenPoses:
         """The poses (M, J, 3) as least squares sees them; support vectors see every pose by itself."""
         delta, features = self.features.evaluate(poses), self.features
         bases = [np.eye(len(delta)) if self.regressor == "svr" else np.linalg.qr(delta[:, features.of_part(p)])[0]

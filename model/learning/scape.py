@@ -230,12 +230,12 @@ def _refine(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, 
 
             def by_vertices(tried: Design, Q: np.ndarray = Q) -> float:
                 """The mean distance of the stitched vertices of left-out poses, well placed, metres."""
-                off = np.stack([parts.stitched(predicted, pose) - body for body, pose, predicted in
+                off = np.stack([parts.stitch(predicted, pose) - body for body, pose, predicted in
                                 zip(bodies, poses, predict_left_out(tried, poses, Q), strict=True)])
                 return float(np.linalg.norm(off - off.mean(axis=1, keepdims=True), axis=2).mean())
 
             design = choose_design(parts.template, parts.skeleton, poses, config, by_vertices, design, design.prior)
-        seen = design.seen(poses)
+        seen = design.prepare(poses)
         space = seen.fit(seen.of_space(space) + _correction(parts, system, seen.sums(left)))    # [SCAPE] Eq. 4
     return LearnedPose(space, poses, design)
 
@@ -282,7 +282,7 @@ def prior_deformations(parts: BlendedTemplate, space: PoseSpace, people: np.ndar
     [SCAPE] Eq. 8
     """
     pose = parts.skeleton.pose_of(parts.skeleton.fit_rotations(parts.template, people[0]))
-    solve = ShapeSolver(GradientSystem(parts.template, config.smoothness), parts.posed(space.gradients(pose)))
+    solve = ShapeSolver(GradientSystem(parts.template, config.smoothness), parts.deform_edges(space.gradients(pose)))
     return np.stack([solve(parts.local_edges(person, pose)).astype(np.float32) for person in people])
 
 
@@ -300,7 +300,7 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
 
     def deformation(y: np.ndarray) -> np.ndarray:
         pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
-        posed = parts.posed(space.gradients(pose))
+        posed = parts.deform_edges(space.gradients(pose))
         return shape_gradients(system, posed, parts.local_edges(y, pose)).astype(np.float32)
 
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)

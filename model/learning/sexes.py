@@ -68,7 +68,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
         if not all(name in groups for name in SEXES):
             return spaces, None
         known = np.isin(sex, SEXES)
-        return spaces, learn_sex_plane(spaces["neutral"].betas_of(S[known]), sex[known].tolist()).kept()
+        return spaces, learn_sex_plane(spaces["neutral"].betas_of(S[known]), sex[known].tolist()).to_arrays()
 
     spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
                                                    list(sexes)), 1 - POSES, learn)
@@ -114,7 +114,7 @@ class SexPlane:
     accuracy: float
     slope: float
 
-    def kept(self) -> dict[str, Any]:
+    def to_arrays(self) -> dict[str, Any]:
         """What a model keeps of it."""
         return {**vars(self), "weights": self.weights.tolist()}
 

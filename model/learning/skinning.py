@@ -197,7 +197,7 @@ def _unpose(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndar
     """(N, 3) rest vertices, correctives included, that the model with its joints carries onto a body."""
     y = model.vertices(pose)
     left = body - y
-    moved = np.einsum("nij,nj->ni", invert_blended(model.blended(pose)), left - left.mean(axis=0))
+    moved = np.einsum("nij,nj->ni", invert_blended(model.blend_rotations(pose)), left - left.mean(axis=0))
     return model.rest + model.corrections(pose) + moved
 
 
@@ -261,4 +261,4 @@ def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, wor
 
 def _unpose_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray, _: Work) -> np.ndarray:
     """(N, 3) rest vertices of a person whose pose is fitted."""
-    return model.unposed(body, fitter.fit(body).pose)
+    return model.unpose(body, fitter.fit(body).pose)

@@ -70,7 +70,7 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
     if pose is None:
         pose = character_pose(model, vertices, config)
     pose, _ = check_pose(model.skeleton, pose, None)
-    found = model.recentred(vertices, pose)
+    found = model.recentre(vertices, pose)
     kept = {name: value for name, value in model.info.items() if name != PLANE}   # these betas are nobody's
     return replace(found, info={**kept, "character": True})                      # type: ignore[type-var]
 

@@ -61,7 +61,7 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     _check_same_surface(model.template, template)
     skeleton = transfer_skeleton(model.skeleton, model.template, template)
     rounds = (config or ResolutionConfig()).rounds
-    moved = model.resampled(template, skeleton, rounds, progress or (lambda done, total: None))
+    moved = model.resample(template, skeleton, rounds, progress or (lambda done, total: None))
     # landmarks on the nearest new vertices; digests of training bodies say nothing of bodies in another topology
     old, marks = model.template, model.info.get("landmarks", {})
     nearest = cKDTree(template.vertices).query(old.vertices[np.array(list(marks.values()), dtype=np.int64)])[1]

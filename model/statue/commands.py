@@ -213,7 +213,7 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     found = Judgement.of(failed, check)
     if names != humanoid().skeleton.names:
         return found
-    return found.joined(beyond_people(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
+    return found.merge(beyond_people(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
 
 
 def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
@@ -236,7 +236,7 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     left = 1 - float(cleaned.kept.mean())
     if left > 0:
         rows.append(Metric("left out as floor, furniture, specks", 100 * left, "% of the points"))
-    return body, texture and texture.scaled(metre), rows, doubts
+    return body, texture and texture.scale_by(metre), rows, doubts
 
 
 def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, tolerance: Positive | None = None,

@@ -41,7 +41,7 @@ class StatueConfig(Settings):
     start: Literal["registered", "posed"] = "registered"
 
     @classmethod
-    def published(cls) -> StatueConfig:
+    def from_paper(cls) -> StatueConfig:
         """The control model posed by features, its head warped, its mesh fitted by the steps of the paper alone.
 
         Not as in the paper: without --features joints and landmarks are found by a search, which the paper has clicked.
@@ -51,7 +51,7 @@ class StatueConfig(Settings):
         are the cubic root that Eq. 19 asks for, and are filled smoothly where there is none. Adaptive triangles are
         small where the displaced surface bends away from their edges, not where the displacement is greater.
         """
-        return cls(surface=SurfaceFitConfig.published(), start="posed")
+        return cls(surface=SurfaceFitConfig.from_paper(), start="posed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +159,6 @@ def pose_automatically(control: ControlModel, found: Features, registered: bool 
 def fit_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
                 config: DisplacementConfig | None = None) -> ControlModel:
     """The control model on the scan, drawn out of folds, its joints where the features put them."""
-    unfolded = unfold_control(control.fitted(surface.vertices, posed.joints), scan, config).mesh.vertices
+    unfolded = unfold_control(control.refit(surface.vertices, posed.joints), scan, config).mesh.vertices
     root = unfolded[control.skeleton.part_of_vertex(control.mesh) == 0].mean(axis=0)
-    return control.fitted(unfolded, np.vstack([root, posed.joints[1:]]))
+    return control.refit(unfolded, np.vstack([root, posed.joints[1:]]))

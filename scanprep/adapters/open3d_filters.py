@@ -69,7 +69,7 @@ def recolor(mesh: Mesh, source: Mesh) -> Mesh:
     if source.colors is None:
         return mesh
     at = Surface(source).closest(mesh.vertices)
-    return Mesh(mesh.vertices, mesh.faces, np.clip(at.transferred(source.colors, source.faces), 0, 1))
+    return Mesh(mesh.vertices, mesh.faces, np.clip(at.transfer(source.colors, source.faces), 0, 1))
 
 
 def library(name: str) -> Any:

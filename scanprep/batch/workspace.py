@@ -103,9 +103,9 @@ class Workspace:
         keys = {task.name: self._key(common, task) for task in tasks}
         assert len(keys) == len(tasks), "names of tasks differ"
         # what is kept, what has no place to write to, and the jobs that are left
-        outcomes: dict[str, Any] = {name: self._kept(name, key) for name, key in keys.items()}
+        outcomes: dict[str, Any] = {name: self._load_if_valid(name, key) for name, key in keys.items()}
         wanted = [task for task in tasks if outcomes[task.name] is NOTHING]
-        outcomes |= {task.name: Failure(line) for task in wanted if (line := self._blocked(task))}
+        outcomes |= {task.name: Failure(line) for task in wanted if (line := self._why_blocked(task))}
         jobs = [Job(task.name, task.given, self._making(), task.place, self.home / "steps" / _plain(task.name),
                     self.force) for task in wanted if outcomes[task.name] is NOTHING]
         done = len(tasks) - len(jobs)
@@ -138,7 +138,7 @@ class Workspace:
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
         """What `make` returns, or returned for the same inputs before; it gets a folder for files of the output."""
         key = self.digests.key(inputs)
-        kept = self._kept(name, key)
+        kept = self._load_if_valid(name, key)
         if kept is not NOTHING:
             return kept
         with self.staging(name, key) as staged:
@@ -147,12 +147,12 @@ class Workspace:
 
     def is_done(self, work: Any, task: Task) -> bool:
         """Whether `run` would leave a task as it is."""
-        return self._kept(task.name, self._key(self.digests.of(work), task)) is not NOTHING
+        return self._load_if_valid(task.name, self._key(self.digests.of(work), task)) is not NOTHING
 
     @contextlib.contextmanager
     def instead(self, work: Any, task: Task) -> Iterator[Staged]:
         """As `staging`, of a task that somebody does in another way: for `run` it is done."""
-        if line := self._blocked(task):
+        if line := self._why_blocked(task):
             raise ForeignFileError(line)
         common = self.digests.of(work)
         with self.staging(task.name, self._key(common, task), common) as staged:
@@ -178,13 +178,13 @@ class Workspace:
         """Remove what is kept of a result, but none of its files."""
         self._record(name).unlink(missing_ok=True)
 
-    def kept(self, start: str) -> list[str]:
+    def list_results(self, start: str) -> list[str]:
         """The results that are kept and whose names begin so."""
         return [unquote(path.stem) for path in sorted((self.home / "done").glob(f"{_plain(start)}*.npz"))]
 
     def drop_others(self, start: str, names: Collection[str] = ()) -> None:
         """Remove the results whose names begin so, but for those named."""
-        for name in self.kept(start):
+        for name in self.list_results(start):
             if name not in names:
                 self.drop(name)
 
@@ -211,7 +211,7 @@ class Workspace:
         """What a task depends on; `common` is the digest of the work."""
         return self.digests.key(common, task.place, task.given)
 
-    def _kept(self, name: str, key: str) -> Any:
+    def _load_if_valid(self, name: str, key: str) -> Any:
         """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""
         header = _read_record(self._record(name), self.folder)
         if header is None or header["digest"] != key or (self.force and name not in self._made) \
@@ -222,7 +222,7 @@ class Workspace:
         except storage.StorageError:                        # damaged
             return NOTHING
 
-    def _blocked(self, task: Task) -> str:
+    def _why_blocked(self, task: Task) -> str:
         """Why a task has no place to write to, before any work is done for it."""
         place = self.folder / task.place
         if not task.place or not place.exists() or self._record(task.name).exists():

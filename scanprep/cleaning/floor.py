@@ -35,7 +35,7 @@ class Plane:
         u /= np.linalg.norm(u)
         return points @ np.stack([u, np.cross(self.normal, u)], axis=1)
 
-    def flipped(self) -> Plane:
+    def flip(self) -> Plane:
         """The same plane from behind."""
         return Plane(-self.normal, -self.offset, self.noise)
 
@@ -55,7 +55,7 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
         plane = _fit(near)
         height = plane.height(few)
         if np.mean(height < -WIDEST) > np.mean(height > WIDEST):
-            plane, height = plane.flipped(), -height
+            plane, height = plane.flip(), -height
         if np.mean(height < -WIDEST) > MOST_BELOW:
             continue
         area = _area_of_cells(plane.flat(few[np.abs(height) < WIDEST / 2]), WIDEST)
@@ -135,7 +135,7 @@ def _refine(plane: Plane, points: np.ndarray) -> Plane:
         near = points[np.abs(height) < band]
         fitted = _fit(near)
         if fitted.normal @ plane.normal < 0:
-            fitted = fitted.flipped()
+            fitted = fitted.flip()
         noise = 1.4826 * float(np.median(np.abs(fitted.height(near))))
         plane = Plane(fitted.normal, fitted.offset, max(noise, 1e-5))
         band = min(band, max(3 * plane.noise, 1e-4))

@@ -112,7 +112,7 @@ def collapse(mesh: Mesh, faces: int, crease: float | None = None, keep: np.ndarr
     centre = mesh.vertices.mean(axis=0)                       # quadrics lose digits far from the origin
     rounds = Rounds(mesh, (mesh.vertices - centre)[:, None], keep, labels, crease)
     rounds.run(faces, progress)
-    kept, owner = rounds.numbered()
+    kept, owner = rounds.renumber()
     vertices = rounds.points[kept, 0] + centre
     same = rounds.kinds[kept] == FIXED
     vertices[same] = mesh.vertices[kept[same]]

@@ -63,7 +63,7 @@ class Rounds:
             if progress is not None:
                 progress(min(total, total - (len(self.faces) - count)), total)
 
-    def numbered(self) -> tuple[np.ndarray, np.ndarray]:
+    def renumber(self) -> tuple[np.ndarray, np.ndarray]:
         """The remaining vertices (n,), and for every original one (N,) which of them it ended in."""
         return np.unique(final_owner(self.owner), return_inverse=True)
 

@@ -136,7 +136,7 @@ def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: D
     points = _different_meshes(template, poses, config.meshes)
     rounds = Rounds(template, points.swapaxes(0, 1), keep, labels, onto_vertices=config.placement == "vertices")
     rounds.run(faces, progress)
-    kept, owner = rounds.numbered()
+    kept, owner = rounds.renumber()
     return _assemble(template, skeleton, kept, owner, rounds.face_rows, rounds.kinds[kept] == FIXED, config)
 
 

@@ -36,7 +36,7 @@ class Person:
         """The picture without all else."""
         return replace(self.picture, depth=np.where(self.mask, self.picture.depth, np.nan))
 
-    def oriented_points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def points_and_normals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points (n, 3), metres, their normals (n, 3) towards the camera, and which are at the edge of a surface (n,).
 
         Near a jump in depth neither a pixel nor its normal can be trusted, and it is left out.
@@ -54,7 +54,7 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
 
     `size`, metres, of the body, the root of its surface area; `marks` (L, 3), metres, points that are on the person.
     """
-    small = picture.without_flying_pixels().halved()
+    small = picture.without_flying_pixels().halve()
     pieces = _pieces(small, small.seen & ~room_planes(small, size), size)
     shown = [_area_and_radius(small, mask, size) for mask in pieces]
     people = [mask for mask, (area, radius) in zip(pieces, shown, strict=True)

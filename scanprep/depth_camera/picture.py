@@ -130,7 +130,7 @@ class DepthPicture:
         used, index = np.unique(faces, return_inverse=True)
         return Mesh(self.points().reshape(-1, 3)[used], index.reshape(-1, 3))
 
-    def halved(self) -> DepthPicture:
+    def halve(self) -> DepthPicture:
         """Every second pixel of every second row, means of those around on the same surface."""
         h, w = (n // 2 * 2 for n in self.depth.shape)
         blocks = self.depth[:h, :w].reshape(h // 2, 2, w // 2, 2).transpose(0, 2, 1, 3).reshape(h // 2, w // 2, 4)

@@ -143,7 +143,8 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
         mesh.vertices, axis=0)))
     start, off = mesh.corners[some].mean(axis=1), 1e-4 * reach * mesh.face_normals[some]
     rays = Rays(mesh)
-    vote = rays.occluded(start + off, around, reach).astype(float) - rays.occluded(start - off, -around, reach)
+    vote = rays.test_occlusion(start + off, around, reach).astype(float) - rays.test_occlusion(start - off, -around,
+                                                                                               reach)
     vote *= mesh.face_areas[some]
     # The sum of the votes against what it would be if each were as likely the other way.
     total = np.bincount(patch[some], vote, len(size))
@@ -173,7 +174,8 @@ def _agree_with_camera(mesh: Mesh, rays: Rays, patch: np.ndarray, turn: np.ndarr
     middle, area = mesh.corners[some].mean(axis=1), mesh.face_areas[some]
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     # of the diagonal, above a triangle: farther than the noise of a depth camera
-    sights = [np.average(~rays.occluded(middle + 2e-3 * size * way, np.tile(way, (len(some), 1)), size), weights=area)
+    sights = [np.average(~rays.test_occlusion(middle + 2e-3 * size * way, np.tile(way, (len(some), 1)), size),
+                         weights=area)
               for way in ways]
     # of a scan from one side: one view has 0.89 and more, a whole body a half
     if max(sights) < 0.8:

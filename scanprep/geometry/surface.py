@@ -42,7 +42,7 @@ class SurfacePoints:
     bary: np.ndarray            # (n, 3) barycentric coordinates
     distances: np.ndarray       # (n,) metres, from the query points
 
-    def transferred(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    def transfer(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """The same surface points (n, 3) on other vertices of the same triangulation."""
         return np.einsum("nc,ncd->nd", self.bary, vertices[faces[self.faces]])
 
@@ -152,7 +152,7 @@ class Rays:
         face = np.asarray(hit["primID"], dtype=np.int64)
         return face, np.where(face >= 0, np.asarray(hit["tfar"], dtype=np.float64), np.nan)
 
-    def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6) -> np.ndarray:
+    def test_occlusion(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6) -> np.ndarray:
         """(n,) bool: something lies within `reach` along each ray."""
         return self.cast(origins, directions, reach)[0] >= 0
 

@@ -26,7 +26,7 @@ class Target:
     descriptors: np.ndarray | None = None       # (n, q) what else a point is matched by (see `path_descriptors`)
     index: np.ndarray | None = None             # (n,) number of each point in the scan
 
-    def thinned(self, cell: float) -> Target:
+    def thin(self, cell: float) -> Target:
         """One point for each cubic cell (metres)."""
         keep = thin(self.points, cell)
         return Target(self.points[keep], self.normals[keep], self.border[keep], self.oriented,

@@ -66,7 +66,7 @@ class Scene:
         solids = [s.corners.reshape(-1, 3) @ vertical for s in shapes if s.faces is not None and len(s.corners)]
         self.floor = min((float(h.min()) for h in solids), default=np.inf)
 
-    def seen(self, origins: np.ndarray, directions: np.ndarray) -> Seen:
+    def cast(self, origins: np.ndarray, directions: np.ndarray) -> Seen:
         """What rays hit."""
         if not len(self.corners):
             return Seen(np.empty(0, int), np.empty((0, 3), np.float32), *np.empty((2, 0), np.float32))

@@ -88,15 +88,15 @@ def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: 
     solid = [s for s in everything if not _on_top(s) and _opacity(s) == 1]
     if solid:
         scene = _scene(solid, camera)
-        canvas.cover(scene.seen(origins, directions))
+        canvas.cover(scene.cast(origins, directions))
         if ground and np.isfinite(scene.floor):
             canvas.floor = scene.ground_shadow(*camera.rays(width, height))
     for shape in everything:
         if _opacity(shape) < 1:
-            canvas.cover(_scene([shape], camera).seen(origins, directions), opacity=_opacity(shape))
+            canvas.cover(_scene([shape], camera).cast(origins, directions), opacity=_opacity(shape))
     top = [s for s in everything if _on_top(s)]
     if top:
-        canvas.cover(_scene(top, camera).seen(origins, directions), through=0.8)
+        canvas.cover(_scene(top, camera).cast(origins, directions), through=0.8)
     return canvas.finish(width, height, samples=2)
 
 

@@ -32,7 +32,7 @@ class Texture:
     uv: np.ndarray
     image: np.ndarray  # (H, W, 3) float in [0, 1]: rows from the top
 
-    def scaled(self, factor: float) -> Texture:
+    def scale_by(self, factor: float) -> Texture:
         """All lengths of the mesh times a factor."""
         return self if factor == 1 else replace(self, mesh=self.mesh.with_vertices(factor * self.mesh.vertices))
 

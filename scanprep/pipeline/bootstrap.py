@@ -107,7 +107,7 @@ def drop_round(space: Workspace, number: int, names: Collection[str]) -> None:
     kept = f"{folder_of(number)}/"
     for name in names:
         space.drop(kept + name)
-    if not space.kept(kept):
+    if not space.list_results(kept):
         space.drop(f"model {number}")
 
 

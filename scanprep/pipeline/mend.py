@@ -54,14 +54,14 @@ class MendApp(ResultsApp):
         worst = [name for name in self.verdicts if name in tasks]
         self.scan_names = [*worst, *(name for name in tasks if name not in self.verdicts)]
         self.changed: set[int] = set()
-        template = Clicked.found(self.call.template, ending, None, self.call.template_landmarks)
-        super().__init__(template, [self._clicked(tasks[name], ending) for name in self.scan_names], names)
+        template = Clicked.load(self.call.template, ending, None, self.call.template_landmarks)
+        super().__init__(template, [self._load_clicked(tasks[name], ending) for name in self.scan_names], names)
 
-    def _clicked(self, task: ScanTask, ending: str) -> Clicked:
+    def _load_clicked(self, task: ScanTask, ending: str) -> Clicked:
         """A scan and its landmarks, in the file that `scape prep run` reads."""
         unit = self.call.config.scan.unit
         if task.landmarks is not None:
-            return Clicked.found(task.scan, ending, unit, task.landmarks)
+            return Clicked.load(task.scan, ending, unit, task.landmarks)
         return Clicked(task.scan, (self.call.landmarks or task.scan.parent) / (task.name + ending), unit)
 
     # what the page is sent

@@ -110,7 +110,7 @@ def judge_whole(verdicts: Sequence[Verdict], skeleton: Skeleton | None, limits: 
     doubts = [f"{100 * usual:.0f}% of a body has no data in these scans: what is there is a guess"] if usual > most \
         else []
     doubts += skeleton_doubts(skeleton) if skeleton is not None else []
-    return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).joined(Judgement.of(check=doubts))
+    return judge_many({verdict.name: verdict.judgement for verdict in verdicts}).merge(Judgement.of(check=doubts))
 
 
 def _summary(verdicts: Sequence[Verdict]) -> list[tuple[str, float, float, str]]:

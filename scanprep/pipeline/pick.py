@@ -42,8 +42,8 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
     ending = landmark_ending(format)
     if (mesh / "set.json").exists():
         return _run_mending(mesh, scans, ending, names, unit, serve)
-    template = Clicked.found(mesh, ending, None if scans else unit)      # as scape prep run reads it
-    others = [Clicked.found(path, ending, unit, file) for path, file in _files(scans)]
+    template = Clicked.load(mesh, ending, None if scans else unit)      # as scape prep run reads it
+    others = [Clicked.load(path, ending, unit, file) for path, file in _files(scans)]
     with bar("reading") as progress:                      # a file that is no mesh is refused before a browser opens
         for number, one in enumerate(first := [template, *others[:1]]):
             progress(number, len(first))

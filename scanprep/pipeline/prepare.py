@@ -56,14 +56,14 @@ class PrepareConfig(Settings):
     workers: Workers = field(default_factory=Workers)
 
     @classmethod
-    def published(cls) -> PrepareConfig:
+    def from_paper(cls) -> PrepareConfig:
         """Scans registered as [SCAPE] did, from landmarks.
 
         Not as in the paper: landmarks are not multiplied by Correlated Correspondence, which finds all of them for a
         scan that has none. How soft links are, and when, it does not tell. Triangles that end inverted are mended, and
         soles are pressed to a scan that ends flat around the feet.
         """
-        return cls(scan=ScanSettings(RegistrationConfig.published()))
+        return cls(scan=ScanSettings(RegistrationConfig.from_paper()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -192,6 +192,6 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
                      len(template.faces), doubts={name: doubts} if parts else None, usual=UNSEEN)[0]
     rival = Judgement.of(check=[f"{RIVAL}: click some landmarks, left and right, to decide"] if has_rival else [])
     if parts is None or problem is not None:
-        return verdict.judgement.joined(rival)
+        return verdict.judgement.merge(rival)
     # of a body that is too large or too small the size is the cause, limbs out of shape are what comes of it
-    return beyond_people(stature(template, parts, fit.mesh.vertices)).joined(verdict.judgement, rival)
+    return beyond_people(stature(template, parts, fit.mesh.vertices)).merge(verdict.judgement, rival)

@@ -107,7 +107,7 @@ def fit_stages(inputs: Inputs, fit: GraphFit, stages: list[GraphStage],
 def fit_stage(inputs: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
     """The fit after matches were sought and followed, as often as the stage says."""
     cell, template = stage.detail * inputs.size, inputs.template
-    target, sample = inputs.target.thinned(cell), thin(template.vertices, cell)
+    target, sample = inputs.target.thin(cell), thin(template.vertices, cell)
     fit = fit.refine(template, stage.nodes)
     for _ in range(stage.rounds):
         fit = fit.minimise(pull_of_stage(inputs, stage, fit.x, target, sample), stage, inputs.size, 1)
@@ -121,7 +121,7 @@ def rotate_end(inputs: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> Gr
     may bend, so what counts is how far the end is from an enlarged copy of itself.
     """
     size, template = inputs.size, inputs.template
-    target = inputs.target.thinned(0.5 * stage.detail * size)
+    target = inputs.target.thin(0.5 * stage.detail * size)
     scan = RigidFit(orient(target, template.with_vertices(fit.x), NORMALS * size), size)
     held = landmark_pull(len(fit.x), inputs.landmarks, stage.landmarks * size**2)
     areas = template.vertex_areas

@@ -197,7 +197,7 @@ def people_do() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     person, rng = average_person(), np.random.default_rng(0)
     # random poses beside the named ones that show what people do
     poses = [*map(find_pose, NAMED_POSES), *(random_pose(rng) for _ in range(60))]
-    bodies = np.stack([person.posed(pose) for pose in poses])
+    bodies = np.stack([person.in_pose(pose) for pose in poses])
     angles = joint_angles(person.skeleton.fit_rotations(person.mesh, bodies))
     bent = np.stack([part_bending(person.mesh, person.skeleton, body)[0] for body in bodies])
     angles = np.concatenate([angles, angles[:, MIRROR_PART] * [-1, 1, -1]])

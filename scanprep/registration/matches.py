@@ -96,10 +96,10 @@ def initial_transform(inputs: Inputs) -> np.ndarray:
     if inputs.descriptors is not None:
         # Front and back of a trunk are described nearly alike. A motion to such points flattens the body, but its
         # rotation is right, since right, left, up and down are told apart.
-        sample, few = thin(template.vertices, 0.03 * inputs.size), target.thinned(0.03 * inputs.size)
+        sample, few = thin(template.vertices, 0.03 * inputs.size), target.thin(0.03 * inputs.size)
         mine = Described(template.vertices, template.vertex_normals, inputs.descriptors).of(sample)
-        index, _ = mine.matched(Described(few.points, few.normals, few.descriptors), np.inf,
-                                Likeness(positions=0.0, descriptors=1.0, limit=np.inf))
+        index, _ = mine.match(Described(few.points, few.normals, few.descriptors), np.inf,
+                              Likeness(positions=0.0, descriptors=1.0, limit=np.inf))
         return landmark_motion(template.vertices[sample[index >= 0]], few.points[index[index >= 0]])
     if inputs.landmarks is not None:
         return landmark_motion(template.vertices[inputs.landmarks[0]], inputs.landmarks[1])
@@ -177,7 +177,7 @@ class Described:
             parts.append(like.descriptors * self.descriptors)
         return np.hstack(parts)
 
-    def matched(self, others: Described, reach: float, like: Likeness) -> tuple[np.ndarray, np.ndarray]:
+    def match(self, others: Described, reach: float, like: Likeness) -> tuple[np.ndarray, np.ndarray]:
         """For each point the best of others, -1 where it is beyond the limits; and how far apart they are."""
         mine, theirs = self.columns(like), others.columns(like)
         _, index = cKDTree(theirs).query(mine, workers=search_threads(len(mine)))
@@ -202,13 +202,13 @@ def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Tar
     x, N = deformed.vertices, len(deformed.vertices)
     mine = Described(x, deformed.vertex_normals, descriptors).of(sample)
     theirs = Described(target.points, target.normals, target.descriptors)
-    p, apart = mine.matched(theirs, reach, like)
+    p, apart = mine.match(theirs, reach, like)
     good = (p >= 0) & ~target.border[p]
     v, p = sample[good], p[good]
     weights = area / len(sample) * tukey(apart[good], reach)
     wanted = pull(N, v, target.points[p], weights, target.normals[p], slide)
 
-    chosen, apart = theirs.matched(mine, reach, like)
+    chosen, apart = theirs.match(mine, reach, like)
     p = np.flatnonzero(chosen >= 0)
     weights = area / len(target.points) * tukey(apart[p], reach)
     return wanted + pull(N, sample[chosen[p]], target.points[p], weights, target.normals[p], slide)

@@ -166,7 +166,7 @@ class RegistrationConfig(Settings):
         return replace(whole, graph=whole.graph[:-1], final_fit=None)
 
     @classmethod
-    def published(cls) -> RegistrationConfig:
+    def from_paper(cls) -> RegistrationConfig:
         """The registration that [SCAPE] used: rigid links between neighbours, matches point to point [Hahnel].
 
         Nodes keep their size; the template is drawn to the landmarks first, then to the scan with ever softer links.

@@ -66,7 +66,7 @@ def mirror_poses(template: Mesh, poses: np.ndarray, symmetry: Symmetry) -> np.nd
     """Poses (M, N, 3), metres, with left and right exchanged: what a body does on one side it can do on the other."""
     body = template if symmetry.pose < 0 else template.with_vertices(poses[symmetry.pose])
     image = Surface(body).closest(symmetry.image)
-    return symmetry.reflect(np.stack([image.transferred(pose, template.faces) for pose in poses]))
+    return symmetry.reflect(np.stack([image.transfer(pose, template.faces) for pose in poses]))
 
 
 def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:

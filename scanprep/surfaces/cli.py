@@ -97,7 +97,7 @@ def template(scans: ScansArg, output: Output, faces: Faces = 14000, landmarks: P
     for note in notes:
         say(f"note: {note}")
     return Outcome(output, [*rows, Metric("landmarks carried", len(marks)), *about_mesh(made)],
-                   judgement=_as_template(made).joined(Judgement.of(check=doubts)))
+                   judgement=_as_template(made).merge(Judgement.of(check=doubts)))
 
 
 def repair_mesh(mesh: MeshArg, output: Output, unit: Unit | None = None) -> Outcome:
@@ -249,7 +249,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
         *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
         Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
         *about_mesh(after)], {"fill": config},
-        judgement=filling_judgement(holes, len(after.faces) - len(before.faces)).joined(Judgement.of(check=still_open)))
+        judgement=filling_judgement(holes, len(after.faces) - len(before.faces)).merge(Judgement.of(check=still_open)))
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,

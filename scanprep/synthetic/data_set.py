@@ -57,10 +57,10 @@ class GroundTruth:
 
 def stand(person: Person, pose: np.ndarray) -> GroundTruth:
     """A person in a pose with the lowest point on the floor, z = 0."""
-    vertices = person.posed(pose)
+    vertices = person.in_pose(pose)
     trans = np.array([0.0, 0.0, -vertices[:, 2].min()])
     return GroundTruth(person.shape, np.asarray(pose, dtype=np.float64), trans, vertices + trans, person.mesh.faces,
-                       person.part_of_face, person.posed_joints(pose, trans))
+                       person.part_of_face, person.joints_in_pose(pose, trans))
 
 
 def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,

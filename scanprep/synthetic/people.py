@@ -54,7 +54,7 @@ class Person:
     def _poser(self) -> Poser:
         return Poser(self.anatomy, self.mesh.vertices, self.joints[0])
 
-    def posed(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+    def in_pose(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """The vertices (N, 3), metres, in a pose (16, 3): rotation vectors of the parts against their parents.
 
         `pose[0]` turns the body about `joints[0]`.
@@ -62,7 +62,7 @@ class Person:
         pose = _check(pose)
         return self._poser(pose) + (0 if trans is None else np.asarray(trans, dtype=np.float64))
 
-    def posed_joints(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+    def joints_in_pose(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """The joints (16, 3) in a pose, metres; shoulders move in the chest as the arms are raised.
 
         `posed_joints(pose)[0]` is `joints[0] + trans`.

@@ -41,7 +41,7 @@ class Clicked:
     _saved: bool = False                 # by now
 
     @classmethod
-    def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
+    def load(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
         """With the landmarks of its file, or of that of its name beside it; else one of this ending will be written."""
         file = file or landmarks_beside(path)
         one = cls(path, file or path.with_name(name_of(path) + ending), unit)
@@ -175,5 +175,5 @@ def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], bod
     fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
                                           np.array([on_scan[name] for name in common])),
                    RegistrationConfig.quick(), progress)
-    moved = nearest.transferred(fit.mesh.vertices, template.faces)
+    moved = nearest.transfer(fit.mesh.vertices, template.faces)
     return {name: body.nearest(place) for name, place in zip(on_template, moved, strict=True)}

@@ -44,7 +44,7 @@ class Serving(Protocol):
         """A tab opened or came back."""
         ...
 
-    def passed(self, connection: Any) -> None:
+    def accept_connection(self, connection: Any) -> None:
         """The connection of a request has shown the token."""
         ...
 
@@ -89,20 +89,20 @@ class Guarded(RequestHandler):
             raise Refusal(403, "wrong or missing token")
         if self.get_query_argument("server", gate.server) != gate.server:
             raise Refusal(403, "a page of an earlier server")
-        self.server.passed(self.request.connection)
+        self.server.accept_connection(self.request.connection)
 
     def passes(self) -> bool:
         """Whether the request has the token."""
         gate = self.server.gate
         return not gate.wrong_token(self.get_query_argument("token", None), self.get_cookie(gate.cookie))
 
-    def refused(self, why: str) -> None:
+    def report_refusal(self, why: str) -> None:
         """Tell the terminal of a refusal; the token is no part of it."""
         self.server.say(one_line(f"refused: {self.request.method} {self.request.path}: {why}"))
 
     def log_exception(self, typ: Any, value: BaseException | None, tb: Any) -> None:
         if isinstance(value, HTTPError):
-            self.refused(getattr(value, "why", str(value)))
+            self.report_refusal(getattr(value, "why", str(value)))
         else:
             self.server.say("".join(traceback.format_exception(typ, value, tb)).rstrip())
 
@@ -159,7 +159,7 @@ class Socket(Guarded, WebSocketHandler):
 
             def told(code: int | None = None, reason: str | None = None) -> None:
                 if code == 1009:
-                    self.refused(f"a message of more than {LARGEST_MESSAGE} bytes")
+                    self.report_refusal(f"a message of more than {LARGEST_MESSAGE} bytes")
                 close(code, reason)
 
             protocol.close = told           # type: ignore[method-assign]
@@ -186,7 +186,7 @@ class Socket(Guarded, WebSocketHandler):
         try:
             self.server.take_in(self.tab_name, Message.unpack(message))
         except ValueError as problem:
-            self.refused(str(problem))
+            self.report_refusal(str(problem))
             self.close(1003)
 
     def on_close(self) -> None:
@@ -243,7 +243,7 @@ class Drop(Guarded):
 
     def _fail(self, status: int, why: str) -> None:
         self._forget()
-        self.refused(why)
+        self.report_refusal(why)
         self.set_status(status)
         self.finish(why)
 

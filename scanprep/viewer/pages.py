@@ -18,7 +18,7 @@ class Home(App, Protocol):
         """The app of a page that is asked for, the same for the same page; ValueError where it cannot be opened."""
         ...
 
-    def returned(self, app: App) -> None:
+    def on_return(self, app: App) -> None:
         """The page was left: what it has made is now to be shown."""
         ...
 
@@ -63,7 +63,7 @@ class Pages:
             self._turn_to(self.home.enter(self._sender(app, send), fields), send)
         elif message.kind == "leave" and app is not self.home:
             try:
-                self.home.returned(app)
+                self.home.on_return(app)
             finally:                                             # whatever it has made of it, one gets back
                 self._turn_to(self.home, send)
         else:

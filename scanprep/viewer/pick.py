@@ -159,7 +159,7 @@ class PickApp:
             self.note = "the click met nothing: turn the body so that the place faces you"
             return
         self.building |= pane == TEMPLATE
-        self._change(self._number(pane), {self._named(name): place}, drag)
+        self._change(self._number(pane), {self._scan_named(name): place}, drag)
         if not drag:
             self.choose_next(name, pane)
             # a click on the scan that is far from where the landmark was predicted is questioned
@@ -200,7 +200,7 @@ class PickApp:
 
     def on_choose(self, send: Send, name: str) -> None:
         """The landmark that the next click sets; a new name joins the list."""
-        self.chosen, self.alternating = self._named(name), None
+        self.chosen, self.alternating = self._scan_named(name), None
 
     def on_open(self, send: Send, scan: int) -> None:
         """Another scan."""
@@ -266,7 +266,7 @@ class PickApp:
             raise ValueError(f"pane: expected 0, the template, or 1, the scan, got {pane}")
         return self.template if pane == TEMPLATE else self.scans[self.current]
 
-    def _named(self, name: str) -> str:
+    def _scan_named(self, name: str) -> str:
         name = " ".join(str(name).split())[:200]
         if not name:
             raise ValueError("a landmark needs a name")

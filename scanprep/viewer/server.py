@@ -123,7 +123,7 @@ class Server:
 
         self._greeter.put(greet)
 
-    def passed(self, connection: Any) -> None:
+    def accept_connection(self, connection: Any) -> None:
         """The connection of a request has shown the token: whatever comes, it stays open."""
         self._door.strangers = [one for one in self._door.strangers if one is not connection.stream]
 

@@ -49,7 +49,7 @@ def coarse(data: RealData, faces: int) -> RealData:
         return data
     small = decimate(data.template, faces)
     on = Surface(data.template).closest(small.vertices)
-    poses = np.stack([on.transferred(p, data.template.faces) for p in data.poses])
+    poses = np.stack([on.transfer(p, data.template.faces) for p in data.poses])
     near = cKDTree(poses[0]).query(data.template.vertices[list(data.landmarks.values())])[1]
     return RealData(Mesh(poses[0], small.faces), poses, poses[:0],
                     dict(zip(data.landmarks, near.tolist(), strict=True)))
@@ -92,7 +92,7 @@ class Story:
 def explained_share(mesh: Mesh, scan: Mesh | np.ndarray) -> float:
     """Share of the points of a scan that lie near a registered mesh and do not face away from it."""
     size = float(np.sqrt(mesh.face_areas.sum()))
-    target = orient(target_of(scan).thinned(0.01 * size), mesh, 0.05 * size)
+    target = orient(target_of(scan).thin(0.01 * size), mesh, 0.05 * size)
     return float((apart(mesh, target, EXPLAINED * size) < EXPLAINED * size).mean())
 
 

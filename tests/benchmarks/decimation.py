@@ -148,7 +148,7 @@ def replayed(data: RealData, faces: int) -> Row:
 def unseen(template: Mesh, small: Mesh, before: np.ndarray, after: np.ndarray | list[np.ndarray]) -> dict[str, float]:
     """Distances of the surfaces, and how far vertices lie, brought back to the template, from where they lie there."""
     there = Surface(template).closest(small.vertices).points
-    slid = [np.linalg.norm(Surface(template.with_vertices(b)).closest(a).transferred(template.vertices, template.faces)
+    slid = [np.linalg.norm(Surface(template.with_vertices(b)).closest(a).transfer(template.vertices, template.faces)
                            - there, axis=1) for b, a in zip(before, after, strict=True)]
     apart = [surface_distance(template.with_vertices(b), small.with_vertices(a), 20_000)
              for b, a in zip(before, after, strict=True)]

@@ -95,7 +95,7 @@ def write_user_files(work: Path) -> None:
     write_user_scan(work, "half.view", stand(person, random_pose(rng)), ScannerConfig(views=1, resolution=0.009), rng)
     # a walk in a laboratory that has the CMU marker set, 120 frames a second
     layout, (poses, trans) = read_layout("cmu41", person.mesh), walk(240, 120.0)
-    bodies = [person.posed(pose, place) for pose, place in zip(poses, trans, strict=True)]
+    bodies = [person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)]
     markers = np.stack([body[layout.vertices] + DISTANCE * Mesh(body, person.mesh.faces).vertex_normals[layout.vertices]
                         for body in bodies])
     markers += rng.normal(0, 0.001, markers.shape)

@@ -52,7 +52,7 @@ class Take:
 def recorded(model: BodyModel, path: Path) -> Take:
     """A recording; its person is found by the labels of the first half."""
     whole = read_markers(path)
-    rows, worn = choose_layout(model, "cmu41", whole.labels)[0].worn(whole.labels)
+    rows, worn = choose_layout(model, "cmu41", whole.labels)[0].match_columns(whole.labels)
     markers = whole.positions[:, rows]
     fit = find_person(model, MarkerSequence(markers[:len(markers) // 2], worn.labels, whole.rate), worn)
     return Take(model.subject(fit.betas), fit.layout, markers, whole.rate)

@@ -144,7 +144,7 @@ def main() -> None:
     for path in sorted(arguments.folder.glob("*.c3d")):
         if not arguments.files or path.stem in arguments.files:
             markers = read_markers(path)
-            rows, layout = choose_layout(model, "cmu41", markers.labels)[0].worn(markers.labels)
+            rows, layout = choose_layout(model, "cmu41", markers.labels)[0].match_columns(markers.labels)
             order = np.argsort(layout.labels)                           # the same in all files
             layout = layout.select([layout.labels[i] for i in order])
             recordings[path.stem] = layout, markers.positions[:arguments.frames, rows[order]], markers.rate

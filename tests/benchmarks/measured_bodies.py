@@ -60,7 +60,7 @@ def somebody(k: int) -> tuple[Person, np.random.Generator]:
 
 def registered(person: Person, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """The average person's mesh on a scan of somebody near rest."""
-    true = person.mesh.with_vertices(person.posed(near_rest(rng)))
+    true = person.mesh.with_vertices(person.in_pose(near_rest(rng)))
     scanned = scan(true, ScannerConfig(), rng).merged
     ids = np.array([landmarks()[name] for name in CLICKED])
     clicked = true.vertices[ids] + CLICK * rng.normal(size=(len(ids), 3))
@@ -71,7 +71,8 @@ def registered(person: Person, rng: np.random.Generator) -> dict[str, np.ndarray
 def halves(model: BodyModel, person: Person, mine: np.ndarray, k: int, rng: np.random.Generator, known: bool
            ) -> dict[str, np.ndarray]:
     """The half view of somebody in a random pose, completed; `mine` (N, 3) is the registered body."""
-    ids, true = np.array(model.info["people_vertices"]), person.mesh.with_vertices(person.posed(0.6 * random_pose(rng)))
+    ids = np.array(model.info["people_vertices"])
+    true = person.mesh.with_vertices(person.in_pose(0.6 * random_pose(rng)))
     half = half_view(true, k, landmarks(), rng)
     place = {vertex: number for number, vertex in enumerate(ids.tolist())}
     clicked = np.array([place[int(vertex)] for vertex in half.landmarks[0]]), half.landmarks[1]
@@ -98,7 +99,7 @@ def marked(model: BodyModel, person: Person, rng: np.random.Generator) -> dict[s
     frames = []
     for first, second in itertools.pairwise(keys):
         for share in np.arange(BETWEEN) / BETWEEN:
-            mesh = Mesh(person.posed((1 - share) * first + share * second)[ids], rest.faces)
+            mesh = Mesh(person.in_pose((1 - share) * first + share * second)[ids], rest.faces)
             corners = mesh.faces[places.faces]
             normals = np.einsum("lc,lcd->ld", places.bary, mesh.vertex_normals[corners])
             frames.append(np.einsum("lc,lcd->ld", places.bary, mesh.vertices[corners])

@@ -217,8 +217,8 @@ def run_case(model: BodyModel, case: Case, config: ArtefactConfig, seed: int) ->
         faulty = exchanged(case.markers, 0.1, close, rng)
         gone = dataclasses.replace(faulty, markers=dropped(faulty.markers, 0.05, 0.25, rng))
         row["close" if close else "random"] = run_exchanges(model, case, gone, reference, clean, config)
-    turns = turned(subject, layout.select(layout.matched(case.markers.labels)), motion)
-    known = case.markers.select(layout.matched(case.markers.labels))
+    turns = turned(subject, layout.select(layout.match_labels(case.markers.labels)), motion)
+    known = case.markers.select(layout.match_labels(case.markers.labels))
     for kind in KINDS:
         faulty = spoilt(known, kind, 6, turns, rng)
         found = find_artefacts(subject, faulty.markers, layout, config)

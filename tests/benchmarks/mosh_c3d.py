@@ -180,7 +180,7 @@ def main() -> None:
     parser.add_argument("--soft", action="store_true", help="also with a changing shape")
     parser.add_argument("--pictures", type=Path, help="folder for sheets of every fiftieth frame")
     args = parser.parse_args()
-    model, presets = load_model(args.model), {"default": MoshConfig(), "published": MoshConfig.published()}
+    model, presets = load_model(args.model), {"default": MoshConfig(), "published": MoshConfig.from_paper()}
     config = dataclasses.replace(presets[args.preset], soft_tissue=args.soft)
     people = model.info.get("people_vertices")
     layout = load_layout(args.layout, model.template, None if people is None else np.array(people))

@@ -87,7 +87,7 @@ def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSeque
     person = Person(SUBJECT)
     layout = load_layout("cmu41", person.mesh)
     poses, trans = walk(frames, rate)
-    bodies = [person.mesh.with_vertices(person.posed(p, t)) for p, t in zip(poses, trans, strict=True)]
+    bodies = [person.mesh.with_vertices(person.in_pose(p, t)) for p, t in zip(poses, trans, strict=True)]
     markers = MarkerSequence(np.stack([layout.place(body) for body in bodies]), layout.labels, rate)
     return markers, load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
 
@@ -101,15 +101,15 @@ def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float,
     creases = {"": Creases(at_rest(found.model), model.skeleton), " of own part": Creases(at_rest(found.model),
                                                                                         model.skeleton, 0)}
     start = time.process_time()
-    smooth = creases[""].smoothed(changed, poses)
+    smooth = creases[""].smooth(changed, poses)
     row["smoothing_ms"] = MM * (time.process_time() - start) / len(frames)
     row["smoothing_moved_mm"] = MM * float(np.linalg.norm(smooth - changed, axis=2).max())
-    theirs = Creases(at_rest(model, soft.motion.betas), model.skeleton).inverted(person, poses)
+    theirs = Creases(at_rest(model, soft.motion.betas), model.skeleton).find_inverted(person, poses)
     row["turned_on_person"] = int(theirs.sum())
     for kind, each in creases.items():
-        before, after = each.inverted(changed, poses), each.inverted(smooth, poses)
+        before, after = each.find_inverted(changed, poses), each.find_inverted(smooth, poses)
         row |= {f"turned{kind}": int(before.sum()), f"turned{kind}, smoothed": int(after.sum())}
-    row["worst_frame"] = int(creases[""].inverted(changed, poses).sum(axis=1).max())
+    row["worst_frame"] = int(creases[""].find_inverted(changed, poses).sum(axis=1).max())
     share = deformation(model.template.faces, fixed, changed)
     return row | {"deformed_mean": float(share.mean()), "deformed_most": float(np.percentile(share, 99.9)),
                   "moved_by_soft_tissue_mm": float(MM * np.linalg.norm(changed - fixed, axis=2).mean())}

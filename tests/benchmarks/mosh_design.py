@@ -49,7 +49,7 @@ def full_rmse(model: BodyModel, bodies: np.ndarray, fits: WholeFits, chosen: lis
               some: np.ndarray) -> float:
     """Metres, by full refits of some of the bodies."""
     fewer = WholeFits(fits.x[some], fits.markers, fits.places[some], fits.prior.of(some), fits.linear)
-    return float(np.sqrt(vertex_errors(model, fewer.refitted(chosen, config), bodies[some]).mean()))
+    return float(np.sqrt(vertex_errors(model, fewer.refit(chosen, config), bodies[some]).mean()))
 
 
 def members(groups: Groups, choice: Choice, count: int) -> list[int]:
@@ -74,7 +74,7 @@ def other_halves(linear: LinearBodies, groups: Groups, config: DesignConfig) -> 
     for mine in (first, ~first):
         choice, other = choose(linear.of(mine), groups, np.zeros(len(groups), bool), config), linear.of(~mine)
         for count in COUNTS:
-            squared[count].append(other.left(other.steps(members(groups, choice, count))))
+            squared[count].append(other.surface_error(other.steps(members(groups, choice, count))))
     return {count: float(np.sqrt(np.concatenate(parts).mean())) for count, parts in squared.items()}
 
 

@@ -43,8 +43,8 @@ def learned(folder: Path) -> dict[str, BodyModel]:
 
         rng = np.random.default_rng(5)
         man, sexes = Person(SUBJECT), [("female", "male")[k % 2] for k in range(120)]
-        poses = np.stack([man.posed(subject_pose(k, rng)[1]) for k in range(40)])
-        shapes = np.stack([Person(BodyShape.random(rng, sex=sex)).posed(near_rest(rng))
+        poses = np.stack([man.in_pose(subject_pose(k, rng)[1]) for k in range(40)])
+        shapes = np.stack([Person(BodyShape.random(rng, sex=sex)).in_pose(near_rest(rng))
                            for sex in sexes])
         small = decimate_person(man, poses, 10000)
         found = learn_by_sex(small.template, small.transfer(poses), small.transfer(shapes), sexes, small.skeleton,
@@ -65,7 +65,7 @@ def walking(person: Person, layout: MarkerLayout, rng: np.random.Generator, erro
     worn = MarkerLayout(layout.labels, person.mesh.faces[on.faces], layout.distances, on.bary)
     poses, trans = walk(frames, RATE, rng.uniform(0.8, 1.2))
     poses = poses + 0.04 * rng.normal(size=poses.shape[1:])
-    bodies = [person.mesh.with_vertices(person.posed(p, t)) for p, t in zip(poses, trans, strict=True)]
+    bodies = [person.mesh.with_vertices(person.in_pose(p, t)) for p, t in zip(poses, trans, strict=True)]
     return MarkerSequence(np.stack([worn.place(body) for body in bodies]), layout.labels, RATE)
 
 
@@ -112,7 +112,8 @@ def main() -> None:
               np.mean([row["right"] for row in mine if row["sex"] < 0]), "by residual",
               np.mean([row.get("residual_right", np.nan) for row in mine]), flush=True)
     write_report(args.output, {"protocol": f"{args.count} subjects, cmu41, {1e3 * args.error:g} mm, walking",
-                               "machine": machine(), "plane": sex_plane(models["neutral"]).kept(), "subjects": rows})
+                               "machine": machine(), "plane": sex_plane(models["neutral"]).to_arrays(),
+                               "subjects": rows})
 
 
 if __name__ == "__main__":

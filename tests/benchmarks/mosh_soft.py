@@ -133,7 +133,7 @@ class Scene:
         while len(chosen) < 90:
             chosen.append(int(soft[np.argmax(self.graph.nearest(np.array(chosen))[0][soft])]))
         more = np.array(chosen[len(self.marks.labels):])
-        dense = self.marks.joined(MarkerLayout(tuple(f"M{i}" for i in range(len(more))), more))
+        dense = self.marks.merge(MarkerLayout(tuple(f"M{i}" for i in range(len(more))), more))
         return {41: load_layout("cmu41", self.model.template), 67: self.marks, 90: dense}
 
     def found(self, truth: np.ndarray, layout: MarkerLayout, seed: int) -> tuple[Motion, SoftTissue]:

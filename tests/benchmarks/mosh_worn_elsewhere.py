@@ -104,7 +104,7 @@ def solved(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, seek
     if seek:
         worn = find_worn(model, [markers], layout, person, CONFIG.person)
     if worn.changes:
-        markers, layout = worn.named(markers, layout), worn.placed(layout)
+        markers, layout = worn.restore_names(markers, layout), worn.update_layout(layout)
         person = find_person(model, markers, layout, CONFIG.person)
     motion = animate(model.subject(person.betas), markers, person.layout, CONFIG.poses)
     return Solved(person.betas, person.layout, worn, motion)
@@ -128,7 +128,7 @@ def rotations_of(model: BodyModel, result: Solved, vertices: np.ndarray) -> np.n
 def reference(model: BodyModel, path: Path, layout: MarkerLayout) -> Reference:
     """A recording solved as it is."""
     whole = read_markers(path)
-    labels = [label for label in layout.matched(whole.labels) if whole.select([label]).seen.any()]
+    labels = [label for label in layout.match_labels(whole.labels) if whole.select([label]).seen.any()]
     few = whole.select(labels).frames(slice(None, None, EVERY))
     markers = MarkerSequence(few.positions, tuple(layout.aliases.get(label, label) for label in labels), few.rate)
     result = solved(model, markers, layout)
@@ -146,7 +146,7 @@ def moved(model: BodyModel, ref: Reference, count: int, rng: np.random.Generator
     for i in rng.choice(free, count, replace=False):
         away = np.linalg.norm(ref.body.vertices - ref.places[i], axis=1)
         v = int(rng.choice(np.flatnonzero((away > NEAREST) & (away < FARTHEST))))
-        there = layout.moved({"X": v})
+        there = layout.with_places({"X": v})
         turned = rotations_of(model, ref.result, np.array([v]))[:, 0]
         noise = np.einsum("tdc,tc->td", turned, ref.noise[:, i])
         into.positions[:, i] = simulated(model, ref.result, there)[:, 0] + noise

@@ -181,7 +181,7 @@ def main() -> None:
     theirs = solve(person, trc, args.folder)
     told_angles = anatomical_angles(motion, subject, joint_centres(motion, subject))
     draw(args.folder / "angles.png", ours, theirs, motion.rate)
-    told = motion.told()
+    told = motion.residuals_of_trusted()
     used = [i for i, label in enumerate(motion.labels) if label in layout.labels]
     off = {key: ours[key] - theirs[key] for side in "rl" for key in (f"{each}_{side}" for each in COMPARED)}
     report = {"recording": args.recording.name, "model": name.split(",")[0], "frames": len(told), "markers": len(used),

@@ -78,7 +78,7 @@ def fixed_shape(model_file: str, markers: MarkerSequence, layout: MarkerLayout) 
     start = processor_seconds()
     found = mosh(model, markers, layout, MoshConfig(soft_tissue=False))
     cpu_s, motion, subject = processor_seconds() - start, found.motions[0], model.subject(found.betas)
-    body = MarkedBody(subject, found.layout.select(layout.matched(markers.labels)), 0.0, 0.0)
+    body = MarkedBody(subject, found.layout.select(layout.match_labels(markers.labels)), 0.0, 0.0)
     return (body.positions(body.body.join(motion.poses, motion.trans)), model.skeleton.part_rotations(motion.poses),
             subject.joints(motion.poses, motion.trans), cpu_s)
 
@@ -94,7 +94,8 @@ def by_momentum(given: Given, limit: float, model_file: str, markers: MarkerSequ
     """pymomentum on the joints of our mean person, or why there is none."""
     model = load_model(model_file)
     up = upright(model.template)[0]
-    U, labels, rig = turn_up(up), layout.matched(markers.labels), make_rig(model, np.zeros(model.n_betas)).turned(up)
+    U, labels, rig = turn_up(up), layout.match_labels(markers.labels), make_rig(model,
+                                                                                np.zeros(model.n_betas)).with_up(up)
     worn, skeleton = layout.select(labels), rig.skeleton
     done = alone(limit, solve, Markers(
         skeleton.names, skeleton.parents, CM * skeleton.joints, labels,
@@ -114,9 +115,9 @@ TOOLS: dict[str, Callable[[float, str, MarkerSequence, MarkerLayout], Solved | O
 
 def measure(found: Solved, model: BodyModel, markers: MarkerSequence, layout: MarkerLayout) -> dict[str, object]:
     """The figures of a tool and a recording."""
-    seen = markers.select(layout.without(HELD_OUT).matched(markers.labels)).positions
+    seen = markers.select(layout.without(HELD_OUT).match_labels(markers.labels)).positions
     off = 1e3 * np.linalg.norm(found.places - seen, axis=2)
-    held = [label for label in layout.matched(markers.labels) if layout.aliases.get(label, label) in HELD_OUT]
+    held = [label for label in layout.match_labels(markers.labels) if layout.aliases.get(label, label) in HELD_OUT]
     part = model.skeleton.part_of_vertex(model.template)[layout.select(held).nearest]
     apart, parts = calibrated(found, model.skeleton, part, markers.select(held).positions,
                               spread_frames(seen, CALIBRATED))

@@ -91,7 +91,7 @@ def half_view(body: Mesh, k: int, landmarks: dict[str, int], rng: np.random.Gene
         to_camera = camera - points
         far = np.linalg.norm(to_camera, axis=1, keepdims=True)
         facing = np.einsum("nd,nd->n", normals, to_camera / far) > 0.15
-        return facing & ~rays.occluded(points + 1e-3 * normals, to_camera / far, 10.0)
+        return facing & ~rays.test_occlusion(points + 1e-3 * normals, to_camera / far, 10.0)
 
     seen = visible(body.vertices, body.vertex_normals)
     points = np.zeros((0, 3))

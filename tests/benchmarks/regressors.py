@@ -26,7 +26,7 @@ SETTINGS = {
     "quadratic": LearnConfig(features="quadratic"),
     "support vectors": LearnConfig(regressor="svr"),
     "linear, no refinement": LearnConfig(refinements=0),
-    "linear, as published": LearnConfig.published(),
+    "linear, as published": LearnConfig.from_paper(),
 }
 
 

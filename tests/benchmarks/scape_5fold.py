@@ -44,7 +44,7 @@ def rigid(template: Mesh, poses: np.ndarray, skeleton: Skeleton) -> BodyModel:
 
 def published(template: Mesh, poses: np.ndarray, skeleton: Skeleton, pruning: float | None = None) -> BodyModel:
     """Learning as the paper has it; its 0.1 read as a standard deviation, or as a variance in square radians."""
-    config = LearnConfig.published()
+    config = LearnConfig.from_paper()
     config = config if pruning is None else replace(config, prunings=(pruning,))
     return learn_scape(template, poses, None, skeleton, config)
 

@@ -54,7 +54,7 @@ def main() -> None:
         surface, there = Surface(item.truth), signature(item.truth)
         ours = register(data.template, item.scan, item.landmarks(data, "10")).mesh.vertices
         slid = item.truth.vertices + np.random.default_rng(index).normal(0, SLIDE, ours.shape)
-        carried = (surface.closest(x).transferred(there, item.truth.faces) for x in (slid, ours))
+        carried = (surface.closest(x).transfer(there, item.truth.faces) for x in (slid, ours))
         rows.append({"pose": index, "apart_mm": 1e3 * float(np.linalg.norm(ours - item.truth.vertices, axis=1).mean())}
                     | {name: correlation(rest, values, weights)
                        for name, values in zip(("reference", "slid", "ours"), (there, *carried), strict=True)})

@@ -156,7 +156,7 @@ def against_truth(mesh: Mesh, poses: np.ndarray, truth: Skeleton) -> dict[str, o
 
 def embedded(noise: float, slide: float, seed: int = 1, count: int = 20) -> dict[str, object]:
     person, rng = Person(), np.random.default_rng(seed)
-    poses = np.stack([person.posed(subject_pose(k, rng)[1]) for k in range(count)])
+    poses = np.stack([person.in_pose(subject_pose(k, rng)[1]) for k in range(count)])
     if noise or slide:
         poses = disturbed(person.mesh, poses, noise, slide, rng)
     return {"noise_mm": 1e3 * noise, "slide_mm": 1e3 * slide, **against_truth(person.mesh, poses, person.skeleton)}

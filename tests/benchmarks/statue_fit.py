@@ -49,8 +49,8 @@ NAMES = {"right toe": "toe in right leg", "left toe": "toe in left leg", "right 
 WAYS: dict[str, SurfaceFitConfig] = {
     "ours": SurfaceFitConfig(),
     "without cover": SurfaceFitConfig(cover=0),
-    "published": replace(SurfaceFitConfig.published(), slack="rest"),
-    "published, their slack": SurfaceFitConfig.published(),
+    "published": replace(SurfaceFitConfig.from_paper(), slack="rest"),
+    "published, their slack": SurfaceFitConfig.from_paper(),
     "published, polished": SurfaceFitConfig(step="explicit", cooling=0.7, most=100),
 }
 
@@ -111,7 +111,7 @@ def restored(shape: LocalShape, x: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _curved(shape: LocalShape, w: np.ndarray, x: np.ndarray, d: np.ndarray) -> np.ndarray:
-    return shape.transposed(x, w * shape.derivative(x, d)) + 1e-9 * d
+    return shape.apply_transpose(x, w * shape.derivative(x, d)) + 1e-9 * d
 
 
 def figure_6(noise: float = 0.005) -> dict[str, float]:
@@ -125,7 +125,7 @@ def figure_6(noise: float = 0.005) -> dict[str, float]:
 
     left, y = {}, noisy
     for k in range(1, 1001):
-        y = y + 0.5 * shape.published_force(y)
+        y = y + 0.5 * shape.paper_force(y)
         if k in (10, 100, 1000):
             left[f"published_{k}"] = off(y) / off(noisy)
     return {**left, "exact_10": off(restored(shape, noisy, 10)) / off(noisy)}

@@ -106,7 +106,7 @@ def procedural(only: list[str], count: int) -> dict[str, object]:
     kept = np.array(model.info["people_vertices"])
     person = Person(BodyShape.random(np.random.default_rng(SEED)))
     poses, trans = walk(count, RATE)
-    truth = np.stack([person.posed(pose, place) for pose, place in zip(poses, trans, strict=True)])
+    truth = np.stack([person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
     frames = record(truth, person.mesh.faces, SEED)
     known = subject_from_body(model, person.mesh.vertices[kept])
     middle = slice(count // 2 - GAP // 2, count // 2 - GAP // 2 + GAP)

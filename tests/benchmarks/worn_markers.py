@@ -94,7 +94,7 @@ def synthetic_cases(count: int) -> Iterator[Case]:
     for k in range(count):
         rng = np.random.default_rng(1000 + k)
         person = Person(BodyShape.random(rng, "male" if k % 2 else "female"))
-        posed = person.mesh.with_vertices(person.posed(0.6 * random_pose(rng)))
+        posed = person.mesh.with_vertices(person.in_pose(0.6 * random_pose(rng)))
         truth = model.template.with_vertices(posed.vertices[kept])
         whole = scan(posed, ScannerConfig(), rng).merged
         yield from views_of("synthetic person", f"person {k}", model, False, layout, truth, whole,

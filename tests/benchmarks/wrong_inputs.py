@@ -67,7 +67,7 @@ def subject(seed: int, posed: bool = True, views: int = 4) -> Subject:
     rng = np.random.default_rng([seed, 77])
     person, model = Person(BodyShape.random(rng)), load_built_in_model()
     pose = random_pose(rng) if posed else np.zeros((16, 3))
-    body = Mesh(person.posed(pose), person.mesh.faces)
+    body = Mesh(person.in_pose(pose), person.mesh.faces)
     kept = np.array(model.info["people_vertices"])
     seen = scan(body, ScannerConfig(resolution=0.01, views=views), rng).merged
     truth = body.vertices[kept]
@@ -241,7 +241,7 @@ def recording(seed: int) -> tuple[MarkerSequence, np.ndarray]:
     """A person who walks, with the 41 markers where their layout has them, some on bars; the vertices (T, N, 3)."""
     rng, model = np.random.default_rng([seed, 78]), load_built_in_model()
     person, kept = Person(BodyShape.random(rng)), np.array(model.info["people_vertices"])
-    bodies = np.stack([person.posed(pose, trans)[kept] for pose, trans in zip(*walk(FRAMES, RATE), strict=True)])
+    bodies = np.stack([person.in_pose(pose, trans)[kept] for pose, trans in zip(*walk(FRAMES, RATE), strict=True)])
     layout = choose_layout(model, None, tuple(MARKERS))[0]
     places = np.stack([layout.place(model.template.with_vertices(body)) for body in bodies])
     return MarkerSequence(places + rng.normal(0, 0.001, places.shape), layout.labels, RATE), bodies

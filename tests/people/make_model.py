@@ -58,7 +58,7 @@ def learn_people_model(poses: int, faces: int, config: LearnConfig = LEARN, n_be
     at += [near_rest(rng) for _ in range(round(STANDING * poses / 2))]
     # with mirror images: else the mean of the poses leaves the body at rest turned to one side
     at = [side for pose in at for side in (pose, mirror_pose(pose))]
-    posed = np.stack([person.posed(pose) for pose in at])
+    posed = np.stack([person.in_pose(pose) for pose in at])
     small = decimate_person(person, posed, faces)
     assert small.skeleton is not None, "a skeleton was given"
     model = learn_scape(small.template, small.transfer(posed), None, small.skeleton, config)

@@ -116,7 +116,7 @@ class Work:
         covered = find_coverage(body, layout, [motion], [sequence])
         moving = Judgement.of(motion_problem(motion, body.template, layout, sequence),
                               motion_doubts([motion], [sequence], body.template))
-        judgement = covered.judgement().joined(labelling, moving, worn.judgement(sequence.labels), placed)
+        judgement = covered.judgement().merge(labelling, moving, worn.judgement(sequence.labels), placed)
         if found is not None:
             judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
         metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *figures(motion)]
@@ -139,8 +139,8 @@ class Work:
                          lambda: find_worn(self.model, [sequence], layout, found, self.person))
         if not worn.changes:
             return sequence, found, worn
-        sequence = worn.named(sequence, layout)
-        return sequence, find("subject again", sequence, worn.placed(layout)), worn
+        sequence = worn.restore_names(sequence, layout)
+        return sequence, find("subject again", sequence, worn.update_layout(layout)), worn
 
 
 def figures(motion: Motion) -> list[Metric]:
@@ -149,7 +149,7 @@ def figures(motion: Motion) -> list[Metric]:
     off = MM * motion.residuals[seen] if seen.any() else np.array([np.nan])
     frame = MM * np.where(seen, motion.residuals, 0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
     return [
-        Metric(MEAN_ERROR, MM * float(np.nanmean(motion.told())) if seen.any() else np.nan, "mm"),
+        Metric(MEAN_ERROR, MM * float(np.nanmean(motion.residuals_of_trusted())) if seen.any() else np.nan, "mm"),
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),

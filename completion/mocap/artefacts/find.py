@@ -65,7 +65,7 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
         # what it expects tells with the tracks which labels are swapped
         simulated, before, begun, sure = body.body.positions(x), order, bad, not unsure.any()
         places = np.full(markers.positions.shape, np.nan)
-        places[:, body.rows] = body.expected(repaired, simulated, x, unsure)
+        places[:, body.rows] = body.expect(repaired, simulated, x, unsure)
         order = swaps.find_order(markers.positions, markers.rate, places)
         if sure and not tried_both and (order == before).all():
             order, tried_both = _both_ways(body, markers, x, order, places), True
@@ -130,7 +130,7 @@ class Simulation:
     """A body that follows markers whose labels are taken as they are."""
 
     def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout) -> None:
-        self.rows, worn = layout.worn(markers.labels)
+        self.rows, worn = layout.match_columns(markers.labels)
         self.labels, self.rate = worn.labels, markers.rate
         self.body = MarkedBody(subject, worn, FOLLOW.prior_weight, FOLLOW.prior_shrinkage)
         self.part = subject.skeleton.part_of_vertex(subject.template)[worn.nearest]
@@ -151,14 +151,14 @@ class Simulation:
         inside, stiffness = span_with_markers(targets), FOLLOW.inertia(self.rate, self.body.n_unknowns)
         for _ in range(FOLLOW.smoothing):
             weights = self.weights(x[inside], targets[inside])
-            x[inside] = self.body.smoothed(x[inside], stiffness, self.body.system, targets[inside], weights)
+            x[inside] = self.body.smooth_step(x[inside], stiffness, self.body.system, targets[inside], weights)
         return x
 
     def weights(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """Weights (n, L) of markers (n, L, 3), low for outliers, the body being at unknowns (n, P)."""
         return marker_weights(self.body.positions(x), targets, FOLLOW.marker_sd, FOLLOW.outlier)[0]
 
-    def expected(self, targets: np.ndarray, simulated: np.ndarray, x: np.ndarray, unsure: np.ndarray) -> np.ndarray:
+    def expect(self, targets: np.ndarray, simulated: np.ndarray, x: np.ndarray, unsure: np.ndarray) -> np.ndarray:
         """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
         usual = median_of_known(self.local(targets - simulated, x), 0)
         usual[unsure[self.rows]] = 0
@@ -168,13 +168,13 @@ class Simulation:
 
     def local(self, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Vectors (T, L, 3) of markers in the frames of their parts, the body being at x (T, P)."""
-        return self._turned("tldc,tld->tlc", vectors, x)
+        return self._rotate("tldc,tld->tlc", vectors, x)
 
     def world(self, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Vectors (T, L, 3) in the frames of the markers' parts as they are in the world: the inverse of `local`."""
-        return self._turned("tldc,tlc->tld", vectors, x)
+        return self._rotate("tldc,tlc->tld", vectors, x)
 
-    def _turned(self, how: str, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def _rotate(self, how: str, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Products (T, L, 3) of the rotations of the markers' parts, from the part to the world, and vectors."""
         R, out = self.body.body.skeleton.part_rotations(self.body.body.split(x)[0]), np.empty(vectors.shape)
         for some in batches(len(x)):

@@ -105,7 +105,7 @@ class MarkerArtefacts:
             out[gone, row] = self.expected[gone, i]
         return MarkerSequence(out, self.repaired.labels, self.repaired.rate)
 
-    def renamed(self, order: np.ndarray, seen: np.ndarray) -> MarkerArtefacts:
+    def rename_labels(self, order: np.ndarray, seen: np.ndarray) -> MarkerArtefacts:
         """The same of the sequence as it came, from whose columns `order` (L,) the labels were taken all through.
 
         `seen` (T, L) is where its markers were seen.

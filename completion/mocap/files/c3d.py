@@ -50,7 +50,7 @@ class _Numbers:
         halves = np.frombuffer(data, "<u2").reshape(-1, 2)           # the upper half first, exponent larger by 2
         return halves[:, ::-1].copy().view("<f4")[:, 0].astype(np.float64) / 4
 
-    def encoded(self, values: np.ndarray, kind: str) -> bytes:
+    def encode(self, values: np.ndarray, kind: str) -> bytes:
         """Numbers as bytes, floating-point ones ("f4") or whole ones ("i2")."""
         if kind == "f4" and self.processor == _DEC:
             return (4 * values.ravel()).astype("<f4").view("<u2").reshape(-1, 2)[:, ::-1].tobytes()
@@ -310,7 +310,7 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     words[:, mine] = fresh
     out = np.frombuffer(data, np.uint8).copy()
     rows = out[table.start:table.start + table.frames * table.width].reshape(table.frames, -1)
-    encoded = np.frombuffer(table.numbers.encoded(words, table.kind), np.uint8)
+    encoded = np.frombuffer(table.numbers.encode(words, table.kind), np.uint8)
     rows[:, :encoded.size // table.frames] = encoded.reshape(table.frames, -1)
     return out.tobytes()
 
@@ -337,7 +337,7 @@ def as_floats(path: Path, data: bytes) -> bytes:
         values[:, own:] = numbers.words(rows, "u2").reshape(table.frames, -1)[:, own:]
     values[:, :own] *= np.tile([table.scale] * 3 + [1.0], len(table.labels))
     head = bytearray(data[:table.start])
-    minus = numbers.encoded(np.array([-abs(table.scale)]), "f4")
+    minus = numbers.encode(np.array([-abs(table.scale)]), "f4")
     head[12:16] = minus
     records = list(parameter_records(data, numbers))
     points = next((-group for group, name, *_ in records if group < 0 and name == "POINT"), 0)
@@ -345,7 +345,7 @@ def as_floats(path: Path, data: bytes) -> bytes:
         if group == points and name == "SCALE":
             value = link + 4 + data[link + 3]                          # behind type and dimensions
             head[value:value + 4] = minus
-    body = numbers.encoded(values, "f4")
+    body = numbers.encode(values, "f4")
     return bytes(head) + body + bytes(-len(body) % BLOCK)
 
 

@@ -74,7 +74,7 @@ def _with_points(path: Path, data: bytes, table: PointTable, words: np.ndarray, 
     # every frame with the points before its analog channels
     size, T, behind = 4 if table.kind == "f4" else 2, table.frames, rotations_start(parameters, table.start, len(data))
     rows = np.frombuffer(data, np.uint8, T * table.width, table.start).reshape(T, -1)
-    encoded = np.frombuffer(table.numbers.encoded(words, table.kind), np.uint8)
+    encoded = np.frombuffer(table.numbers.encode(words, table.kind), np.uint8)
     own = 4 * len(table.labels) * size
     body = _pad(np.concatenate([encoded.reshape(T, -1), rows[:, own:]], axis=1).tobytes())
     behind = behind if behind >= table.start + table.frames * table.width else 0

@@ -64,9 +64,9 @@ class LabelledRecording:
         """What the labels of all people are worth."""
         if len(self.people) == 1:
             return self.people[0].judgement
-        return Judgement().joined(*(Judgement.of([f"person {k}: {why}" for why in one.judgement.problems],
-                                                 [f"person {k}: {why}" for why in one.judgement.doubts])
-                                    for k, one in enumerate(self.people, start=1)))
+        return Judgement().merge(*(Judgement.of([f"person {k}: {why}" for why in one.judgement.problems],
+                                                [f"person {k}: {why}" for why in one.judgement.doubts])
+                                   for k, one in enumerate(self.people, start=1)))
 
     def write(self, output: Path) -> None:
         """Write the labelled recording: markers first, then points that are none, packed as `*1`, `*2`, ...
@@ -141,7 +141,7 @@ def columns_of_labels(points: MarkerSequence, layout: MarkerLayout, prefixes: Se
     Rows are those of the layout, counted on from person to person; `prefixes` are what their labels begin with, with
     the colon. Of one person the only prefix of the recording, or none, will do.
     """
-    spelled = layout.spelled([label.rpartition(":")[2] for label in points.labels])
+    spelled = layout.with_spellings([label.rpartition(":")[2] for label in points.labels])
     rows = {label: i for i, label in enumerate(layout.labels)}
     rows |= {alias: rows[label] for alias, label in spelled.aliases.items() if label in rows}
     only = len(prefixes) == 1 and len(people_of(points.labels)) < 2     # whatever the file calls that person

@@ -181,7 +181,7 @@ def _snap(layout: MarkerLayout, labels: dict[str, str], usual: MarkerLayout) -> 
     vertices, weights = usual.skin
     moved = MarkerLayout(tuple(label for label in layout.labels if label in labels), vertices[order],
                          np.asarray(usual.distances)[order], weights=weights[order])
-    return moved.joined(layout.select(rest)) if rest else moved
+    return moved.merge(layout.select(rest)) if rest else moved
 
 
 def long_tracks(points: MarkerSequence) -> MarkerSequence:

@@ -66,13 +66,13 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
     lonely = {label: o for label in base.labels if (o := other_side(label)) and o not in base.labels}
     rows = [base.labels.index(label) for label in lonely]
     loose = tuple(o for label, o in lonely.items() if label in base.loose)
-    whole = base.joined(MarkerLayout(tuple(lonely.values()), mirror.partner[base.nearest[rows]], loose=loose))
+    whole = base.merge(MarkerLayout(tuple(lonely.values()), mirror.partner[base.nearest[rows]], loose=loose))
     if count < len(whole.labels):
         raise ValueError(f"count: expected at least the {len(whole.labels)} markers of the base with their partners, "
                          f"got {count}")
     places = _spread(body, mirror, turn * mirror.across, count - len(whole.labels), whole.nearest)
     vertices = np.array([v for place in places for v in place], dtype=np.int64)
-    return whole.joined(MarkerLayout(tuple(_names(body, skeleton, places)), vertices))
+    return whole.merge(MarkerLayout(tuple(_names(body, skeleton, places)), vertices))
 
 
 def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.ndarray:
@@ -99,7 +99,7 @@ def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.nda
     rays, n = Rays(body), 48
     origins, directions = _fans(body, np.sqrt((np.arange(n) + 0.5) / n))
     lifted = origins + 1e-4 * reach * np.repeat(normals, n, axis=0)
-    openness = 1 - rays.occluded(lifted, directions, reach).reshape(-1, n).mean(axis=1)
+    openness = 1 - rays.test_occlusion(lifted, directions, reach).reshape(-1, n).mean(axis=1)
     closed = np.flatnonzero(around @ openness < 0.75)
     away = SurfaceGraph(body).nearest(closed)[0] if len(closed) else np.inf
 

@@ -59,7 +59,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
     else:
         among = choose_layout(loaded, candidates, ())[0]
         if kept is not None and not set(kept.labels) <= set(among.labels):
-            among = among.joined(kept.without([label for label in kept.labels if label in among.labels]))
+            among = among.merge(kept.without([label for label in kept.labels if label in among.labels]))
     labels = () if kept is None else kept.labels
     found, people = _read_bodies(loaded, bodies, unit)
     if config.poses:

@@ -147,12 +147,13 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     other: list[np.ndarray] = []
     for mine in (halves, ~halves) if halves.any() and not halves.all() else ():
         rest = linear.of(~mine)
-        other.append(rest.left(rest.steps(_members(groups, choose(linear.of(mine), groups, kept, config).groups))))
+        other.append(rest.surface_error(rest.steps(_members(groups,
+                                                            choose(linear.of(mine), groups, kept, config).groups))))
     tell(total, total)
 
     # the same without linearising
     def refitted(chosen: list[int]) -> float:
-        return float(np.sqrt(vertex_errors(model, fits.refitted(chosen, config), bodies).mean()))
+        return float(np.sqrt(vertex_errors(model, fits.refit(chosen, config), bodies).mean()))
 
     chosen, full, checks = _members(groups, choice.groups), None, list[Check]()
     if not config.joint:

@@ -69,7 +69,7 @@ class BodyPoints:
 
     def some(self, chosen: np.ndarray) -> BodyPoints:
         """Some of the points."""
-        return BodyPoints(self.shaped.combined(combination_weights(self.count, np.arange(self.count)[chosen], None)))
+        return BodyPoints(self.shaped.combine(combination_weights(self.count, np.arange(self.count)[chosen], None)))
 
     @property
     def batch(self) -> int:

@@ -80,7 +80,7 @@ class MarkerSets:
         B = linear.rows[:, members].reshape(Z, -1, P)
         self._C = np.linalg.inv(np.swapaxes(B, -1, -2) @ B + linear.precision)
         d = linear.steps(members)
-        self.costs = linear.left(d)
+        self.costs = linear.surface_error(d)
         slope = ((linear.gram @ d[..., None])[..., 0] - linear.pull)[..., None]
         self._rho = self._gaps - (self._rows @ d[:, None, :, None])[..., 0]
         self._q = (self._rows @ (self._C @ slope)[:, None])[..., 0]
@@ -100,7 +100,7 @@ class MarkerSets:
         """Root of the mean squared distance, metres."""
         return float(np.sqrt(self.costs.mean()))
 
-    def tried(self, groups: np.ndarray, sign: int) -> np.ndarray:
+    def score_groups(self, groups: np.ndarray, sign: int) -> np.ndarray:
         """(n,) mean squared distance after each of some groups comes (+1) or goes (-1)."""
         rho, S = self._rho[:, groups], self._S[:, groups]
         k = np.linalg.solve(np.eye(S.shape[-1]) + sign * S, rho[..., None])
@@ -154,7 +154,7 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
         passed = np.array([any(0 < sign * (stop - sets.count) < size for stop in through)
                            for size in sets.sizes[open_]])
         open_ = open_ if passed.all() else open_[~passed]
-        gain = (sets.tried(open_, sign) - sets.costs.mean()) / sets.sizes[open_]
+        gain = (sets.score_groups(open_, sign) - sets.costs.mean()) / sets.sizes[open_]
         steps.append(int(open_[np.argmin(gain)]))
         sets.take(steps[-1], sign)
         if sign == ADD and sets.count < 8:           # the first markers know the place a thousand times better
@@ -180,7 +180,7 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
             others = np.flatnonzero(movable & sets.inside & (sets.sizes == 1))
             others = others[others != group]
             if sets.inside[group] and len(others):
-                least = others[np.argmin(sets.tried(others, REMOVE))]
+                least = others[np.argmin(sets.score_groups(others, REMOVE))]
                 done += _exchange(sets, movable, [int(group), int(least)])
         if done == before:
             break
@@ -223,5 +223,5 @@ def _best(sets: MarkerSets, movable: np.ndarray, size: int) -> tuple[int, float]
     open_ = np.flatnonzero(movable & ~sets.inside & (sets.sizes == size))
     if not len(open_):
         return -1, float("inf")
-    costs = sets.tried(open_, ADD)
+    costs = sets.score_groups(open_, ADD)
     return int(open_[np.argmin(costs)]), float(costs.min())

@@ -44,13 +44,13 @@ class LinearBodies:
         right = self.lean + (transposed @ self.gaps[:, chosen].reshape(Z, -1, 1))[..., 0]
         return np.asarray(np.linalg.solve(transposed @ B + self.precision, right[..., None])[..., 0])
 
-    def left(self, steps: np.ndarray) -> np.ndarray:
+    def surface_error(self, steps: np.ndarray) -> np.ndarray:
         """(Z,) mean squared distance of the surface, square metres, after steps (Z, P)."""
         return np.asarray(((steps[:, None] @ self.gram)[:, 0] * steps - 2 * self.pull * steps).sum(axis=1) + self.rest)
 
     def rmse(self, chosen: Sequence[int] | np.ndarray) -> float:
         """Root of the mean squared distance, metres, over all vertices and bodies. [MoSh] Eq. 27"""
-        return float(np.sqrt(self.left(self.steps(chosen)).mean()))
+        return float(np.sqrt(self.surface_error(self.steps(chosen)).mean()))
 
     def of(self, bodies: np.ndarray) -> LinearBodies:
         """Some of the bodies only."""
@@ -68,7 +68,7 @@ class WholeFits:
     prior: Prior
     linear: LinearBodies
 
-    def refitted(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig) -> np.ndarray:
+    def refit(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig) -> np.ndarray:
         """Unknowns (Z, P) from some candidates without linearising, from the fit to the whole body on. [MoSh] Eq. 26"""
         chosen = np.asarray(chosen)
         weights = np.full(len(chosen), config.marker_sd**-2)
@@ -147,7 +147,7 @@ def share_betas(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas
     # steps are counted from where the shift leads
     at, lead = linear.of(bodies), shift.reshape(Z, P)
     at = replace(at, gaps=at.gaps - (at.rows @ lead[:, None, :, None])[..., 0],
-                 pull=at.pull - (at.gram @ lead[..., None])[..., 0], rest=at.left(lead),
+                 pull=at.pull - (at.gram @ lead[..., None])[..., 0], rest=at.surface_error(lead),
                  lean=at.lean - lead @ at.precision)
     C, r = at.gaps.shape[1:]
     rows, gaps = np.zeros((len(names), C, F * r, F * n + K)), at.gaps.reshape(len(names), F, C, r)

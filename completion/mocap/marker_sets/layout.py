@@ -179,7 +179,7 @@ class MarkerLayout:
             | {"indices": indices} for (distance, loose, wand), indices in sets.items()]}
         storage.write_json(path, tree | ({"aliases": dict(self.aliases)} if self.aliases else {}))
 
-    def matched(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
+    def match_labels(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
         """Those of the labels that the layout knows, in their own order, or ValueError where they are fewer.
 
         An alias counts only where its marker is not there.
@@ -192,12 +192,12 @@ class MarkerLayout:
                              f"layout: {', '.join(self.labels)}; sequence: {', '.join(labels) or 'none'}")
         return found
 
-    def worn(self, labels: Sequence[str], minimum: int = 3) -> tuple[np.ndarray, MarkerLayout]:
+    def match_columns(self, labels: Sequence[str], minimum: int = 3) -> tuple[np.ndarray, MarkerLayout]:
         """Which columns (n,) of a sequence the layout knows, as `matched` finds them, and their part of the layout."""
-        known = self.matched(labels, minimum)
+        known = self.match_labels(labels, minimum)
         return np.array([list(labels).index(label) for label in known], dtype=int), self.select(known)
 
-    def spelled(self, labels: Sequence[str]) -> MarkerLayout:
+    def with_spellings(self, labels: Sequence[str]) -> MarkerLayout:
         """The same with those labels as aliases that differ from its own only in case, dots, blanks or dashes."""
         meant: dict[str, set[str]] = {}
         for name in (*self.labels, *self.aliases):
@@ -228,7 +228,7 @@ class MarkerLayout:
         kept = self.select([label for label in self.labels if label not in gone])
         return replace(kept, aliases={a: label for a, label in self.aliases.items() if label not in gone})
 
-    def joined(self, other: MarkerLayout) -> MarkerLayout:
+    def merge(self, other: MarkerLayout) -> MarkerLayout:
         """The markers of both, of which no label is the same; aliases that are labels now go."""
         labels, both = (*self.labels, *other.labels), (self, other)
         aliases = {a: label for each in (other, self) for a, label in each.aliases.items() if a not in labels}
@@ -242,7 +242,7 @@ class MarkerLayout:
         return MarkerLayout(labels, places, np.r_[np.asarray(self.distances), np.asarray(other.distances)], weights,
                             aliases, (*self.loose, *other.loose), (*self.wands, *other.wands))
 
-    def moved(self, places: Mapping[str, int]) -> MarkerLayout:
+    def with_places(self, places: Mapping[str, int]) -> MarkerLayout:
         """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
         vertices, weights = self.vertices.copy(), None if self.weights is None else self.weights.copy()
         for label, vertex in places.items():

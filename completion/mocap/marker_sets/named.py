@@ -101,8 +101,8 @@ def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
     """The named layout that knows most of some labels, and its name; ValueError where none knows three of them."""
-    found = {name: load_layout(name, template, kept).spelled(labels) for name in layout_names()}
-    known = {name: len(layout.matched(labels, 0)) for name, layout in found.items()}
+    found = {name: load_layout(name, template, kept).with_spellings(labels) for name in layout_names()}
+    known = {name: len(layout.match_labels(labels, 0)) for name, layout in found.items()}
     best = max(found, key=lambda name: (known[name], -len(found[name].labels)))
     if known[best] < FEWEST:
         told = ", ".join(f"{name} {count}" for name, count in sorted(known.items(), key=lambda item: -item[1]))
@@ -118,7 +118,7 @@ def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[s
     of_people = None if kept is None else np.array(kept)
     if given is None:
         return fitting_layout(labels, model.template, of_people)
-    return read_layout(given, model.template, of_people, model.skeleton).spelled(labels), str(given)
+    return read_layout(given, model.template, of_people, model.skeleton).with_spellings(labels), str(given)
 
 
 def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None, skeleton: Skeleton | None = None

@@ -38,7 +38,7 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
         draw, taken = ImageDraw.Draw(image), list[tuple[float, float, float, float]]()
         towards = camera.position - points
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        hidden = Rays(body).occluded(points + 1e-4 * towards, towards)
+        hidden = Rays(body).test_occlusion(points + 1e-4 * towards, towards)
         places = camera.project(points, width, height)
         # each label beside its marker, where no other label is
         for i in np.argsort(places[:, 1]):

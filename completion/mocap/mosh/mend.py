@@ -49,7 +49,7 @@ class Result:
     def read(folder: Path, call: MoshCall) -> Result:
         """That of a folder, which need not be open."""
         models, kept = call.models(), Workspace(folder, folder / HOME)
-        names = set(kept.kept(""))
+        names = set(kept.list_results(""))
         actors = [actor for actor in call.actors(folder) if actor.name in names]
         rows = {actor.name: kept.value(actor.name)[0] for actor in actors}
         order = describe(call, models.name, actors).worst_first(Results(rows, {}, ()), rows)
@@ -168,9 +168,9 @@ class MoshApp(ResultsApp):
         """
         if name == other or not {name, other} <= set(self.person.names):
             raise ValueError("choose two markers of this person, to exchange them")
-        self._change(self.current, {name: self._given(other), other: self._given(name)})
+        self._change(self.current, {name: self._layout_place(other), other: self._layout_place(name)})
 
-    def _given(self, label: str) -> np.ndarray:
+    def _layout_place(self, label: str) -> np.ndarray:
         """Where the layout, as it is corrected by now, has a marker on the person that is shown."""
         spot = self.spots.get(self._own(label)) or Spot.of(self.result.usual, self._own(label))
         return spot.on(self.person.body)
@@ -191,7 +191,7 @@ class MoshApp(ResultsApp):
             raise ValueError("nothing was corrected: move, exchange or take away a marker first")
         call = replace(self.result.call, layout=str(self.file))
         worn = {label for one in self.result.people for label in one.names}
-        apply_corrections(self.result.usual, self.spots).matched(sorted(worn), LEAST)
+        apply_corrections(self.result.usual, self.spots).match_labels(sorted(worn), LEAST)
         # now, as they are worked out from files that the run writes anew
         before = {one.name: self.result.figures(one.name) for one in self.result.people}
 

@@ -70,7 +70,7 @@ def apply_corrections(layout: MarkerLayout, spots: Spots) -> MarkerLayout:
                              np.array([spot.distance for spot in moved.values()]),
                              np.array([spot.weights for spot in moved.values()]),
                              loose=tuple(label for label, spot in moved.items() if spot.loose))
-        kept = kept.joined(there) if kept.labels else there
+        kept = kept.merge(there) if kept.labels else there
     return replace(kept, aliases={a: label for a, label in layout.aliases.items() if label in kept.labels})
 
 

@@ -37,7 +37,7 @@ class PoseConfig(AnimateConfig):
     """Settings of the poses of a person whose shape and marker places are known: as of `animate`."""
 
     @classmethod
-    def weighted(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:
+    def from_weights(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:
         """Settings of weights on squared centimetres, on the pose prior, and on squared radians.
 
         A weight is the inverse of a squared deviation. That of the velocity's change from frame to frame is meant for
@@ -76,7 +76,7 @@ class MoshConfig(Settings):
     """
 
     person: PersonConfig = field(default_factory=PersonConfig)
-    poses: PoseConfig = field(default_factory=lambda: PoseConfig.weighted(2.0, 0.3, 57600.0))
+    poses: PoseConfig = field(default_factory=lambda: PoseConfig.from_weights(2.0, 0.3, 57600.0))
     soft: SoftTissueConfig = field(default_factory=SoftTissueConfig)
     artefacts: ArtefactConfig = field(default_factory=ArtefactConfig)
     soft_tissue: bool = True
@@ -84,16 +84,16 @@ class MoshConfig(Settings):
     exaggeration: float = 1.0
 
     @classmethod
-    def published(cls) -> MoshConfig:
+    def from_paper(cls) -> MoshConfig:
         """The weights of [MoSh], every marker believed alike, nothing repaired, shrunk or smoothed beyond them.
 
         Not as in the paper: covariances of poses have at least (0.05 radians)² along every direction. The first frame
         is found by a search, then all frames are solved together, by Gauss-Newton. The weight of the velocity is meant
         for 120 frames a second, and scaled for others.
         """
-        poses = replace(PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6,
+        poses = replace(PoseConfig.from_weights(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6,
                         prior_shrinkage=0.0)
-        return cls(PersonConfig.published(), poses, SoftTissueConfig.published(), repair=False)
+        return cls(PersonConfig.from_paper(), poses, SoftTissueConfig.from_paper(), repair=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +169,8 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     if worn.changes:
         for trial in trials:
             trial.order = worn.order(trial.raw, layout)
-            trial.raw, trial.markers = worn.named(trial.raw, layout), worn.named(trial.markers, layout)
-        layout = worn.placed(layout)
+            trial.raw, trial.markers = worn.restore_names(trial.raw, layout), worn.restore_names(trial.markers, layout)
+        layout = worn.update_layout(layout)
         person = stages.find_person(trials, layout, "worn")
 
     # the poses of all frames, by which the markers are judged; where a frame of the person changed, it is found again
@@ -179,12 +179,12 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
             stages.follow(trial, person, f"poses {n} {trial.number}")           # [MoSh] Eq. 23, poses
         for trial in trials:
             stages.judge(trial, person, f"artefacts {n} {trial.number}")
-        settled = all(trials[i].unchanged(t) for i, t in person.fit.frames)
+        settled = all(trials[i].is_unchanged(t) for i, t in person.fit.frames)
         if settled:
             break
         person = stages.find_person(trials, layout, f"again {n}")
     for trial in trials:
-        if not (settled and trial.unchanged()):
+        if not (settled and trial.is_unchanged()):
             stages.follow(trial, person, f"poses last {trial.number}")
         if config.soft_tissue:
             stages.find_soft_tissue(trial, person)                              # [MoSh] Eq. 24
@@ -207,7 +207,7 @@ class _Trial:
     artefacts: MarkerArtefacts | None = None
     soft: SoftTissue | None = None
 
-    def unchanged(self, frames: int | slice = slice(None)) -> bool:
+    def is_unchanged(self, frames: int | slice = slice(None)) -> bool:
         """Whether the markers of some frames are those that the motion follows."""
         assert self.followed is not None, "followed"
         return np.array_equal(self.followed.positions[frames], self.markers.positions[frames], equal_nan=True)
@@ -217,7 +217,8 @@ class _Trial:
         assert self.motion is not None and self.artefacts is not None, "followed and judged"
         if self.order is None:
             return self.motion, self.soft, self.artefacts
-        return self.motion, self.soft, self.artefacts.renamed(self.order, self.raw.seen[:, np.argsort(self.order)])
+        return self.motion, self.soft, self.artefacts.rename_labels(self.order,
+                                                                    self.raw.seen[:, np.argsort(self.order)])
 
 
 @dataclass(frozen=True, eq=False)

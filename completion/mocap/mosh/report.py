@@ -154,7 +154,7 @@ def _choose_frames(result: MoshResult, takes: Sequence[Take]) -> list[Pane]:
     panes, vertical = [], upwards(takes[0].shown, subject)
     for (number, t), pose, trans in zip(person.frames.tolist(), person.poses, person.trans, strict=True):
         vertices, markers = subject.vertices(pose, trans).astype(float), takes[number].markers
-        known = result.layout.matched(markers.labels, 0)
+        known = result.layout.match_labels(markers.labels, 0)
         dots = Dots(markers.select([label for label in markers.labels if label in known]).positions[t], MARKER, 0.015)
         panes.append(Pane([light.mesh(vertices), dots], facing(subject, pose, vertices, vertical=vertical),
                           str(t) if len(takes) == 1 else f"{number + 1}: {t}"))

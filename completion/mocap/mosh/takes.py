@@ -81,7 +81,7 @@ def measure_held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[st
                      soft: SoftTissue | None) -> HeldOut | None:
     """How far a motion is from markers of the layout that it was not made from; None where there are none of them."""
     wanted = {layout.aliases.get(label, label) for label in labels}
-    known = layout.matched(markers.labels, 0)
+    known = layout.match_labels(markers.labels, 0)
     names = tuple(label for label in known if layout.aliases.get(label, label) in wanted)
     if not names:
         return None

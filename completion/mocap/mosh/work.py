@@ -146,8 +146,8 @@ class _Found:
         problems = [(f"{take.name}: " if several else "") + why for take in takes if (why := motion_problem(
             take.motion, take.subject.template, result.layout, take.markers))]
         moving = Judgement.of(problems, motion_doubts(motions, [take.markers for take in takes], body))
-        own = self.covered.judgement().joined(self.labelling, moving, result.worn.judgement(self.usual.labels),
-                                              result.person.judgement(self.usual))
+        own = self.covered.judgement().merge(self.labelling, moving, result.worn.judgement(self.usual.labels),
+                                             result.person.judgement(self.usual))
         return judge_motions(self.person, own, motions, body)
 
 
@@ -175,7 +175,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
         raise ValueError("; ".join(failures))
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = work.layout or choose_layout(work.model, None, labels)
-    usual = usual.spelled(labels)
+    usual = usual.with_spellings(labels)
     try:
         layout = usual.without(work.hold_out) if work.hold_out else usual
     except ValueError as error:
@@ -197,7 +197,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
         held = measure_held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
         takes.append(Take(source, unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
                           held, light))
-    return _Found(model, guess, result, takes, usual, layout_name, Judgement().joined(*labelling)), failures
+    return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling)), failures
 
 
 def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]
@@ -304,8 +304,9 @@ def _person_metrics(found: _Found) -> list[Metric]:
 def _figures(takes: Sequence[Take]) -> list[Metric]:
     """What motions are judged by, of all frames together."""
     out = list[Metric]()
-    fixed = [t.motion.told() for t in takes]
-    soft = [np.where(np.isnan(t.motion.told()), np.nan, t.soft.motion.residuals) for t in takes if t.soft is not None]
+    fixed = [t.motion.residuals_of_trusted() for t in takes]
+    soft = [np.where(np.isnan(t.motion.residuals_of_trusted()), np.nan,
+                     t.soft.motion.residuals) for t in takes if t.soft is not None]
     held = [t.held for t in takes if t.held is not None]
     held_soft = [h.soft for h in held if h.soft is not None]
     for name, values in zip(ERRORS, ([h.fixed for h in held], held_soft, fixed, soft), strict=True):

@@ -53,7 +53,7 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     [SCAPE] §8
     """
     config, tell = config or AnimateConfig(), progress or (lambda done, total: None)
-    columns, worn = layout.worn(markers.labels)
+    columns, worn = layout.match_columns(markers.labels)
     targets = markers.positions[:, columns]
     body = MarkedBody(subject, worn, config.prior_weight, config.prior_shrinkage)
     if config.smoothing or config.ground:
@@ -115,8 +115,8 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
 
         # one step of all frames together
-        x[inside] = body.smoothed(near, stiffness, body.system, taken, weights) if feet is None else \
-            body.smoothed(near, stiffness, feet.system, taken, weights, feet.held(x)[inside])
+        x[inside] = body.smooth_step(near, stiffness, body.system, taken, weights) if feet is None else \
+            body.smooth_step(near, stiffness, feet.system, taken, weights, feet.target_positions(x)[inside])
         moved[inside] = np.linalg.norm(body.positions(x[inside]) - body.positions(near), axis=2).max(axis=1)
         tell(round(T * (i + 1) / rounds), T)
     return x, order, (~np.isnan(targets[..., 0])).any(axis=1) & (moved < STILL)

@@ -23,7 +23,7 @@ class Floor:
     height: float
 
     @staticmethod
-    def given(numbers: tuple[float, float, float, float]) -> Floor:
+    def from_numbers(numbers: tuple[float, float, float, float]) -> Floor:
         """From a normal, not zero, and a height."""
         length = float(np.linalg.norm(numbers[:3]))
         if not (length > 0 and np.isfinite(numbers).all()):
@@ -65,7 +65,7 @@ class FootContact:
         self.body, subject = body, body.body.subject
         pose, trans, _ = body.body.split(x[np.unique(np.linspace(0, len(x) - 1, 150).astype(int))])
         vertices = subject.vertices(pose, trans)
-        self.floor = Floor.below(vertices) if floor is None else Floor.given(floor)
+        self.floor = Floor.below(vertices) if floor is None else Floor.from_numbers(floor)
         # the soles: at most 24 vertices spread over what comes near the floor, and the lowest of every frame, as heels
         # are round
         rest, height = subject.template.vertices, self.floor.above(vertices)
@@ -75,7 +75,7 @@ class FootContact:
         self.shapes = part_shapes(subject.points(near[np.union1d(spread, height[:, near].argmin(axis=1))]))
         self.stands = self._standing_places(self._points(x), rate)
 
-    def held(self, x: np.ndarray) -> np.ndarray:
+    def target_positions(self, x: np.ndarray) -> np.ndarray:
         """Where the soles are held (T, K, 3), metres: where they stand, and out of the floor if they sank into it.
 
         NaN where they are free, at unknowns (T, P).

@@ -45,7 +45,7 @@ def judge_motions(person: Judgement, own: Judgement, motions: Sequence[Motion], 
 
     On a body that is nowhere near its markers, the size of the person is no cause but an effect, and told last.
     """
-    return own.joined(person) if mean_off(motions) > HAND * size(body) else person.joined(own)
+    return own.merge(person) if mean_off(motions) > HAND * size(body) else person.merge(own)
 
 
 def mean_off(motions: Sequence[Motion]) -> float:
@@ -85,7 +85,7 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     seen = np.isfinite(motion.residuals)
     if not seen.any():
         return "no marker of the layout was ever seen: markers of another layout?"
-    known = layout.matched(markers.labels, 0)
+    known = layout.match_labels(markers.labels, 0)
     columns = [markers.labels.index(label) for label in known]
     some = markers.positions[:: max(1, len(seen) // 50), columns]
     whole = np.isfinite(some[..., 0]).sum(axis=1)

@@ -137,8 +137,8 @@ class MarkedBody:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
         return retract_pose(self.body.n_angles)(x, step)
 
-    def smoothed(self, x: np.ndarray, stiffness: np.ndarray, system: Callable[..., Dense], *of_frames: np.ndarray
-                 ) -> np.ndarray:
+    def smooth_step(self, x: np.ndarray, stiffness: np.ndarray, system: Callable[..., Dense], *of_frames: np.ndarray
+                    ) -> np.ndarray:
         """Frames (T, P) that follow each other after one Gauss-Newton step, coupled as of `solve_coupled_steps`.
 
         `system` makes the equations of some frames from their unknowns and their rows of `of_frames`.

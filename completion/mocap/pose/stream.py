@@ -73,7 +73,7 @@ class MarkerStream:
             raise ValueError("config: expected ground=False and low_pass=0 for a stream, both need later frames")
         if not rate > 0:
             raise ValueError(f"rate: expected a number above 0, got {rate}")
-        self.rows, worn = layout.worn(labels)
+        self.rows, worn = layout.match_columns(labels)
         self.n_labels = len(labels)
         body = MarkedBody(subject, worn, config.prior_weight, config.prior_shrinkage)
         self.tracker = Tracker(body, config, rate)
@@ -188,7 +188,7 @@ class Tracker:
         off = off[~np.isnan(off)]
         astray = bool(np.median(off) > LOST or (off > self.config.outlier).mean() > 0.2)
         if not self.wait and enough and not fresh and astray:
-            found = self._found(taken)
+            found = self._search_again(taken)
             x, converged = (x, converged) if found is None else (found, True)
             self.places = self.body.positions(x)
         if self._to_pass_over(taken, before):
@@ -217,7 +217,7 @@ class Tracker:
 
         return levenberg_marquardt(system, expected[None], self.steps, 1e-2, 1e-4, retract=body.retract)
 
-    def _found(self, targets: np.ndarray) -> np.ndarray | None:
+    def _search_again(self, targets: np.ndarray) -> np.ndarray | None:
         """Unknowns (P,) that a search finds and that fit much better than the body at `places`, or None."""
         found = search(self.body, targets, self.config)
         apart = np.linalg.norm(np.stack([self.body.positions(found), self.places]) - targets, axis=2)

@@ -125,7 +125,7 @@ def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, m
     fixed, changed = moving_character(character, moved, frames)
     colors = heat(deformation(character.template.faces, fixed, changed), 0.0, FULL)
     poses = moved.motion.poses[frames]
-    changed = Creases(at_rest(character), character.skeleton).smoothed(changed, poses)
+    changed = Creases(at_rest(character), character.skeleton).smooth(changed, poses)
     who, what = model.subject(soft.motion.betas), character.subject(moved.motion.betas)
     rows = [bodies_in_a_row(who, soft.motion.poses[frames], person, None, height),
             bodies_in_a_row(what, poses, changed, None, height), bodies_in_a_row(what, poses, changed, colors, height)]
@@ -145,7 +145,7 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue) -> tuple
     creases = Creases(at_rest(character), character.skeleton)
 
     def bodies(some: np.ndarray) -> np.ndarray:
-        return creases.smoothed(moving_character(character, soft, some)[1], soft.motion.poses[some])
+        return creases.smooth(moving_character(character, soft, some)[1], soft.motion.poses[some])
 
     return most, write_glb(path, soft.motion, character.subject(soft.motion.betas), bodies, heat(most, 0.0, FULL))
 
@@ -169,7 +169,7 @@ class Creases:
                 own = spread @ (own + self._near @ own)
             self._shares = own[rest.faces].mean(axis=1)
 
-    def inverted(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    def find_inverted(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """(..., F) bool: triangles of bodies (..., N, 3) in poses (..., J, 3) that face the wrong way."""
         corners = bodies[..., self.rest.faces, :]
         now = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
@@ -177,14 +177,14 @@ class Creases:
         R = np.moveaxis(R, 0, -3)
         return np.asarray((now * (R @ self.rest.face_normals[..., None])[..., 0]).sum(axis=-1) < 0)
 
-    def smoothed(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    def smooth(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """Bodies (n, N, 3) in poses (n, J, 3) whose folded hollows are laid as smoothly as what is around allows.
 
         Patches around inverted triangles grow while some are left; one that leaves more of them is not taken.
         """
         out, faces = np.array(bodies), self.rest.faces
         for x, pose in zip(out, poses, strict=True):
-            bad = self.inverted(x, pose)
+            bad = self.find_inverted(x, pose)
             for rings in (1, 2, 2, 3, 3, 4):             # around inverted triangles that are laid anew, one round each
                 free = np.zeros(len(x))
                 free[faces[bad]] = 1
@@ -195,7 +195,7 @@ class Creases:
                     continue
                 count, patch = connected_components(self._near[mine][:, mine])
                 trial = harmonic(self._near, x, free == 0)
-                left = self.inverted(trial, pose)
+                left = self.find_inverted(trial, pose)
                 of_vertex = np.full(len(x), -1)
                 of_vertex[mine] = patch
                 of_face = of_vertex[faces].max(axis=1)   # no triangle touches two patches
@@ -203,5 +203,5 @@ class Creases:
                 kept = mine[~(after < before)[patch]]
                 trial[kept] = x[kept]
                 x[:] = trial                             # a row of `out`
-                bad = self.inverted(x, pose)
+                bad = self.find_inverted(x, pose)
         return out

@@ -69,7 +69,7 @@ class SoftTissueConfig(Settings):
     outlier: Positive = 0.06
 
     @classmethod
-    def published(cls) -> SoftTissueConfig:
+    def from_paper(cls) -> SoftTissueConfig:
         """The weights of [MoSh] Eq. 24, whose betas change in every frame."""
         return cls(data=0.75, pose=1.0, velocity=6.25, outlier=1000.0, shape_change=0.25)
 
@@ -135,11 +135,11 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
     last = np.zeros(T)
     for i in range(ROUNDS if len(some) > 2 else 0):
         before = body.positions(x[some])
-        x[some] = follower.stepped(x[some], targets[some], share[some], feet,
-                                   None if feet is None else feet.held(x)[some])
+        x[some] = follower.step_poses(x[some], targets[some], share[some], feet,
+                                      None if feet is None else feet.target_positions(x)[some])
         last[some] = np.linalg.norm(body.positions(x[some]) - before, axis=2).max(axis=1)
         tell(round(T * (i + 1) / (ROUNDS + 1)), T)
-    added, changes, skin = follower.moved(x, some, share)
+    added, changes, skin = follower.solve_movement(x, some, share)
     tell(T, T)
     pose, trans, _ = body.body.split(x)
     residuals = np.full(markers.positions.shape[:2], np.nan)
@@ -161,7 +161,7 @@ class SoftFollower(ABC):
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
                  config: SoftTissueConfig) -> None:
         assert motion.betas is not None, "checked"
-        self.rows, self.layout = layout.worn(markers.labels)
+        self.rows, self.layout = layout.match_columns(markers.labels)
         self.config, self.n_betas, self.targets = config, len(motion.betas), markers.positions[:, self.rows]
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
         if config.shape_change:                  # as the paper: its prior is not shrunk, and places are not smoothed
@@ -178,8 +178,8 @@ class SoftFollower(ABC):
         """
 
     @abstractmethod
-    def moved(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
+    def solve_movement(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
+                       ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
         """The movement in all frames x (T, P), that of frames without a marker that counts, not in `some`, none.
 
         What it adds to the places of the markers (T, L, 3), metres, and how `SoftTissue` holds it.
@@ -190,8 +190,8 @@ class SoftFollower(ABC):
         away = targets - self.body.positions(x)
         return np.where(np.isnan(away), 0.0, away)
 
-    def stepped(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray, feet: FootContact | None,
-                places: np.ndarray | None) -> np.ndarray:
+    def step_poses(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray, feet: FootContact | None,
+                   places: np.ndarray | None) -> np.ndarray:
         """Frames (T, P) that follow each other after one Gauss-Newton step, the movement integrated out."""
         whitening = self.whitening(x, targets, share)
 
@@ -200,7 +200,7 @@ class SoftFollower(ABC):
             return data if feet is None else feet.hold(data, x, *places)
 
         held = () if places is None else (places,)
-        return self.body.smoothed(x, self.inertia, system, targets, share, *held)
+        return self.body.smooth_step(x, self.inertia, system, targets, share, *held)
 
     def system(self, x: np.ndarray, targets: np.ndarray, W: np.ndarray) -> Dense:
         """Markers (B, L, 3) whose residuals W (B, n, n) makes independent, and the pose prior, at x (B, P).
@@ -232,14 +232,15 @@ class SkinFollower(SoftFollower):
         root = np.sqrt(np.maximum(strays / noise - 1, 0))[:, None] * self.root
         return lambda x, share: whiten(root @ root.T, share)
 
-    def moved(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
+    def solve_movement(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
+                       ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
         moved, poses = np.zeros(self.targets.shape), self.body.body.split(x)[0]
         if len(some):
-            moved[some] = self.displaced(in_root(self.off(x[some], self.targets[some]), poses[some]), share[some])
+            moved[some] = self.solve_displacements(in_root(self.off(x[some], self.targets[some]), poses[some]),
+                                                   share[some])
         return in_world(moved, poses), np.zeros((len(x), self.n_betas)), SkinMovement(self.modes, moved)
 
-    def displaced(self, off: np.ndarray, share: np.ndarray) -> np.ndarray:
+    def solve_displacements(self, off: np.ndarray, share: np.ndarray) -> np.ndarray:
         """The movement of the skin under the markers (T, L, 3), metres, which lie off the body (T, L, 3).
 
         [MoSh] Eq. 24, with |z|² in place of |β_t|²
@@ -278,8 +279,8 @@ class ShapeFollower(SoftFollower):
             return whiten(self.weight / self.config.shape_change * D @ np.swapaxes(D, 1, 2), np.tile(share, 3))
         return of
 
-    def moved(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
+    def solve_movement(self, x: np.ndarray, some: np.ndarray, share: np.ndarray
+                       ) -> tuple[np.ndarray, np.ndarray, SkinMovement | None]:
         T, K = len(x), self.skin.n_betas
         added, changes, off = np.zeros(self.targets.shape), np.zeros((T, K)), self.off(x, self.targets)
         for few in batches(T):

@@ -41,7 +41,7 @@ class SkinMovement:
         """The same, so many times as large."""
         return SkinMovement(self.modes, factor * self.moved)
 
-    def squared(self) -> np.ndarray:
+    def mean_square(self) -> np.ndarray:
         """(N,) square metres: how far every vertex moves, the mean square over time."""
         moment = np.tensordot(self.moved, self.moved, axes=((0, 2), (0, 2))) / max(len(self.moved), 1)
         return np.maximum(((self.modes @ moment) * self.modes).sum(axis=1), 0)
@@ -105,7 +105,7 @@ class SoftTissue:
     def movement(self, model: BodyModel) -> np.ndarray:
         """How far soft tissue moves every vertex (N,) of the skin, metres: the root of the mean square over time."""
         by_betas = skin_movement(model, self.changes) if self.changes.any() or self.skin is None else 0.0
-        return np.sqrt(by_betas**2 + (0.0 if self.skin is None else self.skin.squared()))
+        return np.sqrt(by_betas**2 + (0.0 if self.skin is None else self.skin.mean_square()))
 
     def save(self, path: str | Path) -> None:
         """Write a motion file (see `Motion.save`) that also holds soft tissue.

@@ -92,7 +92,7 @@ class PersonConfig(Settings):
     seed: Seed = 0
 
     @classmethod
-    def published(cls) -> PersonConfig:
+    def from_paper(cls) -> PersonConfig:
         """Weights, twelve random frames and six stages of [MoSh], all markers alike."""
         return cls(choice="random", data=0.75, surface=100.0, initial=0.25, outlier=1000.0, loose=False, wand=0.0)
 
@@ -114,7 +114,7 @@ class LatentPoints:
         rest = np.zeros((*self.mean.shape, len(z) - K))
         return MovingPoints(self.at(z[:K]), np.concatenate([self.by_betas, rest], axis=-1))
 
-    def combined(self, ids: np.ndarray, weights: np.ndarray) -> LatentPoints:
+    def combine(self, ids: np.ndarray, weights: np.ndarray) -> LatentPoints:
         """Combinations of some of them, ids and weights (n, k)."""
         return LatentPoints(np.einsum("lk,lkd->ld", weights, self.mean[ids]),
                             np.einsum("lk,lkdb->ldb", weights, self.by_betas[ids]))
@@ -218,7 +218,7 @@ class State:
         """(B, 3J + 3 + K + 3L) all unknowns, those that frames share in every row."""
         return np.concatenate([self.x, np.tile(self.z, (len(self.x), 1))], axis=1)
 
-    def moved(self, rows: np.ndarray) -> State:
+    def with_unknowns(self, rows: np.ndarray) -> State:
         """The state with other unknowns."""
         n, K = self.x.shape[1], len(self.betas)
         return replace(self, x=rows[:, :n], betas=rows[0, n:n + K], coefficients=rows[0, n + K:].reshape(-1, 3))
@@ -249,9 +249,9 @@ class LatentFit:
     def start(self, x: np.ndarray) -> State:
         """The mean person with the markers in their usual places, at poses (B, 3J + 3) that were found for it."""
         betas = np.zeros(self.n_betas)
-        return self._hung(x, betas, self.usual_places(self.layout, betas), self.layout, self.reach, False)
+        return self._attach(x, betas, self.usual_places(self.layout, betas), self.layout, self.reach, False)
 
-    def hung_anew(self, state: State, look: bool, last: bool) -> State:
+    def reattach(self, state: State, look: bool, last: bool) -> State:
         """The same places on the triangles that are nearest now; to `look` finds loose markers along their limbs.
 
         The `last` time the distances that are near one that the marker set names become that one.
@@ -260,12 +260,12 @@ class LatentFit:
         if look and self.loose.any():
             vertices = self.model.subject(state.betas).vertices(*self.split(state.x))
             found, distances = find_loose(self.model, vertices, self.layout, self.targets, self.reach)
-            layout, looked = replace(self.layout.moved(found), distances=distances), True
+            layout, looked = replace(self.layout.with_places(found), distances=distances), True
             places = np.where(self.loose[:, None], self.usual_places(layout, state.betas), places)
-        state = self._hung(state.x, state.betas, places, layout, (state.least, state.greatest), looked)
-        return self._measured(state, last)
+        state = self._attach(state.x, state.betas, places, layout, (state.least, state.greatest), looked)
+        return self._measure_distances(state, last)
 
-    def _measured(self, state: State, last: bool) -> State:
+    def _measure_distances(self, state: State, last: bool) -> State:
         """The state with the distances of its markers from the skin as they are now, where they are unknown."""
         free = state.least < state.greatest
         if not free.any():
@@ -284,14 +284,14 @@ class LatentFit:
         return replace(state, layout=replace(state.layout, distances=distances),
                        least=np.where(free, state.least, distances), greatest=np.where(free, state.greatest, distances))
 
-    def _hung(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray, layout: MarkerLayout,
-              reach: tuple[np.ndarray, np.ndarray], looked: bool) -> State:
+    def _attach(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray, layout: MarkerLayout,
+                reach: tuple[np.ndarray, np.ndarray], looked: bool) -> State:
         """The state with markers at points (L, 3) of the latent coordinate system, each on its nearest triangle."""
         vertices = self.latent.at(betas)
         markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
-        corners = self.latent.combined(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
+        corners = self.latent.combine(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
         return State(x, betas, markers.coefficients(vertices, points), markers, self._supports(markers),
-                     self.latent.combined(markers.ids, markers.weights), corners, layout, *reach, looked)
+                     self.latent.combine(markers.ids, markers.weights), corners, layout, *reach, looked)
 
     def _supports(self, markers: LatentMarkers) -> ShapedPoints:
         """Points of the skin with free shape, each made once: stitching them is what hanging markers anew costs."""
@@ -301,19 +301,19 @@ class LatentFit:
             rows = np.array(list(new.values()))
             made = self.model.points(markers.ids[rows], markers.weights[rows], self.n_betas)
             self._column |= {key: len(self._column) + i for i, key in enumerate(new)}
-            self._made = made if self._made is None else self._made.joined(made)
+            self._made = made if self._made is None else self._made.concatenate(made)
         assert self._made is not None, "at least one marker"
-        return self._made.combined(combination_weights(self._made.count, np.array([self._column[key] for key in keys]),
-                                                       None))
+        return self._made.combine(combination_weights(self._made.count, np.array([self._column[key] for key in keys]),
+                                                      None))
 
     def usual_places(self, layout: MarkerLayout, betas: np.ndarray) -> np.ndarray:
         """Where a layout has the markers (L, 3) on a body of these betas in the latent pose, metres. [MoSh] Eq. 15"""
         return energy.rise_above_skin(self._usual(layout).at(betas), np.asarray(layout.distances))
 
     def _usual(self, layout: MarkerLayout) -> LatentPoints:
-        return self.latent.combined(*supports(self.model.template, layout))
+        return self.latent.combine(*supports(self.model.template, layout))
 
-    def simulated(self, state: State, x: np.ndarray, z: np.ndarray) -> MovingPoints:
+    def simulate(self, state: State, x: np.ndarray, z: np.ndarray) -> MovingPoints:
         """The markers in every frame for x (B, n) and z (K + 3L,), derivatives by both. [MoSh] Eq. 16"""
         K, (pose, trans) = self.n_betas, self.split(x)
         positions, d_pose = state.points.operator(z[:K]).jacobian(pose, trans)
@@ -323,7 +323,7 @@ class LatentFit:
 
     def residuals(self, state: State) -> np.ndarray:
         """(B, L) distances of simulated from observed markers, metres; NaN where one was not seen."""
-        return np.linalg.norm(self.simulated(state, state.x, state.z).positions - self.targets, axis=2)
+        return np.linalg.norm(self.simulate(state, state.x, state.z).positions - self.targets, axis=2)
 
     def weights(self, state: State) -> np.ndarray:
         """(B, L) weights of the data, per square centimetre; outliers have less, as loose markers not yet found."""
@@ -339,7 +339,8 @@ class LatentFit:
 
         def equations(rows: np.ndarray) -> Arrow:
             x, z = rows[:, :n], rows[0, n:]
-            common = [Residual(r.values[None], r.jacobian[None]) for r in self.shared(state, usual, z, factor).values()]
+            common = [Residual(r.values[None], r.jacobian[None]) for r in self.shared_terms(state, usual, z,
+                                                                                            factor).values()]
             return Arrow(normal_equations(list(self.of_frames(state, x, z, weights, factor).values())), len(z),
                          normal_equations(common))
 
@@ -351,10 +352,10 @@ class LatentFit:
                   ) -> dict[str, Residual]:
         """The terms of the frames, derivatives by (x, z)."""
         whole = np.concatenate([x, np.tile(z, (len(x), 1))], axis=1)
-        return {"data": data_term(self.simulated(state, x, z), self.targets, weights),
+        return {"data": data_term(self.simulate(state, x, z), self.targets, weights),
                 "pose": energy.pose_prior(whole, self.prior, factor * self.config.pose)}            # [MoSh] Eq. 21
 
-    def shared(self, state: State, usual: LatentPoints, z: np.ndarray, factor: float) -> dict[str, Residual]:
+    def shared_terms(self, state: State, usual: LatentPoints, z: np.ndarray, factor: float) -> dict[str, Residual]:
         """The terms of what frames share."""
         c, markers = self.config, latent_places(state.markers.kind, state.supports, z)
         distances = np.asarray(state.layout.distances)
@@ -365,11 +366,11 @@ class LatentFit:
 
     def energies(self, state: State) -> dict[str, float]:
         """What each term is, weights included."""
-        both = self.of_frames(state, state.x, state.z, self.weights(state), 1.0) | self.shared(
+        both = self.of_frames(state, state.x, state.z, self.weights(state), 1.0) | self.shared_terms(
             state, self._usual(state.layout), state.z, 1.0)
         return {name: float(np.sum(term.energy)) for name, term in both.items()}
 
-    def placed_layout(self, state: State) -> MarkerLayout:
+    def export_layout(self, state: State) -> MarkerLayout:
         """The layout with every marker on the triangle it hangs on at its own distance, exact in the latent pose."""
         vertices, points, hung = self.latent.at(state.betas), state.places, state.markers
         if hung.kind != "triangle":

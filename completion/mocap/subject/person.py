@@ -149,16 +149,16 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     for i, factor in enumerate(config.annealing):
         last = i == stages - 1
         if i % 2 or (last and i):                        # loose markers are looked for before two of the stages
-            state = fit.hung_anew(state, i in (1, 3), last)                                 # [MoSh] Eq. 16
+            state = fit.reattach(state, i in (1, 3), last)                                 # [MoSh] Eq. 16
         rows, converged, taken = step(f"person, stage {i}", given,
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
-        state, steps = state.moved(rows), steps + taken
+        state, steps = state.with_unknowns(rows), steps + taken
         tell(len(chosen) + i + 1, total)
 
     ends, (pose, trans) = np.cumsum([len(each) for each in positions]), fit.split(state.x)
     which = np.searchsorted(ends, chosen, side="right")
     moved = np.linalg.norm(state.places - fit.usual_places(fit.layout, state.betas), axis=1)
-    return PersonFit(state.betas.copy(), fit.placed_layout(state),
+    return PersonFit(state.betas.copy(), fit.export_layout(state),
                      np.stack([which, chosen - np.r_[0, ends][which]], axis=1), rotations.log(rotations.exp(pose)),
                      trans.copy(), fit.residuals(state), moved, fit.energies(state), converged, steps)
 
@@ -175,7 +175,7 @@ def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
                    ) -> tuple[MarkerLayout, list[np.ndarray]]:
     """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, NaN if it lacks one."""
     columns = [{layout.aliases.get(label, label): sequence.labels.index(label)
-                for label in layout.matched(sequence.labels)} for sequence in sequences]
+                for label in layout.match_labels(sequence.labels)} for sequence in sequences]
     known = layout.without([label for label in layout.labels if not any(label in mine for mine in columns)])
     positions = [np.full((len(sequence.positions), len(known.labels), 3), np.nan) for sequence in sequences]
     for out, sequence, mine in zip(positions, sequences, columns, strict=True):

@@ -110,16 +110,16 @@ class Worn:
         if self.too_many:
             check.append(f"{', '.join(self.too_many)} far from where the layout says: the wrong layout, or the wrong "
                          "body?")
-        return judge_moves({m.label: m.before for m in self.moved}, len(labels)).joined(Judgement.of(parts, check))
+        return judge_moves({m.label: m.before for m in self.moved}, len(labels)).merge(Judgement.of(parts, check))
 
-    def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
+    def restore_names(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""
         return MarkerSequence(sequence.positions[:, self.order(sequence, layout)], sequence.labels, sequence.rate)
 
     def order(self, sequence: MarkerSequence, layout: MarkerLayout) -> np.ndarray:
         """From which column (L,) of a sequence each of its labels is to be taken."""
         rows = {layout.aliases.get(label, label): sequence.labels.index(label)
-                for label in layout.matched(sequence.labels, 0)}
+                for label in layout.match_labels(sequence.labels, 0)}
         order = np.arange(len(sequence.labels))
         for first, second in self.exchanged:
             if first in rows and second in rows:
@@ -127,14 +127,14 @@ class Worn:
                 order[two] = order[two[::-1]]
         return order
 
-    def placed(self, layout: MarkerLayout) -> MarkerLayout:
+    def update_layout(self, layout: MarkerLayout) -> MarkerLayout:
         """A layout with the moved markers where they are worn, at its end, and without those found nowhere."""
         layout = layout.without(self.unplaced) if self.unplaced else layout
         if not self.moved:
             return layout
         found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
                              np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
-        return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
+        return replace(layout.without(found.labels).merge(found), aliases=layout.aliases)
 
 
 class _Frames:
@@ -234,7 +234,8 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 
     # two exchanged names on a leg can draw all its markers away: what was found nowhere is sought on the body without
     if found.unplaced and (found.moved or found.exchanged):
-        renamed, placed = [found.named(each, layout) for each in sequences], replace(found, unplaced=()).placed(layout)
+        renamed = [found.restore_names(each, layout) for each in sequences]
+    placed = replace(found, unplaced=()).update_layout(layout)
         again = _without(model, renamed, placed, (), config)
         off, limit = dict(zip(again.layout.labels, again.off, strict=True)), again.far(FAR)
         gone = [label for label in found.unplaced if off[label] > limit]
@@ -294,7 +295,7 @@ def _find_exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence],
             order[[i, j]] = j, i
         if by_mean(at.targets[:, order]) < as_they_came:
             names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in pairs))
-            renamed = [names.named(each, layout) for each in sequences]
+            renamed = [names.restore_names(each, layout) for each in sequences]
             other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout, rough.wand)
             if burden(other.off) < min(0.5 * burden(at.off), burden(best[2].off)):
                 best = names.exchanged, renamed, other

@@ -93,7 +93,7 @@ def _costs(mesh: Mesh) -> csr_array:
     cosine = np.maximum(mesh.vertex_normals @ directions.T, 0)
     vertex, ray = np.nonzero(cosine)
     start = mesh.vertices[vertex] + 1e-3 * mesh.mean_edge * mesh.vertex_normals[vertex]
-    free = ~Rays(mesh).occluded(start, directions[ray])
+    free = ~Rays(mesh).test_occlusion(start, directions[ray])
     weight = cosine[vertex, ray]
     n = len(mesh.vertices)
     seen = np.bincount(vertex, weight * free, n) / np.maximum(np.bincount(vertex, weight, n), 1e-12)

@@ -57,7 +57,7 @@ class ControlModel:
         """For linear blend skinning [Statues] Eq. 1."""
         return Rig(self.mesh, self.skeleton, self.weights, np.zeros((0, *self.mesh.vertices.shape)))
 
-    def fitted(self, vertices: np.ndarray, joints: np.ndarray) -> ControlModel:
+    def refit(self, vertices: np.ndarray, joints: np.ndarray) -> ControlModel:
         """The same model on other vertices (N, 3) and joint centres (J, 3), whose pose becomes the default pose."""
         return replace(self, mesh=self.mesh.with_vertices(vertices), skeleton=replace(self.skeleton, joints=joints))
 

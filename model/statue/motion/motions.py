@@ -159,12 +159,12 @@ class Follower:
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """The control mesh (..., n, 3), metres, in poses (..., J, 3) of the model."""
         if poses.ndim == 2:
-            return self._moved(self.subject.vertices(poses, trans))
+            return self._move(self.subject.vertices(poses, trans))
         trans = np.broadcast_to(np.zeros(3) if trans is None else trans, (len(poses), 3))
-        return np.concatenate([[self._moved(body) for body in self.subject.vertices(poses[k:k + 32], trans[k:k + 32])]
+        return np.concatenate([[self._move(body) for body in self.subject.vertices(poses[k:k + 32], trans[k:k + 32])]
                                for k in range(0, len(poses), 32)])
 
-    def _moved(self, body: np.ndarray) -> np.ndarray:
+    def _move(self, body: np.ndarray) -> np.ndarray:
         body = np.asarray(body, dtype=np.float64)
         outer = np.einsum("ea,eb->eab", np.diff(body[self._edges], axis=1)[:, 0], self._before).reshape(-1, 9)
         R = rotations.project((self._around @ outer).reshape(-1, 3, 3))

@@ -41,42 +41,42 @@ class LocalShape:
         columns = np.concatenate([self.held, *self.corners.T])
         return csr_array((np.concatenate([np.ones(R), *-self.bary.T]), (rows, columns)), shape=(R, self.count))
 
-    def raised(self, x: np.ndarray) -> np.ndarray:
+    def height_offsets(self, x: np.ndarray) -> np.ndarray:
         """(R, 3) what the height adds to the foot, on vertices (N, 3)."""
         _, _, c, size = self._frames(x)
         return (self.heights / np.sqrt(size))[:, None] * c
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
         """(R, 3) x_i - x(α, β, h), metres."""
-        return self.plane @ x - self.raised(x)
+        return self.plane @ x - self.height_offsets(x)
 
     def energy(self, x: np.ndarray) -> float:
         """S(x) of vertices (N, 3), square metres: 0 for every similar copy of the rest shape. [Statues] Eq. 10"""
         return float(self.weights @ (self.residuals(x) ** 2).sum(axis=1))
 
-    def published_force(self, x: np.ndarray) -> np.ndarray:
+    def paper_force(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) mean over its frames of what would bring each vertex where they want it, the frames standing still:
         not the gradient of Eq. 10, for a vertex also moves the frames of which it is a corner. [Statues] Eq. 12
         """
-        return -self._summed(self.held, self.weights[:, None] * self.residuals(x))
+        return -self._sum_rows(self.held, self.weights[:, None] * self.residuals(x))
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) exact gradient of `energy`, with what a vertex does to the frames of others."""
-        return 2 * self.transposed(x, self.weights[:, None] * self.residuals(x))
+        return 2 * self.apply_transpose(x, self.weights[:, None] * self.residuals(x))
 
-    def transposed(self, x: np.ndarray, r: np.ndarray) -> np.ndarray:
+    def apply_transpose(self, x: np.ndarray, r: np.ndarray) -> np.ndarray:
         """The transposed derivative of the residuals at vertices x (N, 3), applied to rows r (R, 3)."""
         e, f, c, size = self._frames(x)
-        q = self._scaled(c, size, r)
+        q = self._apply_curvature(c, size, r)
         to_1, to_2 = np.cross(f, q), np.cross(q, e)
         rows = np.concatenate([to_1 + to_2, -to_1, -to_2])
-        return self.plane.T @ r + self._summed(self.corners.T.ravel(), rows)
+        return self.plane.T @ r + self._sum_rows(self.corners.T.ravel(), rows)
 
     def derivative(self, x: np.ndarray, d: np.ndarray) -> np.ndarray:
         """(R, 3) how the residuals at vertices x (N, 3) change when these move by d (N, 3)."""
         e, f, c, size = self._frames(x)
         d0, d1, d2 = (d[corner] for corner in self.corners.T)
-        return self.plane @ d - self._scaled(c, size, np.cross(d1 - d0, f) + np.cross(e, d2 - d0))
+        return self.plane @ d - self._apply_curvature(c, size, np.cross(d1 - d0, f) + np.cross(e, d2 - d0))
 
     def _frames(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Two sides of every frame, their cross product and the double area."""
@@ -85,12 +85,12 @@ class LocalShape:
         c = np.cross(e, f)
         return e, f, c, np.maximum(np.linalg.norm(c, axis=1), self.smallest)
 
-    def _scaled(self, c: np.ndarray, size: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def _apply_curvature(self, c: np.ndarray, size: np.ndarray, v: np.ndarray) -> np.ndarray:
         """The (symmetric) derivative of h c / √|c| by c, applied to v (R, 3)."""
         along = np.where(size > self.smallest, np.einsum("rd,rd->r", c, v) / (2 * size**2), 0.0)
         return (self.heights / np.sqrt(size))[:, None] * (v - along[:, None] * c)
 
-    def _summed(self, vertex: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def _sum_rows(self, vertex: np.ndarray, rows: np.ndarray) -> np.ndarray:
         return np.stack([np.bincount(vertex, column, self.count) for column in rows.T], axis=1)
 
 

@@ -65,7 +65,7 @@ class SurfaceFitConfig(Settings):
     polish: int = 6
 
     @classmethod
-    def published(cls) -> SurfaceFitConfig:
+    def from_paper(cls) -> SurfaceFitConfig:
         """As the paper has it; cooling and steps, which it does not tell, are such that the Euler steps converge.
 
         Not as in the paper: vertices past the edge of a hole of the scan are carried by the shape.
@@ -131,7 +131,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         tell(len(temperatures) + k + 1, total)
     if config.polish:
         x = fit.onto_the_surface(x)
-    seen, _ = fit.seen(x)
+    seen, _ = fit.find_data(x)
     apart, inverted = fit.surface.closest(x).distances[seen], int(inverted_triangles(rest, x).sum())
     return SurfaceFit(x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
                       float(apart.max(initial=0.0)), inverted, temperatures, bool(converged and seen.any()))
@@ -148,7 +148,7 @@ class _Fit:
         self.points = ScanPoints(target.points, target.normals, target.border)
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
         # ten points of the scan for each vertex draw the mesh
-        self.sample = target.thinned(max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4))
+        self.sample = target.thin(max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4))
         self.shown = np.ones(len(start), dtype=bool) if hidden is None else ~np.asarray(hidden)
         self.reach = config.reach * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
 
@@ -170,12 +170,12 @@ class _Fit:
         for count in range(most + 1):
             matches, A = self.assignment(x, T)                                             # [Statues] Eq. 14, 15, 17
             wanted = matches @ self.points.points
-            data = self.undrawn(A, wanted) if explicit else self.drawn(x, A, wanted)           # [Statues] Eq. 13
-            force = data.force(x) + lam * (self.shape.published_force(x) if explicit else -0.5 * self.shape.gradient(x))
+            data = self.undrawn(A, wanted) if explicit else self.find_matches(x, A, wanted)           # [Statues] Eq. 13
+            force = data.force(x) + lam * (self.shape.paper_force(x) if explicit else -0.5 * self.shape.gradient(x))
             converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
             if (converged and count) or count == most:
                 break
-            x = x + 0.5 * force if explicit else self.stepped(x, data, force)                  # [Statues] Eq. 18
+            x = x + 0.5 * force if explicit else self.step(x, data, force)                  # [Statues] Eq. 18
         return x, converged
 
     def assignment(self, x: np.ndarray, T: float) -> tuple[csr_array, np.ndarray]:
@@ -196,7 +196,7 @@ class _Fit:
         near = np.linalg.norm(self.points.points[nearest] - x, axis=1) <= self.reach
         return self.shown & near & self.points.beside(x, nearest)
 
-    def seen(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def find_data(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Vertices with data (N,), and the nearest point (N,) of the whole scan."""
         nearest = self.points.nearest(x, self.normals(x), 1)[0][:, 0]
         return self.beside_data(x, nearest), nearest
@@ -205,25 +205,25 @@ class _Fit:
         """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3) alone."""
         return SurfaceData(A, wanted, csc_array((0, len(wanted))), np.zeros((0, 3)), 0.0)
 
-    def drawn(self, x: np.ndarray, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
+    def find_matches(self, x: np.ndarray, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
         """The same, and points of the scan draw the mesh where both face the same way."""
         if not self.config.cover:
             return self.undrawn(A, wanted)
         mesh = self.rest.with_vertices(x)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
-        normals = found.transferred(mesh.vertex_normals, mesh.faces)
+        normals = found.transfer(mesh.vertex_normals, mesh.faces)
         facing = np.einsum("pd,pd->p", normals, self.sample.normals) > 0.3
         good = np.flatnonzero(facing & self.shown[corners].all(axis=1))
         rows = np.repeat(np.arange(len(good)), 3)
         C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(x)))
         return SurfaceData(A, wanted, C, self.sample.points[good], self.config.cover * len(x) / len(found.faces))
 
-    def stepped(self, x: np.ndarray, data: SurfaceData, force: np.ndarray) -> np.ndarray:
+    def step(self, x: np.ndarray, data: SurfaceData, force: np.ndarray) -> np.ndarray:
         """Vertices after a Gauss-Newton step on local shape and data; `force` is minus half the gradient."""
         shape, w, lam = self.shape, self.shape.weights[:, None], self.config.shape
         nearly = Factored(csc_array(lam * self.stiffness + data.bound + 1e-6 * lam * eye_array(len(x))))
-        d = conjugate_gradients(lambda d: lam * shape.transposed(x, w * shape.derivative(x, d)) + data.applied(d),
+        d = conjugate_gradients(lambda d: lam * shape.apply_transpose(x, w * shape.derivative(x, d)) + data.apply(d),
                                 force, nearly.solve, 30, 1e-2)
 
         def energy(x: np.ndarray) -> float:
@@ -236,18 +236,18 @@ class _Fit:
 
     def polish(self, x: np.ndarray) -> np.ndarray:
         """Vertices after a round in which they are drawn to the tangent planes of the surface itself."""
-        seen, near = self.seen(x)
+        seen, near = self.find_data(x)
         found, n = self.surface.closest(x), self.target.normals[near]
         wrong = np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) <= 0
         y = np.where(wrong[:, None], self.target.points[near], found.points)
         A = np.einsum("ni,nj->nij", n, n) + 0.05 * np.eye(3)                # little force along the surface
-        data = self.drawn(x, 100.0 * seen[:, None, None] * A, y)
-        return self.stepped(x, data, data.force(x) - 0.5 * self.config.shape * self.shape.gradient(x))
+        data = self.find_matches(x, 100.0 * seen[:, None, None] * A, y)
+        return self.step(x, data, data.force(x) - 0.5 * self.config.shape * self.shape.gradient(x))
 
     def onto_the_surface(self, x: np.ndarray) -> np.ndarray:
         """Vertices with data moved onto the surface, where that inverts no triangle."""
         x = unfold(self.rest, x)
-        free, _ = self.seen(x)
+        free, _ = self.find_data(x)
         found = self.surface.closest(x)
         free &= np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) > 0
         already = inverted_triangles(self.rest, x)
@@ -282,7 +282,7 @@ class SurfaceData:
         """(N, 3) minus half the gradient."""
         return np.einsum("nij,nj->ni", self.A, self.y - x) + self.share * (self.C.T @ (self.z - self.C @ x))
 
-    def applied(self, d: np.ndarray) -> np.ndarray:
+    def apply(self, d: np.ndarray) -> np.ndarray:
         """(N, 3) half the second derivative, applied to d (N, 3)."""
         return np.einsum("nij,nj->ni", self.A, d) + self.share * (self.C.T @ (self.C @ d))
 
