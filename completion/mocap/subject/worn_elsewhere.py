@@ -235,7 +235,7 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     # two exchanged names on a leg can draw all its markers away: what was found nowhere is sought on the body without
     if found.unplaced and (found.moved or found.exchanged):
         renamed = [found.restore_names(each, layout) for each in sequences]
-    placed = replace(found, unplaced=()).update_layout(layout)
+        placed = replace(found, unplaced=()).update_layout(layout)
         again = _without(model, renamed, placed, (), config)
         off, limit = dict(zip(again.layout.labels, again.off, strict=True)), again.far(FAR)
         gone = [label for label in found.unplaced if off[label] > limit]
