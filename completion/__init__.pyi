@@ -37,8 +37,8 @@ from .mocap.mosh.mosh import mosh as mosh
 from .mocap.mosh.mosh import mosh_by_sex as mosh_by_sex
 from .mocap.pose.follow import animate as animate
 from .mocap.pose.marked_body import AnimateConfig as AnimateConfig
-from .mocap.pose.stream import Frame as Frame
 from .mocap.pose.stream import MarkerStream as MarkerStream
+from .mocap.pose.stream import PoseFrame as PoseFrame
 from .mocap.retargeting.retarget import morph_vertices as morph_vertices
 from .mocap.retargeting.retarget import retarget as retarget
 from .mocap.retargeting.soft_tissue import deformation as deformation

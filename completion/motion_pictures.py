@@ -15,7 +15,7 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, stance
 from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots, Moving, Solid, render, side_by_side
+from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet, render
 
 from .motion import Motion
 
@@ -153,8 +153,8 @@ def picture_bodies(motion: Motion, subject: Subject, bodies: np.ndarray, frames:
                    ) -> np.ndarray:
     """Some of the meshes (n, N, 3) of a body that changes side by side, at one scale; `frames` (n,) is when."""
     chosen = spread_indices(len(frames), count)
-    return side_by_side(bodies_in_a_row(subject, motion.poses[frames[chosen]], bodies[chosen]),
-                        seconds(motion, frames[chosen]))
+    return contact_sheet(bodies_in_a_row(subject, motion.poses[frames[chosen]], bodies[chosen]),
+                         seconds(motion, frames[chosen]))
 
 
 def mean_over(values: np.ndarray, axis: int) -> np.ndarray:

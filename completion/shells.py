@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from scanprep.arguments import Argument, Place
-from scanprep.command_line import Arguments, load
+from scanprep.command_line import Arguments, load_command
 from scanprep.console import Outcome
 
 ShellArg = Annotated[Literal["bash", "zsh", "tcsh"], Place("SHELL")]
@@ -36,7 +36,7 @@ def _add(parser: argparse.ArgumentParser, commands: Mapping[str, tuple[str, str]
     """The commands of a group, with all below them, as parsers below its own."""
     below = parser.add_subparsers()
     for name, (text, target) in commands.items():
-        function, path = load(target), f"{prog} {name}"
+        function, path = load_command(target), f"{prog} {name}"
         if function.__name__ == "group":
             _add(below.add_parser(name, help=text, prog=path), sys.modules[function.__module__].COMMANDS, path)
         else:

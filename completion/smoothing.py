@@ -43,7 +43,8 @@ def solve_coupled_steps(x: np.ndarray, equations: Callable[[slice], tuple[np.nda
     return step
 
 
-def smooth(x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, stiffness: np.ndarray, rounds: int) -> np.ndarray:
+def smooth_frames(x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, stiffness: np.ndarray,
+                  rounds: int) -> np.ndarray:
     """Smooth all frames (T, P) by some rounds of `solve_coupled_steps`, the data of each frame as a quadratic.
 
     Frames are no longer needed: near its own optimum x a frame is its gradient and its Gauss-Newton matrix.

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import sparray
 
-from .linear import PointOperator, Points
+from .linear import PointOperator, SurfaceCombination
 
 
-class ShapedPoints(Points):
+class ShapedPoints(SurfaceCombination):
     """Surface points as a function of pose, betas and place, with derivatives; affine in betas.
 
     Made by `BodyModel.points`.

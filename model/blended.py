@@ -137,7 +137,7 @@ class Blended(PointOperator):
         return (f.astype(x.dtype, copy=False) @ self.bends.reshape(f.shape[1], -1)).reshape(-1, *x.shape) + x
 
     def combine(self, weights: np.ndarray | sparray) -> Blended:
-        used, mix = _needed_vertices(self.mix, weights)
+        used, mix = _find_needed_vertices(self.mix, weights)
         return replace(self, weights=self.weights[used], rest=self.rest[used],
                        bends=np.ascontiguousarray(self.bends[..., used]), mix=mix)
 
@@ -181,7 +181,7 @@ def relative_to_parents(skeleton: Skeleton, R: np.ndarray, joints: np.ndarray) -
     return y - (R @ joints[..., None])[..., 0], y
 
 
-def _needed_vertices(mix: Mix, weights: np.ndarray | sparray) -> tuple[np.ndarray | slice, Mix]:
+def _find_needed_vertices(mix: Mix, weights: np.ndarray | sparray) -> tuple[np.ndarray | slice, Mix]:
     """Which vertices combinations (K, L) of points, `mix` of n vertices, need, and how they are mixed of those."""
     rows = find_single_rows(weights) if mix is None else None
     if rows is not None:
@@ -259,7 +259,7 @@ class ShapedBlended(ShapedPoints):
         return replace(self.mean.middle, basis=np.moveaxis(self.middle[..., 0], 0, -1))
 
     def combine(self, weights: np.ndarray | sparray) -> ShapedBlended:
-        used, _ = _needed_vertices(self.mean.mix, weights)
+        used, _ = _find_needed_vertices(self.mean.mix, weights)
         return replace(self, own=self.own.combine(weights), mean=self.mean.combine(weights), rest=self.rest[:, used])
 
     def concatenate(self, other: ShapedPoints) -> ShapedBlended:

@@ -199,7 +199,8 @@ class BodyModel(ABC):
             "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance, "pose_examples": self.pose_examples,
             **self.arrays()}
         header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
-                  "versions": versions(), "names": list(skeleton.names), "lift": features.lift.kind, "info": self.info}
+                  "versions": writer_versions(), "names": list(skeleton.names), "lift": features.lift.kind,
+                  "info": self.info}
         storage.save(path, self.kind, VERSION, arrays, {**header, **self.notes()})
 
     @classmethod
@@ -355,7 +356,7 @@ def restore_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.
     return variances, whole
 
 
-def versions() -> dict[str, str]:
+def writer_versions() -> dict[str, str]:
     """What wrote a file."""
     try:
         ours = importlib.metadata.version("scapekit")

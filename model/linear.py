@@ -31,7 +31,7 @@ def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, n
     return pose, np.broadcast_to(trans, (*pose.shape[:-2], 3))
 
 
-class Points(ABC):
+class SurfaceCombination(ABC):
     """Some surface points of a body that a pose moves."""
 
     @property
@@ -50,7 +50,7 @@ class Points(ABC):
         """Numbers that the derivatives of one coordinate of a point at one pose hold in between."""
 
 
-class PointOperator(Points):
+class PointOperator(SurfaceCombination):
     """Some surface points of a fixed body as a function of pose and place, with derivatives.
 
     Built by `Subject.points`; it never touches the mesh. The root's joint stands in `origin` (3,) when trans is zero.
@@ -213,7 +213,7 @@ class Subject:
 
 def combination_weights(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None) -> csr_array:
     """(L, N) surface points as combinations of vertices; arguments as of `Subject.points`."""
-    ids, weights = check_points(n_vertices, vertex_ids, weights)
+    ids, weights = check_combinations(n_vertices, vertex_ids, weights)
     share = np.ones(ids.shape) if weights is None else weights
     ends = np.arange(len(ids) + 1) * (ids.shape[1] if ids.ndim == 2 else 1)
     found = csr_array((share.ravel(), ids.ravel(), ends), shape=(len(ids), n_vertices), copy=True)
@@ -229,8 +229,8 @@ def find_single_rows(weights: np.ndarray | sparray) -> np.ndarray | None:
     return rows.indices if (rows.data == 1).all() and (np.diff(rows.indptr) == 1).all() else None
 
 
-def check_points(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None
-                 ) -> tuple[np.ndarray, np.ndarray | None]:
+def check_combinations(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None
+                       ) -> tuple[np.ndarray, np.ndarray | None]:
     """Vertex indices and weights of surface points as arrays, or ValueError."""
     ids = np.asarray(vertex_ids, dtype=np.int64)
     if ids.ndim != (1 if weights is None else 2):

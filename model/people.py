@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import Judgement, beyond_people
+from scanprep.judgement import Judgement, implausible_body
 from scanprep.pictures.camera import tallest
 from scanprep.skeleton.roles import find_roles
 
@@ -22,7 +22,7 @@ def person_judgement(model: BodyModel, betas: np.ndarray | None, cause: str = ""
     if not find_roles(model.skeleton.names).keys() >= HUMAN:
         return Judgement()
     body = model.subject(betas).vertices(np.zeros((len(model.skeleton.parents), 3)))
-    return beyond_people(*stature_and_volume(model.template.with_vertices(body)), betas, cause)
+    return implausible_body(*stature_and_volume(model.template.with_vertices(body)), betas, cause)
 
 
 def stature_and_volume(body: Mesh) -> tuple[float, float | None]:

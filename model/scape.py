@@ -22,7 +22,7 @@ from .linear import Subject, check_pose, combination_weights
 from .pose_space import PoseSpace, faces_of_part
 from .priors import sample_poses
 from .products import Terms
-from .resolution.transfer import Follower, Piece, gradients_of
+from .resolution.transfer import Piece, SurfaceCarrier, gradients_of
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
@@ -207,7 +207,7 @@ class ScapeModel(BodyModel):
             return moved
         # three poses for each feature of the part that has most
         poses = sample_poses(self, max(40, 3 * int(np.bincount(self.features.part).max())), np.random.default_rng(0))
-        poses[0], follow = self.pose_mean, Follower(self.template, template)
+        poses[0], follow = self.pose_mean, SurfaceCarrier(self.template, template)
         moved = _with_pose_space(moved, poses, follow.positions(self.subject(None).vertices(poses)), rounds)
         return _with_shape_space(moved, self, follow, poses[:8], rounds, progress) if self.n_betas else moved
 
@@ -261,7 +261,7 @@ def _with_pose_space(model: ScapeModel, poses: np.ndarray, wanted: np.ndarray, r
     return model
 
 
-def _with_shape_space(model: ScapeModel, teacher: ScapeModel, follow: Follower, poses: np.ndarray, rounds: int,
+def _with_shape_space(model: ScapeModel, teacher: ScapeModel, follow: SurfaceCarrier, poses: np.ndarray, rounds: int,
                       progress: Progress) -> ScapeModel:
     """The model with a mean person and shape components corrected in poses (M, J, 3), where those of the teacher are.
 

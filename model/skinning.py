@@ -19,7 +19,7 @@ from .body import BodyModel, Progress, restore_variances
 from .features import PoseFeatures, RotationLift
 from .linear import Subject, combination_weights
 from .products import Products, Terms
-from .resolution.transfer import Follower
+from .resolution.transfer import SurfaceCarrier
 
 SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
 
@@ -238,7 +238,7 @@ class SkinningModel(BodyModel):
         return np.moveaxis(self.correctives, 0, -1) if rotations_alone else None
 
     def resample(self, template: Mesh, skeleton: Skeleton, rounds: int, progress: Progress) -> SkinningModel:
-        follow = Follower(self.template, template)
+        follow = SurfaceCarrier(self.template, template)
 
         def displaced(field: np.ndarray) -> np.ndarray:
             return follow.displacements(field.astype(np.float64)).astype(field.dtype)

@@ -224,7 +224,7 @@ def near(word: str, known: Iterable[str], alike: float = 0.6) -> str:
     return f"; did you mean {found[0]}?" if found else ""
 
 
-def sentences(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+def command_sentences(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     """The docstring of a command without its arguments, and what it says of each argument."""
     text, _, listed = (inspect.getdoc(function) or "").partition("\nArgs:\n")
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", listed, re.MULTILINE)

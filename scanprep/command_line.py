@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from . import config_files, ranges
-from .arguments import Argument, UsageError, make_parser, near, read_line, sentences
+from .arguments import Argument, UsageError, command_sentences, make_parser, near, read_line
 from .config_files import Flag
 from .console import JUDGEMENT, Metric, Outcome, keep_report, say, show, write_report
 from .interrupts import tidy_up
@@ -85,7 +85,7 @@ def settings_file(function: Callable[..., Outcome], argv: list[str]) -> str | No
     if not found or "--write-config" not in argv:
         return None
     settings = _Settings(found, argv)
-    return settings.about + config_files.write(settings.values)
+    return settings.about + config_files.write_settings(settings.values)
 
 
 class _Settings:
@@ -108,7 +108,7 @@ class _Settings:
                 self.values = {name: _as_published(value) if hasattr(value, "from_paper") and (
                     name == own or value == type(value)()) else value for name, value in values.items()}
             if given.config is not None:
-                self.values = config_files.read(given.config, self.values)
+                self.values = config_files.read_settings(given.config, self.values)
 
     @property
     def flags(self) -> dict[str, Flag]:
@@ -156,7 +156,7 @@ class Arguments:
         self.beside, self.either = bool(kinds), len(kinds) > 1
         self.settings = _Settings({p.name: p.default for p in parameters if isinstance(p.default, ranges.Settings)},
                                   argv)
-        self.text, told = sentences(function)
+        self.text, told = command_sentences(function)
         self.listed = [Argument(p.name, hints[p.name], p.default, told.get(p.name, "")) for p in parameters
                        if p.name != SPACE and p.name not in self.settings.values]
         self.output_name = next((a.name for a in self.listed if a.name in ("output", "out")), "")
@@ -312,13 +312,13 @@ def dispatch(commands: Mapping[str, tuple[str, str]], prog: str, argv: list[str]
         hint = f"; did you mean {at}?" if at else near(first, commands) or near(first, everywhere)
         say(f"{prog}: no command '{first}'{hint or '; there are: ' + ', '.join(commands)}")
         return 2
-    target = load(commands[first][1])
+    target = load_command(commands[first][1])
     if target.__name__ == "group":
         return target(argv[1:])
     return run(target, f"{prog} {first}", argv[1:])
 
 
-def load(target: str) -> Callable[..., Any]:
+def load_command(target: str) -> Callable[..., Any]:
     """The function of a command, "module:function"."""
     module, function = target.split(":")
     return getattr(importlib.import_module(module), function)

@@ -43,7 +43,7 @@ def flags(settings: Mapping[str, Settings]) -> dict[str, Flag]:
 
 
 def _flags(path: Path_, config: Settings) -> Iterator[Flag]:
-    told, hints = sentences(type(config)), _hints(type(config))
+    told, hints = settings_sentences(type(config)), _hints(type(config))
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if FLAG in marks(hints[field.name]):
@@ -59,7 +59,7 @@ def replace_at(config: Settings, path: Path_, value: Any) -> Settings:
     return dataclasses.replace(config, **{first: inner})
 
 
-def sentences(cls: type[Settings]) -> dict[str, str]:
+def settings_sentences(cls: type[Settings]) -> dict[str, str]:
     """What the docstrings of settings, and of those that they extend, say of each field."""
     fields, found = {field.name for field in dataclasses.fields(cls)}, dict[str, list[str]]()
     for owner in reversed(cls.__mro__):
@@ -75,7 +75,7 @@ def sentences(cls: type[Settings]) -> dict[str, str]:
     return {name: " ".join(lines).strip() for name, lines in found.items()}
 
 
-def write(settings: Mapping[str, Settings]) -> str:
+def write_settings(settings: Mapping[str, Settings]) -> str:
     """Settings as a file that `read` takes: every field with its sentence."""
     kept = _of_files(settings)
     return "\n\n".join("\n".join(_lines(config, (name,) if len(kept) > 1 else ())) for name, config in kept.items())
@@ -102,7 +102,7 @@ def _lines(config: Any, table: Path_) -> Iterator[str]:
     """Fields first, then tables, as TOML wants it."""
     import tomlkit
 
-    told, inner = sentences(type(config)), []
+    told, inner = settings_sentences(type(config)), []
     if table:
         yield f"[{'.'.join(table)}]"
     for field in dataclasses.fields(config):
@@ -124,7 +124,7 @@ def _lines(config: Any, table: Path_) -> Iterator[str]:
         yield from _lines(value, name)
 
 
-def read(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
+def read_settings(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
     """Settings with what a file changes in them; ValueError names file, line, what was expected, the nearest name."""
     with storage.taking_apart(path, "settings in TOML"):
         text = storage.read_bytes(path, "settings in TOML").decode("utf-8")

@@ -142,7 +142,7 @@ def show(metrics: list[Metric]) -> None:
     Console().print(table)
 
 
-def versions() -> dict[str, str]:
+def library_versions() -> dict[str, str]:
     """Versions of Python, the platform and the libraries the figures depend on."""
     found = {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
     for name in ("scapekit", "numpy", "scipy", "libigl", "cholespy", "embreex"):
@@ -162,7 +162,7 @@ def write_report(outcome: Outcome, command: str, seconds: float, notes: Sequence
         return None
     path = report_path(outcome.output)
     storage.write_json(path, {
-        "command": command, "seconds": round(seconds, 2), "versions": versions(),
+        "command": command, "seconds": round(seconds, 2), "versions": library_versions(),
         "settings": outcome.settings, "failures": outcome.failures, "notes": list(notes),
         "judgement": None if outcome.judgement is None else dataclasses.asdict(outcome.judgement),
         "metrics": [{"metric": m.name, "value": m.value, "unit": m.unit} for m in outcome.metrics],

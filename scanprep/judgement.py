@@ -139,8 +139,8 @@ def carry_judgements(inputs: Iterable[Path], used: Iterable[Path] = ()) -> Judge
     return Judgement.of(problems, doubts)
 
 
-def beyond_people(stature: float, volume: float | None = None, betas: np.ndarray | None = None, cause: str = ""
-                  ) -> Judgement:
+def implausible_body(stature: float, volume: float | None = None, betas: np.ndarray | None = None, cause: str = ""
+                     ) -> Judgement:
     """Whether a body is one that a person can have, with the likely cause where it is not.
 
     Parameters

@@ -267,7 +267,7 @@ def _add_sets(rng: np.random.Generator, place: Any, add: Any, text: Any) -> None
     source, config = filled(place("source")), DecimateSetConfig(meshes=1)
     write_decimated_set(source, place("small"), 60, config)
     add(place("small") / "decimation.npz", lambda path: _load_map(
-        path, source, config, {k: storage.kind_of(path) and v for k, v in _settings(path).items()}),
+        path, source, config, {k: storage.stored_kind(path) and v for k, v in _settings(path).items()}),
         lambda found: good_mesh(found.template))
     write_correspondences(path := place("pairs.json"), Correspondences(
         np.arange(4), rng.random((4, 3)), np.ones(4), "manual", {"all": float("nan")}, True))

@@ -20,9 +20,9 @@ from scipy.spatial.distance import cdist
 from model.statue.control.files import STORED, humanoid, humanoid_markers, write_control
 from model.statue.control.model import ControlModel
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.anatomy import Anatomy
+from scanprep.synthetic.anatomy import RestFrames
 from scanprep.synthetic.landmarks import landmarks, markers
-from scanprep.synthetic.topology import load
+from scanprep.synthetic.topology import load_topology
 
 NAMES = ("humanoid_root", "vl5", "skullbase", "l_sternoclavicular", "l_shoulder", "l_elbow", "l_wrist",
          "r_sternoclavicular", "r_shoulder", "r_elbow", "r_wrist", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee",
@@ -42,9 +42,9 @@ LIMITS = {"humanoid_root": (FREE, FREE, FREE),
           "l_hip": ((-35, 65), (-35, 130), (-50, 50)), "l_knee": ((-8, 155),), "l_ankle": ((-35, 55),)}
 
 
-def coarse_body(a: Anatomy) -> Field:
+def coarse_body(a: RestFrames) -> Field:
     """The surface of the people without toes, fingers and ears, which few triangles cannot follow."""
-    people = load()
+    people = load_topology()
     x, part = people.mesh.vertices.copy(), people.part_of_vertex
     # ears are laid flat: the skin is spanned anew over the side of the head, a quarter of the ear is left
     ear = a.vertices[landmarks()["left ear"]] + [0, 0.012, 0.012]
@@ -90,7 +90,7 @@ def at(side: float, front: float, up: float) -> np.ndarray:
     return np.array([side, -front, up])
 
 
-def joint_places(a: Anatomy) -> np.ndarray:
+def joint_places(a: RestFrames) -> np.ndarray:
     """(17, 3) the centres of the joints; the sternoclavicular ones lie beside the notch above the breastbone."""
     of_people = np.array([0, 1, 3, 4, 4, 5, 6, 7, 7, 8, 9, 10, 11, 12, 13, 14, 15])
     joints = a.joints[of_people]
@@ -99,7 +99,7 @@ def joint_places(a: Anatomy) -> np.ndarray:
     return np.where(np.abs(joints) < 1e-12, 0.0, joints)
 
 
-def slide(control: ControlModel, anatomy: Anatomy, rounds: int = 12) -> Mesh:
+def slide(control: ControlModel, anatomy: RestFrames, rounds: int = 12) -> Mesh:
     """The mesh slid over the surface of the people until each landmark and marker lies at theirs."""
     mesh, field = control.mesh, coarse_body(anatomy)
     twin = mirrored_vertices(mesh)
@@ -107,7 +107,7 @@ def slide(control: ControlModel, anatomy: Anatomy, rounds: int = 12) -> Mesh:
     x, mine, theirs = mesh.vertices, [*control.skeleton.joints], [*joint_places(anatomy)]
     goals = np.zeros((0, 3))
     for vertices, marks in ((control.landmarks, landmarks()), (humanoid_markers(), markers())):
-        places = project(field, load().mesh.vertices[[marks[name] for name in vertices]], 6)
+        places = project(field, load_topology().mesh.vertices[[marks[name] for name in vertices]], 6)
         mine += [*x[list(vertices.values())]]
         theirs += [*places]
         # a marker beside a landmark shares its vertex, in the middle between them
@@ -141,7 +141,7 @@ def slide(control: ControlModel, anatomy: Anatomy, rounds: int = 12) -> Mesh:
 
 def nearest_marks(mesh: Mesh, marks: dict[str, int]) -> dict[str, int]:
     """The vertices nearest to marked vertices of the people; left and right are mirror images."""
-    twin, people = mirrored_vertices(mesh), load()
+    twin, people = mirrored_vertices(mesh), load_topology()
     on_middle = twin == np.arange(len(twin))
 
     def nearest(vertex: int) -> int:
@@ -161,7 +161,7 @@ def mirrored_vertices(mesh: Mesh) -> np.ndarray:
 
 def build() -> ControlModel:
     """The stored humanoid, brought to the people."""
-    anatomy, old = load().anatomy, humanoid()
+    anatomy, old = load_topology().anatomy, humanoid()
     mesh = slide(old, anatomy)
     joints = joint_places(anatomy)
     joints[0] = mesh.vertices[old.skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
@@ -170,7 +170,7 @@ def build() -> ControlModel:
                    landmarks=nearest_marks(mesh, landmarks()))
 
 
-def freedom(anatomy: Anatomy) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+def freedom(anatomy: RestFrames) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
     """Axes and limits of every joint, anatomical in the default pose; those of the right mirror those of the left.
 
     The axes of elbow and knee are square to the limb, and a positive angle bends it. Shoulder and hip have three axes

@@ -17,7 +17,7 @@ from quiet_pictures import render
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
 from completion.mocap.mosh import cli, report
-from completion.mocap.mosh.work import Work
+from completion.mocap.mosh.work import MoshTask
 from scanprep.batch.workspace import HOME
 from scanprep.pictures import scene
 from scanprep.pictures.page import Page
@@ -77,7 +77,7 @@ def small_pictures():
         yield
 
 
-class QuietWork(Work):
+class QuietWork(MoshTask):
     """The work with small pictures and charts that are not drawn, in other processes too."""
 
     def __call__(self, actor, room):
@@ -138,7 +138,7 @@ def _killed(place, stage, call, *words):
         if (now, number) == (stage, int(call)):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    cli.Work = QuietWork
+    cli.MoshTask = QuietWork
     with counted(kill):
         sys.exit(run(Path(place), *words))
 

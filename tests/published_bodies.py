@@ -12,7 +12,7 @@ from model.export.correctives import pose_directions
 from model.rig import Rig
 from scanprep.dataset import Skeleton
 from scanprep.synthetic.data_set import SUBJECT, near_rest
-from scanprep.synthetic.people import PARTS, BodyShape, Person, random_pose
+from scanprep.synthetic.people import PARTS, BodyShape, SyntheticPerson, random_pose
 
 PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
 # of each synthetic part the joint that turns it here
@@ -29,14 +29,14 @@ class Synthetic:
 
 def synthetic_smpl(faces: int = 2400, people: int = 3, poses: int = 8, seed: int = 5) -> Synthetic:
     """24 joints, 10 betas and 207 pose columns, learned from synthetic people; no spine is cut but ours."""
-    rng, man = np.random.default_rng(seed), Person(SUBJECT)
+    rng, man = np.random.default_rng(seed), SyntheticPerson(SUBJECT)
     at = [random_pose(rng) for _ in range(poses)]
     for pose in at:
         pose[0] = 0
     small = make_model.decimate_person(man, None, faces)
     own, template = small.vertex_map, small.template
     drawn = [BodyShape.random(rng, ("female", "male")[k % 2]) for k in range(people)]
-    shapes = np.stack([Person(shape).mesh.vertices[own] for shape in drawn])
+    shapes = np.stack([SyntheticPerson(shape).mesh.vertices[own] for shape in drawn])
     mean = shapes.mean(axis=0)
     _, s, Vt = np.linalg.svd((shapes - mean).reshape(people, -1), full_matrices=False)
     shapedirs = (s[:10, None] * Vt[:10] / np.sqrt(people - 1)).reshape(-1, len(own), 3)[:people - 1]
@@ -153,7 +153,7 @@ def published_vertices(a: dict[str, np.ndarray], pose: np.ndarray, betas: np.nda
     return out + trans
 
 
-def people_near_rest(count: int, seed: int) -> list[tuple[Person, np.ndarray]]:
+def people_near_rest(count: int, seed: int) -> list[tuple[SyntheticPerson, np.ndarray]]:
     """People who were not learned from, and how they stand."""
     rng = np.random.default_rng(seed)
-    return [(Person(BodyShape.random(rng, ("female", "male")[k % 2])), near_rest(rng)) for k in range(count)]
+    return [(SyntheticPerson(BodyShape.random(rng, ("female", "male")[k % 2])), near_rest(rng)) for k in range(count)]

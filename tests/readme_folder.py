@@ -16,7 +16,7 @@ from completion.__main__ import main
 from model import load_model, write_body_npz
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.ownership import HOME
-from scanprep.batch.values import load_header
+from scanprep.batch.values import load_step_header
 from scanprep.decimation.registered_set import decimate_set
 from scanprep.pipeline.prepare import SCANS
 from scanprep.synthetic.data_set import read_views
@@ -112,7 +112,7 @@ def begun_set(demo, folder, names):
     """
     for result in ("person", "skeleton", *(SCANS + name for name in names)):
         record = Path(HOME, "done", f"{quote(result, safe=' ')}.npz")
-        header = load_header(demo / record)
+        header = load_step_header(demo / record)
         for file in (record, *header["files"]):
             (folder / file).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(demo / file, folder / file)

@@ -14,7 +14,7 @@ from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
 from scanprep.geometry.format_glb import turn_up
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 
 FRAMES = 30
 BETAS = np.array([0.9, -0.6, 0.4])
@@ -83,7 +83,7 @@ def test_the_glb_shows_every_frame_at_its_time(place, tmp_path):
     glb, body = Glb((tmp_path / "out" / "animation.glb").read_bytes()), worm_with_prior().subject(None)
     for sampler in glb.json["animations"][0]["samplers"]:
         assert np.allclose(glb.array(sampler["input"])[:, 0], np.arange(FRAMES) / 60)
-    shown = np.stack([glb.skinned(t) for t in range(FRAMES)]) @ turn_up(upright(body.template)[0])
+    shown = np.stack([glb.skinned(t) for t in range(FRAMES)]) @ turn_up(guess_upright(body.template)[0])
     off = 1000 * np.linalg.norm(shown - motion.vertices(body), axis=2)
     figures = told(tmp_path / "out")
     assert figures["animation.glb, distance from the exact body, mean"] == pytest.approx(off.mean(), rel=1e-3)
@@ -110,7 +110,7 @@ def test_a_long_motion_is_shown_at_its_own_times(tmp_path, changing, monkeypatch
     weights = glb.array(samplers[-1]["output"]).reshape(len(frames), -1)
     assert weights.min() >= 0 and weights.max() <= 1
     places = np.stack([glb.skinned(t) for t in range(53)])
-    off = np.linalg.norm(places @ turn_up(upright(body.template)[0]) - exact, axis=2)
+    off = np.linalg.norm(places @ turn_up(guess_upright(body.template)[0]) - exact, axis=2)
     assert off[frames].mean() < 1e-3 and off.mean() < 2e-3
     assert not (tmp_path / "out" / "subject.json").exists()
 

@@ -130,7 +130,7 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
     weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
     rows, values = [], []
     for t in range(5):
-        prior = energy.pose_prior(x[t][None], body.prior, PLAIN.prior_weight)
+        prior = energy.pose_prior_term(x[t][None], body.prior, PLAIN.prior_weight)
         markers = body.shapes.columns(x[t, :-3].reshape(1, 4, 3), x[t, -3:][None])[1][0]              # (15, 3, 30)
         root = np.sqrt(weights[t])
         residual = root * (body.positions(x[t]) - targets[t]).T

@@ -16,7 +16,7 @@ def precision(body, x, ids):
     follow = body.follow(ids, x)
     weights = np.full(len(ids), 0.005**-2)
     targets = body.vertices(x)[ids]
-    terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior(x[None], PRIOR),
+    terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior_term(x[None], PRIOR),
              energy.shape_prior(x[None], body.n_angles + 3)]
     return normal_equations(terms).hessian[0]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
-from completion.mocap.files.motion_files import write_motion
+from completion.mocap.files.motion_files import write_motion_folder
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.coverage import between, find_coverage, marker_labels
@@ -94,7 +94,7 @@ def test_a_part_between_two_is_told():
 
 def test_angles_that_are_guesses_are_in_no_table(tmp_path):
     found, motion = covered(LEGS)
-    write_motion(tmp_path, motion, subject(), None, found.told)
+    write_motion_folder(tmp_path, motion, subject(), None, found.told)
     lines = (tmp_path / "motion.mot").read_text().splitlines()
     head = lines[lines.index("endheader") + 1].split("\t")
     assert "knee_angle_r" in head and "hip_flexion_l" in head and head[1:7] == [

@@ -9,8 +9,8 @@ from PIL import Image
 
 from completion.__main__ import main
 from completion.partial import report
-from completion.partial.completion import complete, doubts, find_stray, load_completion
-from completion.partial.inputs import in_metres
+from completion.partial.completion import complete, completion_doubts, find_stray, load_completion
+from completion.partial.inputs import prepare_in_metres
 from completion.partial.work import read_picture
 from model.fitting.bodies import as_body
 from model.fitting.scan_fit import scan_fit
@@ -59,7 +59,7 @@ def test_a_body_before_a_wall_is_completed(model, body, marks):
 
 def test_what_is_beyond_the_border_is_unknown_and_not_doubted(model, body, marks):
     middle = taken(body).project(body.vertices.mean(axis=0))[0]
-    given = in_metres(as_body(model), taken(body, slice(int(middle), None)), marks, None, QUICK)
+    given = prepare_in_metres(as_body(model), taken(body, slice(int(middle), None)), marks, None, QUICK)
     fit = scan_fit(as_body(model), given.cloud, given.vertices, given.points, QUICK)
     x = as_body(model).join(POSE, body.vertices.mean(axis=0))
     x[3 * len(POSE):][:3] += (body.vertices - fit.mesh(x).vertices).mean(axis=0)
@@ -69,9 +69,10 @@ def test_what_is_beyond_the_border_is_unknown_and_not_doubted(model, body, marks
     assert find_stray(fit, x) == []
     seen, error = np.zeros(len(fit.part), dtype=bool), np.where(fit.beyond(x), 1.0, 0.001)
     within = [p for p in range(4) if not fit.beyond(x)[fit.part == p].any()]
-    assert within and doubts(fit, x, np.where(np.isin(fit.part, within), 0.001, 1.0), seen) != doubts(
+    assert within and completion_doubts(fit, x, np.where(np.isin(fit.part, within), 0.001, 1.0),
+                                        seen) != completion_doubts(
         fit, x, np.full(len(seen), 1.0), seen)
-    assert len(doubts(fit, x, error, seen)) < 4
+    assert len(completion_doubts(fit, x, error, seen)) < 4
     aside = x.copy()
     aside[3 * len(POSE)] += 0.3
     assert len(find_stray(fit, aside)) == 2         # it stands in seen space, and leaves what was seen without a body

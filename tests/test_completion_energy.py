@@ -39,8 +39,8 @@ def skin(body, x0):
 ENERGIES = {
     "point_to_point": points,
     "above_skin": skin,
-    "pose_prior": lambda body, x0: lambda x: energy.pose_prior(x, PRIOR, 2.0),
-    "upright": lambda body, x0: lambda x: energy.upright(x, np.array([0, 0.6, 0.8]), np.array([0, 1.0, 0]), 0.3),
+    "pose_prior": lambda body, x0: lambda x: energy.pose_prior_term(x, PRIOR, 2.0),
+    "upright": lambda body, x0: lambda x: energy.upright_term(x, np.array([0, 0.6, 0.8]), np.array([0, 1.0, 0]), 0.3),
     "joint_limits": lambda body, x0: lambda x: energy.joint_limits(x, LIMITS, 2.0),
     "shape_prior": lambda body, x0: lambda x: energy.shape_prior(x, body.n_angles + 3, 2.0),
     "stay_near": lambda body, x0: lambda x: energy.stay_near(x, x0 + 0.1, np.arange(len(x0)) / 3),

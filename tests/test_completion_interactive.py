@@ -8,10 +8,10 @@ from browser import wait_until
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 from test_completion_partial import errors
 
-from completion.partial.clicked_landmarks import doubts
+from completion.partial.clicked_landmarks import landmark_doubts
 from completion.partial.completion import complete, load_completion
 from completion.partial.interactive import CompleteApp
-from completion.partial.work import Work
+from completion.partial.work import CompletionTask
 from scanprep.batch.opening import workspace
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.landmarks import read_landmarks
@@ -37,7 +37,7 @@ def case(model, tmp_path):
     body = model.template.with_vertices(model.vertices(POSE, None, TRANS))
     points, seen = half_view(body, np.array([0.3, -1, 0.5]), noise=0.001)
     write_points(tmp_path / "half.ply", PointCloud(points))
-    work = Work(model, "worm", dict(zip(NAMES, map(int, MARKS), strict=True)), QUICK)
+    work = CompletionTask(model, "worm", dict(zip(NAMES, map(int, MARKS), strict=True)), QUICK)
     app = CompleteApp(model, work, [tmp_path / "half.ply"], tmp_path / "out")
     yield body, points, seen, app
     app.close()
@@ -114,11 +114,12 @@ def test_what_python_completes_the_page_completes(case):
 def test_landmarks_at_wrong_places_are_told():
     found = {"left toe": np.zeros(3), "right toe": np.array([0.3, 0, 0]), "left knee": np.array([0, 0, 0.5]),
              "right knee": np.array([0.3, 0, 0.5]), "nose": np.array([0.1, 0, 1.6])}
-    assert doubts({name: place + 0.03 for name, place in found.items()}, found).startswith("all landmarks are where")
+    assert landmark_doubts({name: place + 0.03 for name, place in found.items()},
+                           found).startswith("all landmarks are where")
     swapped = {**found, "left toe": found["right toe"], "right toe": found["left toe"],
                "left knee": found["right knee"]}
-    assert "left and right are exchanged" in doubts(swapped, found)
-    told = doubts({**found, "nose": found["left knee"], "left toe": found["right toe"]}, found)
+    assert "left and right are exchanged" in landmark_doubts(swapped, found)
+    told = landmark_doubts({**found, "nose": found["left knee"], "left toe": found["right toe"]}, found)
     assert told.endswith("where the rings are: nose (1105 mm), left toe (300 mm)")
 
 

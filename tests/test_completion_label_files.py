@@ -22,7 +22,7 @@ from completion.__main__ import main
 from completion.mocap.animate import work as animating
 from completion.mocap.files.c3d import point_table
 from completion.mocap.files.c3d_points import rename_points
-from completion.mocap.files.markers import MarkerFileError, read_points
+from completion.mocap.files.markers import MarkerFileError, read_marker_points
 from completion.mocap.labelling import recording
 from completion.mocap.labelling.corrections import COLUMNS, read_corrections, write_labels
 from completion.mocap.labelling.label import GHOST, UNKNOWN
@@ -190,7 +190,7 @@ def test_the_table_says_what_was_found_and_gives_it_back(here):
     folder, _ = here
     assert label("raw.c3d", "-o", "out.c3d") == 0
     rows = rows_of(folder / "out.labels.csv")
-    points = read_points("raw.c3d")
+    points = read_marker_points("raw.c3d")
     tracks = link_points(points.positions, points.rate)
     assert {row["fixed"] for row in rows} == {""} and {row["label"] for row in rows} == {*MARKERS, ""}
     covered = np.zeros(tracks.shape, dtype=int)
@@ -271,7 +271,7 @@ def test_labels_that_the_recording_has_are_believed_unless_asked(here):
     names = [f"*{i}" for i in range(35)]
     names[5], names[6], names[7] = "Worm:m6", "Worm:M5", "Worm:stick"
     write_markers("some.csv", MarkerSequence(points, names, RATE))
-    known = columns_of_labels(read_points("some.csv"), MarkerLayout.load("layout.json"))
+    known = columns_of_labels(read_marker_points("some.csv"), MarkerLayout.load("layout.json"))
     assert np.unique(known[:, 5]) == 6 and np.unique(known[:, 6]) == 5 and (known[:, [4, 7, 34]] == UNKNOWN).all()
     assert label("some.csv", "-o", "kept.csv") == 0 and label("some.csv", "-o", "anew.csv", "--relabel") == 0
     kept, anew = read_markers("kept.csv"), read_markers("anew.csv")
@@ -288,7 +288,7 @@ def test_several_people(here, monkeypatch):
     monkeypatch.setattr(recording, "label_people", knows)
     write_markers("two.csv", MarkerSequence(shuffle(points, order), [f"*{i}" for i in range(69)], RATE))
     assert label("two.csv", "-o", "out.c3d", "--people", "2") == 0
-    out = read_points("out.c3d")
+    out = read_marker_points("out.c3d")
     assert out.labels == (*(f"Person{k}:{name}" for k in (1, 2) for name in MARKERS), "*1")
     for k in (1, 2):
         np.testing.assert_allclose(read_markers("out.c3d", subject_prefix=f"Person{k}").positions, markers[k - 1],
@@ -302,7 +302,7 @@ def test_several_people(here, monkeypatch):
     names = [*(f"Ann:{name}" for name in MARKERS), *(f"Bob:{name}" for name in MARKERS), "*1"]
     write_markers("named.csv", MarkerSequence(points, names, RATE))
     assert label("named.csv", "-o", "again.csv", "--people", "2") == 0
-    assert read_points("again.csv").labels == tuple(names)
+    assert read_marker_points("again.csv").labels == tuple(names)
     assert "person 2" in (folder / "again.report.html").read_text()
 
 
@@ -400,7 +400,7 @@ def test_animate_goes_on_with_the_labels(here, monkeypatch):
 def test_mosh_goes_on_with_the_labels(here, monkeypatch):
     """Of centimetres, which the file does not tell; the page that mends reads the labelled points."""
     folder, knows = here
-    monkeypatch.setattr(mosh_cli, "Work", QuietWork)
+    monkeypatch.setattr(mosh_cli, "MoshTask", QuietWork)
     order, points, markers = worm_points(folder)
     write_markers("walk.csv", MarkerSequence(100 * shuffle(points, order), [f"*{i}" for i in range(35)], RATE))
     assert mosh(folder, "walk.csv", "-o", "out", "--unlabelled", "--unit", "cm") == 0
@@ -424,7 +424,7 @@ def test_mosh_goes_on_with_the_labels(here, monkeypatch):
 
 def test_mosh_with_labels_that_are_doubtful(here, monkeypatch):
     folder, knows = here
-    monkeypatch.setattr(mosh_cli, "Work", QuietWork)
+    monkeypatch.setattr(mosh_cli, "MoshTask", QuietWork)
     knows.confidence = 0.5
     assert mosh(folder, "raw.c3d", "-o", "out", "--unlabelled") == 0
     judged = json.loads((folder / "out" / "report.json").read_text())["judgement"]

@@ -11,12 +11,12 @@ from completion.mocap.marker_sets import pictures, transfer
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import layout_names, load_layout, read_layout
 from completion.mocap.marker_sets.opensim import opensim_markers
-from completion.mocap.marker_sets.pictures import marker_rows, picture_layout
+from completion.mocap.marker_sets.pictures import layout_rows, picture_layout
 from model.fitting.bodies import at_rest
 from scanprep import read_mesh, write_landmarks, write_mesh
 from scanprep.geometry.landmark_reading import read_marker_set
 from scanprep.registration.nonrigid import Registration
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +26,7 @@ def small_pictures(monkeypatch):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person()
+    return SyntheticPerson()
 
 
 def test_the_sets_are_listed_with_their_bodies(capsys):
@@ -94,7 +94,7 @@ def test_the_picture_shows_every_marker(person):
 
 def test_the_table_has_partners_and_parts(person):
     layout = load_layout("cmu41", person.mesh)
-    rows = {row[0]: row for row in marker_rows(person.mesh, layout, person.skeleton)}
+    rows = {row[0]: row for row in layout_rows(person.mesh, layout, person.skeleton)}
     assert rows["LELB"][3] == "RELB" and rows["C7"][3] == "middle" and rows["RBAC"][3] == "-"
     assert rows["LTHI"][2] == "thigh_left" and rows["LTHI"][5] == "loose" and rows["LWRA"][4] == "45.0 mm"
     assert "RBAK" in rows["RBAC"][1]

@@ -20,7 +20,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.sides import split_side
 from scanprep.geometry.surface import Surface
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 COUNTS = {"biomech57": 57, "cmu41": 41, "helenhayes29": 29, "mosh67": 67, "plugingait39": 39, "vicon47": 47}
 MIDDLE = {"C7", "T10", "CLAV", "STRN", "CV7", "TV2", "TV7", "SJN", "SXS", "Top.Head", "Front.Head", "Rear.Head",
@@ -30,7 +30,7 @@ FILES = sorted(FOLDER.glob("*.json"))
 
 @pytest.fixture(scope="module")
 def someone():
-    return Person()
+    return SyntheticPerson()
 
 
 @pytest.fixture(scope="module")

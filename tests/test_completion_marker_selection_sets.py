@@ -9,7 +9,7 @@ from derivatives import differences
 
 from completion.mocap.marker_selection.design import design_markers
 from completion.mocap.marker_selection.fits import BodyPoints, DesignConfig, prior_around, rough_poses, vertex_errors
-from completion.mocap.marker_selection.greedy import ADD, REMOVE, MarkerSets, exchange, symmetric_groups, walk
+from completion.mocap.marker_selection.greedy import ADD, REMOVE, MarkerSets, exchange, improve_set, symmetric_groups
 from completion.mocap.marker_selection.linear import LinearBodies, fit_bodies, share_betas
 from completion.mocap.marker_sets.layout import MarkerLayout
 from model.fitting.vertices import spread_vertices
@@ -52,7 +52,7 @@ def test_points_are_those_of_the_model_and_their_jacobian_is_the_finite_differen
 def test_every_step_is_the_direct_solve(groups, sign):
     linear, everything = FITS.linear, np.arange(len(groups))
     sets = MarkerSets(linear, groups, everything if sign == REMOVE else [])
-    path = walk(sets, sign, np.ones(len(groups), bool), 3 if sign == REMOVE else len(LABELS))
+    path = improve_set(sets, sign, np.ones(len(groups), bool), 3 if sign == REMOVE else len(LABELS))
     assert len(path.steps) > 5
     for i in range(len(path.counts)):
         members = [c for g in path.set(i) for c in groups[g]]
@@ -69,8 +69,8 @@ def test_greedy_is_never_better_than_the_best_subset_and_finds_it_one_step_away(
     linear, free = small(seed=seed), np.ones(7, bool)
     groups = tuple((i,) for i in range(7))
     best = {n: min(linear.rmse(list(each)) for each in combinations(range(7), n)) for n in range(1, 8)}
-    down = walk(MarkerSets(linear, groups, range(7)), REMOVE, free, 1)
-    up = walk(MarkerSets(linear, groups, []), ADD, free, 7)
+    down = improve_set(MarkerSets(linear, groups, range(7)), REMOVE, free, 1)
+    up = improve_set(MarkerSets(linear, groups, []), ADD, free, 7)
     for path in (down, up):
         for count, rmse in zip(path.counts, path.rmse, strict=True):
             assert count == 0 or rmse >= best[count] * (1 - 1e-9)

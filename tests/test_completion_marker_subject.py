@@ -9,7 +9,7 @@ from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.named import load_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.subject.person import PersonConfig, choose_frames, find_person, spread_frames
-from scanprep.synthetic.people import BodyShape, Person, walk
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, synthesise_walk
 
 BETAS = np.array([1.2, -0.8, 0.6, -0.5])
 CONFIG = PersonConfig(frames=6)
@@ -117,9 +117,9 @@ def test_markers_on_wands_and_without_their_bars_are_the_same_person(model, layo
 
 
 def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
-    person = Person(BodyShape.like("male", stature=1.88, weight=1.0))
+    person = SyntheticPerson(BodyShape.like("male", stature=1.88, weight=1.0))
     on_skin = load_layout("cmu41", person.mesh)
-    poses, trans = walk(40, 40.0)
+    poses, trans = synthesise_walk(40, 40.0)
     bodies = np.stack([person.in_pose(p, t) for p, t in zip(poses, trans, strict=True)])
     places = np.stack([on_skin.place(person.mesh.with_vertices(v)) for v in bodies])
     sequence = MarkerSequence(places, on_skin.labels, 40.0)

@@ -12,13 +12,13 @@ from completion.mocap.marker_sets.symmetry import find_skin_mirror, label_pairs
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.rotations import exp
 from scanprep.synthetic.landmarks import landmarks
-from scanprep.synthetic.people import Person
-from scanprep.synthetic.topology import load
+from scanprep.synthetic.people import SyntheticPerson
+from scanprep.synthetic.topology import load_topology
 
 
 @pytest.fixture(scope="module")
 def person():
-    return Person().mesh
+    return SyntheticPerson().mesh
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def base(person):
 
 @pytest.fixture(scope="module")
 def candidates(person, mirror, base):
-    return candidate_layout(person, base, 114, mirror=mirror, skeleton=Person().skeleton)
+    return candidate_layout(person, base, 114, mirror=mirror, skeleton=SyntheticPerson().skeleton)
 
 
 def test_there_are_as_many_as_wanted_and_the_base_is_first(candidates, base):
@@ -46,7 +46,7 @@ def test_there_are_as_many_as_wanted_and_the_base_is_first(candidates, base):
 def test_every_candidate_has_its_mirror_image(candidates, person):
     pairs = label_pairs(candidates.labels)
     assert (pairs >= 0).all() and (pairs[pairs] == np.arange(114)).all()
-    image = person.vertices[load().mirror[candidates.vertices]]              # the true one
+    image = person.vertices[load_topology().mirror[candidates.vertices]]              # the true one
     assert np.linalg.norm(image - person.vertices[candidates.vertices[pairs]], axis=1)[47:].max() < 0.03
     own = pairs == np.arange(114)
     assert np.abs(person.vertices[candidates.vertices[own], 0]).max() < 0.02
@@ -69,7 +69,7 @@ def nearest_before(apart, i):
 
 
 def test_labels_name_the_part(candidates, person):
-    skeleton = Person().skeleton
+    skeleton = SyntheticPerson().skeleton
     parts = skeleton.part_of_vertex(person)[candidates.vertices]
     for label, part in list(zip(candidates.labels, parts, strict=True))[47:]:
         side, stem, number = label.split(".")
@@ -94,7 +94,7 @@ def test_nobody_can_wear_markers_there(person, mirror):
 
 def test_a_turned_body_has_the_same_candidates(candidates, person, base):
     turned = person.with_vertices(person.vertices @ exp(np.array([1.0, 0.5, -2.0])).T + 3)
-    again = candidate_layout(turned, base, 114, skeleton=Person().skeleton)
+    again = candidate_layout(turned, base, 114, skeleton=SyntheticPerson().skeleton)
     assert again.labels == candidates.labels and (again.vertices == candidates.vertices).mean() > 0.95
 
 

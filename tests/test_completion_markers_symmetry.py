@@ -13,8 +13,8 @@ from completion.mocap.marker_sets.symmetry import (
     side_of,
 )
 from scanprep.geometry.rotations import exp
-from scanprep.synthetic.people import Person
-from scanprep.synthetic.topology import load
+from scanprep.synthetic.people import SyntheticPerson
+from scanprep.synthetic.topology import load_topology
 
 PAIRS = [("LELB", "RELB"), ("L.Knee", "R.Knee"), ("left elbow", "right elbow"), ("Left Toe", "Right Toe"),
          ("LEFT_TOE", "RIGHT_TOE"), ("elbow_l", "elbow_r"), ("KneeL", "KneeR"), ("toe in left leg", "toe in right leg"),
@@ -25,7 +25,7 @@ MIDDLE = ["C7", "STRN", "CLAV", "T10", "V.Sacral", "Rear.Head", "ARIEL", "SJN", 
 
 @pytest.fixture(scope="module")
 def person():
-    return Person().mesh
+    return SyntheticPerson().mesh
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +49,9 @@ def test_partners_by_label():
 
 
 def test_the_mirror_image_is_found_whatever_the_triangulation(person, mirror):
-    true = person.vertices[load().mirror]                           # known there, and not made use of
+    true = person.vertices[load_topology().mirror]                           # known there, and not made use of
     off = np.linalg.norm(mirror.image(person) - true, axis=1)
-    assert off.max() < 0.001 and (mirror.partner == load().mirror).mean() > 0.999 and mirror.returns < 0.0005
+    assert off.max() < 0.001 and (mirror.partner == load_topology().mirror).mean() > 0.999 and mirror.returns < 0.0005
     R, t = exp(np.array([1.0, 0.5, -2.0])), np.array([1.0, 2, 3])
     turned = person.with_vertices(person.vertices @ R.T + t)
     again = find_skin_mirror(turned)
@@ -62,13 +62,13 @@ def test_the_mirror_image_is_found_whatever_the_triangulation(person, mirror):
 def test_the_mirror_image_moves_with_the_body(person, mirror):
     raised = np.zeros((16, 3))
     raised[4] = [0, -0.6, 0]                                         # one arm
-    posed = person.with_vertices(Person().in_pose(raised))
-    off = np.linalg.norm(mirror.image(posed) - posed.vertices[load().mirror], axis=1)
+    posed = person.with_vertices(SyntheticPerson().in_pose(raised))
+    off = np.linalg.norm(mirror.image(posed) - posed.vertices[load_topology().mirror], axis=1)
     assert off.max() < 0.002 and np.linalg.norm(posed.vertices - person.vertices, axis=1).max() > 0.3
 
 
 def test_who_does_not_stand_symmetrically_needs_landmarks(person):
-    body = person.with_vertices(Person().in_pose(np.random.default_rng(0).normal(0, 0.4, (16, 3))))
+    body = person.with_vertices(SyntheticPerson().in_pose(np.random.default_rng(0).normal(0, 0.4, (16, 3))))
     with pytest.raises(ValueError, match=r"template: expected one that stands symmetrically, .* landmarks"):
         find_skin_mirror(body)
     with pytest.raises(ValueError, match="landmarks: expected at least 3 pairs of left and right, found 1 among"):

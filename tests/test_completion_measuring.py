@@ -16,7 +16,7 @@ from model.measurement.survey import ordinal, percentiles
 from scanprep import Mesh, RegisteredSet, write_mesh
 from scanprep.geometry.landmark_names import landmark_name, translate_landmarks
 from scanprep.judgement import Judgement
-from scanprep.synthetic.people import BodyShape, Person
+from scanprep.synthetic.people import BodyShape, SyntheticPerson
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_without_a_model_a_pose_is_told(folder, tmp_path, capsys):
 
 
 def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
-    person = Person(BodyShape.like(weight=1.0))
+    person = SyntheticPerson(BodyShape.like(weight=1.0))
     bodies = RegisteredSet.create(tmp_path / "set", person.mesh)
     bodies.add("one", person.mesh, subject="a")
     assert scape(tmp_path / "set", "-o", tmp_path / "set.csv") == 0
@@ -112,7 +112,7 @@ def test_a_set_and_people_who_are_known_by_their_triangles(folder, tmp_path):
 
 def test_a_completion_states_errors(folder, tmp_path):
     """Those that expected errors of its vertices imply; its report names the model."""
-    model, person = small_people(), Person(BodyShape("male", (0.1,)))
+    model, person = small_people(), SyntheticPerson(BodyShape("male", (0.1,)))
     body = model.template.with_vertices(person.mesh.vertices[kept()])
     n = len(body.vertices)
     done = Completion(body, body, np.zeros((16, 3)), np.zeros(4), np.zeros(3), np.ones(n, bool), 0.001, 1.0, 0.001,
@@ -167,7 +167,7 @@ def test_one_line_for_what_is_wrong(folder, monkeypatch, capsys, words, told):
 
 
 def test_other_triangles_are_refused(folder, tmp_path, capsys):
-    write_mesh(tmp_path / "other.ply", Person().mesh)
+    write_mesh(tmp_path / "other.ply", SyntheticPerson().mesh)
     assert scape(folder / "bodies" / "rest.ply", tmp_path / "other.ply", "--landmarks", folder / "marks.json", "-o",
                  tmp_path / "m.csv") == 1
     assert "expected the triangles of" in capsys.readouterr().err

@@ -12,11 +12,11 @@ from completion.mocap.retargeting.retarget import world_up
 from completion.mocap.retargeting.soft_tissue import Creases, moving_character, picture_transfer, write_character
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from model.fitting.bodies import at_rest
-from model.posing.character import CharacterConfig, character_model, inside
+from model.posing.character import CharacterConfig, character_model, points_inside
 from scanprep.geometry import rotations
 from scanprep.geometry.format_glb import turn_up
 from scanprep.geometry.surface import Surface
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 
 FRAMES = 12
 
@@ -140,7 +140,7 @@ def test_a_figure_is_closed_symmetric_and_has_its_landmarks_on_the_skin(name):
     assert np.percentile(off, 90) < 0.008 and off.max() < 0.025                     # so coarse, fingertips are lost
     image = mesh.vertices * [-1, 1, 1]
     assert np.percentile(np.linalg.norm(surface.closest(image).points - image, axis=1), 95) < 0.008 * height
-    assert inside(mesh, np.array(list(figure.joints.values()))).all()
+    assert points_inside(mesh, np.array(list(figure.joints.values()))).all()
     for part, point in figure.joints.items():
         if part.endswith("_left"):
             np.testing.assert_allclose(figure.joints[part.replace("left", "right")], point * [-1, 1, 1], atol=1e-12)
@@ -160,7 +160,7 @@ def test_files_and_pictures(model, soft, character, tmp_path, monkeypatch):
     np.testing.assert_allclose(most, deformation(character.template.faces, fixed, changed).max(axis=0))
     glb = Glb((tmp_path / "worm.glb").read_bytes())
     smooth = Creases(at_rest(character), character.skeleton).smooth(changed, moved.motion.poses)
-    shown = np.stack([glb.skinned(t) for t in range(12)]) @ turn_up(upright(character.template)[0])
+    shown = np.stack([glb.skinned(t) for t in range(12)]) @ turn_up(guess_upright(character.template)[0])
     off = 1000 * np.linalg.norm(shown - smooth, axis=2)
     assert off.mean() < 1 and off.mean() == pytest.approx(told[0].value, rel=1e-3)
     assert np.linalg.norm(changed - fixed, axis=2).max() > 10 * off.mean() / 1000

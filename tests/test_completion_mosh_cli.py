@@ -14,13 +14,13 @@ from scene_reader import scenes_of
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
 from completion.__main__ import main
 from completion.mocap.mosh import cli
-from completion.mocap.mosh.recordings import Grouping, find_actors, write_table
+from completion.mocap.mosh.recordings import Grouping, find_actors, write_grouping
 from completion.mocap.mosh.takes import measure_held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion_pictures import frames_to_play
 from model.learning.sexes import SexPlane
 from scanprep.geometry.format_glb import turn_up
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 
 PERSON = {"subject.json", "layout.json", "report.html", "report.json", "picture.png"}
 TAKE = {"motion.npz", "soft_tissue.npz", "animation.glb", "motion.bvh", "motion.trc",
@@ -131,7 +131,7 @@ def test_the_glb_lasts_as_long_as_the_motion_and_exaggerates(done):
         glb = Glb((done / "ann" / "walk" / name).read_bytes())
         times = glb.array(glb.json["animations"][0]["samplers"][0]["input"])[:, 0]
         assert len(times) == FRAMES and times[-1] == pytest.approx((FRAMES - 1) / 60, rel=1e-5)
-        up = upright(worm_with_prior().template)[0]
+        up = guess_upright(worm_with_prior().template)[0]
         first[name] = np.stack([glb.skinned(t) for t in range(FRAMES)]) @ turn_up(up)
     soft = SoftTissue.load(done / "ann" / "walk" / "soft_tissue.npz")
     rigid = soft.motion.vertices(worm_with_prior().subject(soft.motion.betas))
@@ -192,7 +192,7 @@ def test_two_people_and_a_prop_in_one_file_become_two_folders(place, tmp_path, c
     labels = [f"{who}:{label}" for who in ("Ann", "Bob") for label in ann.labels]
     positions = np.concatenate([ann.positions, bob.positions + [2.0, 0, 0], ball], axis=1)
     write_markers(tmp_path / "two.c3d", MarkerSequence(positions, (*labels, "Ball:A", "Ball:B", "Ball:C"), 60.0))
-    monkeypatch.setattr(cli, "Work", QuietWork)
+    monkeypatch.setattr(cli, "MoshTask", QuietWork)
     out = tmp_path / "out"
     assert run(place, tmp_path / "two.c3d", "-o", out, "--ground", soft_tissue=False, repair=False,
                person={"frames": 3, "annealing": [2.0]}) == 0
@@ -244,7 +244,7 @@ def test_who_is_who(tmp_path):
     assert names(find_actors([tmp_path / "dance.c3d"], Grouping())) == one
     assert [a.name for a in find_actors([tmp_path / "dance.c3d"], Grouping.of("Eve"))] == ["Eve"]
     table = tmp_path / "who.csv"
-    write_table(table, find_actors([tmp_path / "dance.c3d"], Grouping()))
+    write_grouping(table, find_actors([tmp_path / "dance.c3d"], Grouping()))
     mended = find_actors([tmp_path / "dance.c3d"], Grouping.of(str(table)))
     table.unlink()
     assert names(mended) == one and [a.recordings[0].who for a in mended] == ["Adam", "Eve"]

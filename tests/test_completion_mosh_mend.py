@@ -30,7 +30,7 @@ MOVED, EXCHANGED = "M12", ["M2", "M20"]
 @pytest.fixture(scope="module", autouse=True)
 def nobody_looks():
     with small_pictures(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "Work", QuietWork)
+        patch.setattr(cli, "MoshTask", QuietWork)
         yield
 
 

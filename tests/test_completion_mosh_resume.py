@@ -12,7 +12,7 @@ from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.mocap.mosh import cli
 from model import load_model
 from scanprep.batch import room
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.batch.workspace import HOME
 
 HERE = Path()
@@ -24,7 +24,7 @@ ALL = PERSON | {"poses", "artefacts", "soft", "files", "page", "person page"}
 @pytest.fixture(scope="module", autouse=True)
 def quiet():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "Work", QuietWork)
+        patch.setattr(cli, "MoshTask", QuietWork)
         yield
 
 
@@ -113,7 +113,7 @@ def test_two_workers_write_what_one_does(place, tmp_path):
 
 
 def test_workers_of_a_cluster_keep_no_steps_and_write_the_same(copied, monkeypatch):
-    monkeypatch.setattr(room, "Room", lambda folder, steps, tell, force: Room(folder, None, tell, force))
+    monkeypatch.setattr(room, "TaskContext", lambda folder, steps, tell, force: TaskContext(folder, None, tell, force))
     assert run(HERE, *BOB, "-o", "cluster") == 0
     assert contents(copied / "cluster") == contents(copied / "whole")
     assert not (copied / "cluster" / HOME / "steps").exists()

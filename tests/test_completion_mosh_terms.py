@@ -80,7 +80,7 @@ def of_frames(kind):
         moving = energy.moving_points(y, d_pose, points.shape_jacobian(pose))
         found, frame = simulate_markers(kind, moving, x[15 + K:].reshape(-1, 3))
         J = np.concatenate([found.jacobian, terms.each_own(frame)], axis=-1)
-        residual = terms.data_term(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
+        residual = terms.marker_term(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
         return Residual(residual.values[0], residual.jacobian[0])
 
     return term, x
@@ -91,7 +91,7 @@ TERMS = {
     "surface": of_latent(lambda m, corners, usual: terms.surface_term(m, corners, *(np.full((2, L), 0.01)), 3.0)),
     "usual_place": of_latent(lambda m, corners, usual: terms.place_term(m, usual, np.arange(1.0, L + 1))),
     "shape": lambda kind: ((lambda z: terms.shape_term(z, K, 2.0)), np.random.default_rng(4).normal(size=K + 3 * L)),
-    "pose": lambda kind: ((lambda x: energy.pose_prior(x, PRIOR, 0.25)), np.random.default_rng(5).normal(size=15)),
+    "pose": lambda kind: ((lambda x: energy.pose_prior_term(x, PRIOR, 0.25)), np.random.default_rng(5).normal(size=15)),
 }
 
 
@@ -120,7 +120,7 @@ def test_weights_are_per_square_centimetre():
     still = np.zeros((1, 3, 1))
     at, there = MovingPoints(np.array([[0.0, 0.0, 0.03]]), still), MovingPoints(np.array([[0.0, 0.0, 0.01]]), still)
     corners = MovingPoints(np.array([[-1.0, -1, 0], [1, -1, 0], [0, 2, 0]]), np.zeros((3, 3, 1)))
-    assert terms.data_term(at, there.positions, np.array([0.75])).energy == pytest.approx(3.0)
+    assert terms.marker_term(at, there.positions, np.array([0.75])).energy == pytest.approx(3.0)
     assert terms.place_term(at, there, np.array([0.25])).energy == pytest.approx(1.0)
     assert terms.surface_term(at, corners, *np.array([[0.01], [0.01]]), 100.0).energy == pytest.approx(400.0)
 

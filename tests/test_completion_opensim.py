@@ -9,16 +9,16 @@ from test_completion_mosh_virtual import T, found, original
 from completion.mocap.artefacts.results import write_virtual
 from completion.mocap.files.c3d_points import add_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers, write_markers
-from completion.mocap.files.motion_files import joint_centres, write_motion
+from completion.mocap.files.motion_files import joint_centres, write_motion_folder
 from completion.mocap.files.opensim import centre_labels, unlike, write_mot
 from completion.mocap.joint_angles import JointAngles, anatomy, angles_of, decompose, ground_axes
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp, log
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.anatomy import LEG_ANGLE, LEG_LEAN, PARENTS, PARTS, Anatomy, BodyShape
+from scanprep.synthetic.anatomy import LEG_ANGLE, LEG_LEAN, PARENTS, PARTS, BodyShape, RestFrames
 
 __all__ = ["original"]
-JOINTS = Anatomy(BodyShape()).joints                    # z is up, the face looks along -y, the left side is +x
+JOINTS = RestFrames(BodyShape()).joints                    # z is up, the face looks along -y, the left side is +x
 BODY = anatomy(PARTS, PARENTS, JOINTS)
 RIGHT, AHEAD, UP = np.array([-1.0, 0, 0]), np.array([0, -1.0, 0]), np.array([0, 0, 1.0])
 SKELETON = Skeleton(np.arange(16), PARENTS, JOINTS, PARTS)
@@ -178,7 +178,7 @@ def test_files_of_a_motion_without_people(tmp_path, capsys):
     model = worm_with_prior()
     motion = Motion(np.zeros((1, 4, 3)), np.zeros((1, 3)), None, 50.0, np.zeros((1, 0)))      # and of one frame
     markers = MarkerSequence(np.full((1, 2, 3), np.nan), ("A b", "part1_joint"), 50.0)
-    write_motion(tmp_path, motion, model.subject(None), markers)
+    write_motion_folder(tmp_path, motion, model.subject(None), markers)
     assert "motion.mot is not written: joint angles are of people" in capsys.readouterr().err
     assert not (tmp_path / "motion.mot").exists()
     text, back = (tmp_path / "motion.trc").read_text(), read_markers(tmp_path / "motion.trc")
@@ -191,7 +191,7 @@ def test_files_of_a_person(tmp_path):
     body = small_people().subject(np.zeros(4))
     poses = np.random.default_rng(7).normal(0, 0.2, (5, 16, 3))
     motion = Motion(poses, np.ones((5, 3)), None, 50.0, np.zeros((5, 0)))
-    write_motion(tmp_path, motion, body)
+    write_motion_folder(tmp_path, motion, body)
     centres, points = joint_centres(motion, body), read_markers(tmp_path / "motion.trc")
     text = (tmp_path / "motion.mot").read_text()
     names, *rows = [line.split("\t") for line in text.split("endheader\n")[1].splitlines()]

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.mocap.files.motion_files import joint_angles, joint_centres, write_motion
-from completion.mocap.retargeting.retarget import betas_over_time, lowest, morph_vertices, retarget, world_up
+from completion.mocap.files.motion_files import joint_angles, joint_centres, write_motion_folder
+from completion.mocap.retargeting.retarget import betas_over_time, lowest_heights, morph_vertices, retarget, world_up
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp, log
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 
 FRAMES = 40
 BETAS = np.array([0.5, -0.5, 0.2])
@@ -48,7 +48,7 @@ def test_joint_angles_are_the_rotations_without_jumps(motion, model, subject, tm
     degrees = joint_angles(cut)
     assert np.abs(np.diff(cut.poses, axis=0)).max() > 3 and np.abs(np.diff(degrees, axis=0)).max() < 40
     np.testing.assert_allclose(exp(np.radians(degrees)), exp(motion.poses), atol=1e-9)
-    write_motion(tmp_path, cut, subject)
+    write_motion_folder(tmp_path, cut, subject)
     head, rows = table(tmp_path / "joint_angles.csv")
     first, last = model.skeleton.names[0], model.skeleton.names[-1]
     assert head[:4] == ["time", f"{first}_rx", f"{first}_ry", f"{first}_rz"] and head[-1] == f"{last}_rz"
@@ -61,14 +61,14 @@ def test_joint_centres_are_those_of_the_surface(motion, subject, tmp_path):
     wanted = np.stack([regressor @ v for v in motion.vertices(subject)])
     np.testing.assert_allclose(joint_centres(motion, subject), wanted, atol=1e-10)
     np.testing.assert_allclose(wanted[:, 0], subject.origin + motion.trans, atol=1e-9)      # the rule of Place
-    write_motion(tmp_path, motion, subject)
+    write_motion_folder(tmp_path, motion, subject)
     head, rows = table(tmp_path / "joint_centres.csv")
     assert len(head) == 13
     np.testing.assert_allclose(rows[:, 1:].reshape(FRAMES, 4, 3), wanted, rtol=1e-5, atol=1e-6)
 
 
 def test_residuals_have_empty_cells_where_nothing_was_seen(motion, subject, tmp_path):
-    write_motion(tmp_path, motion, subject)
+    write_motion_folder(tmp_path, motion, subject)
     head, rows = table(tmp_path / "residuals.csv")
     assert head == ["time", "mean", "A", "B"]
     np.testing.assert_allclose(rows[:, 2:], motion.residuals, rtol=1e-5)
@@ -77,7 +77,7 @@ def test_residuals_have_empty_cells_where_nothing_was_seen(motion, subject, tmp_
 
 
 def test_bvh_has_the_bones_of_the_subject(motion, subject, model, tmp_path):
-    write_motion(tmp_path, motion, subject)
+    write_motion_folder(tmp_path, motion, subject)
     text = (tmp_path / "motion.bvh").read_text()
     assert f"Frames: {FRAMES}" in text and "Frame Time: 0.05" in text
     offsets = [np.array(line.split()[1:], float) for line in text.splitlines() if line.strip().startswith("OFFSET")]
@@ -100,7 +100,7 @@ def test_another_body_stands_where_the_first_does(motion, subject, model):
     other = model.subject(np.array([-2.0, 1.5, 1.0]))
     moved = retarget(motion, subject, other)
     up, sign = world_up(motion, subject)
-    low, its = (lowest(who, m.poses, m.trans, up, sign) for who, m in ((subject, motion), (other, moved)))
+    low, its = (lowest_heights(who, m.poses, m.trans, up, sign) for who, m in ((subject, motion), (other, moved)))
     floor = np.percentile(low, 2)
     ratio = (its - floor) / (low - floor)
     high = low - floor > 0.05
@@ -111,7 +111,7 @@ def test_another_body_stands_where_the_first_does(motion, subject, model):
 
 
 def test_up_is_found_in_whatever_axes_the_world_has(motion, subject):
-    axis = upright(subject.template)[0]
+    axis = guess_upright(subject.template)[0]
     for to in range(3):
         R = np.roll(np.eye(3), to - axis, axis=0)
         turned = motion.poses.copy()
@@ -134,7 +134,7 @@ def test_a_body_that_changes_is_in_each_frame_that_of_its_betas(motion, model):
     up, sign = world_up(motion, model.subject(BETAS))
     grounded = morph_vertices(model, motion, betas)
     np.testing.assert_allclose((sign * grounded[:, :, up]).min(axis=1),
-                               lowest(model.subject(BETAS), motion.poses, motion.trans, up, sign), atol=1e-9)
+                               lowest_heights(model.subject(BETAS), motion.poses, motion.trans, up, sign), atol=1e-9)
     away = grounded - got
     assert np.abs(np.delete(away, up, axis=2)).max() < 1e-12 and np.ptp(away, axis=1).max() < 1e-9
     still = morph_vertices(model, motion, {0.0: BETAS}, grounded=True)

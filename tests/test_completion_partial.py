@@ -8,7 +8,7 @@ from completion.partial.settings import CompletionConfig
 from model.fitting import energy
 from model.fitting.bodies import FixedBody
 from model.fitting.free_space import Contact
-from model.fitting.limbs import limbs, redrawn
+from model.fitting.limbs import limb_runs, redrawn
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -149,7 +149,7 @@ def test_limbs_are_drawn_from_the_prior_given_the_rest(model):
     covariance[3:, 3:] = root @ root.T / 20
     prior = gaussian_prior(model.pose_mean, covariance, 0, 0)
     x = np.random.default_rng(1).normal(0, 0.3, 15)
-    assert limbs(model.skeleton) == [[2, 3], [1]]
+    assert limb_runs(model.skeleton) == [[2, 3], [1]]
     drawn = redrawn(body, x, 2, prior, 20000, np.random.default_rng(2))
     moved, rest = np.arange(6, 12), np.arange(3, 6)
     np.testing.assert_array_equal(drawn[:, [0, 1, 2, 3, 4, 5, 12, 13, 14]], np.tile(x[[0, 1, 2, 3, 4, 5, 12, 13, 14]],

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from model.fitting import energy
-from model.fitting.limbs import unbranched_runs
+from model.fitting.limbs import runs_without_branch
 from model.priors import JointLimits, gaussian_prior, typical_poses
 
 EXAMPLES = np.random.default_rng(7).normal(0, 0.4, (12, 4, 3)) * (np.arange(4) > 0)[:, None]
@@ -56,7 +56,7 @@ def test_moments_that_do_not_agree_are_refused(covariance):
 
 
 def test_limbs_are_runs_without_a_branch():
-    assert unbranched_runs(np.array([-1, 0, 1, 0, 1, 4, 5])) == [[1], [2], [3], [4, 5, 6]]
+    assert runs_without_branch(np.array([-1, 0, 1, 0, 1, 4, 5])) == [[1], [2], [3], [4, 5, 6]]
 
 
 def test_joint_limits_begin_beyond_what_was_seen():

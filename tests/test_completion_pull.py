@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from model.fitting import energy
 from model.fitting.bodies import FixedBody, ShapedBody
 from model.fitting.limbs import nearest_squared
-from model.fitting.pull import Pull
+from model.fitting.pull import MatchTargets
 from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 
 RNG = np.random.default_rng(3)
@@ -31,7 +31,7 @@ def test_one_residual_of_three_rows_is_that_of_place_and_plane(body):
     to_planes = Residual(root * (NORMALS * off).sum(axis=-1),
                          root[:, None] * np.einsum("ld,...ldp->...lp", NORMALS, points.jacobian))
     plain = normal_equations([energy.point_to_point(points, TARGETS, TO_POINT), to_planes])
-    pull = Pull(*body.gather(MATCHED, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
+    pull = MatchTargets(*body.gather(MATCHED, x), TARGETS, NORMALS, TO_POINT, TO_PLANE)
     nothing = normal_equations([energy.stay_near(x[None], x, np.zeros(len(x)))])
     for ours, theirs in zip(pull.equations(x[None], nothing).dense, plain, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
@@ -51,7 +51,7 @@ def test_a_matrix_is_assembled_only_where_a_step_is_taken():
             asked.append(x)
             return near.columns(x)
 
-    pull = Pull(Counted, np.arange(6), TARGETS, NORMALS, TO_POINT, TO_PLANE)
+    pull = MatchTargets(Counted, np.arange(6), TARGETS, NORMALS, TO_POINT, TO_PLANE)
     held = np.ones(len(x))
     found = levenberg_marquardt(lambda at: pull.equations(at, normal_equations([energy.stay_near(at, x, held)])),
                                 x[None], 1)

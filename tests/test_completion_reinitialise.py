@@ -4,7 +4,7 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.initialise import reinitialise_limbs
+from completion.mocap.pose.initialise import reinitialise_frames
 from completion.mocap.pose.marked_body import AnimateConfig, MarkedBody
 
 CONFIG = AnimateConfig(prior_weight=1e-3)
@@ -35,7 +35,7 @@ def test_a_lost_limb_comes_back_and_nothing_else_moves(body, true):
     targets, start = body.positions(true), lost_limb(true)
     far = np.linalg.norm(body.positions(start) - targets, axis=2)
     assert ((far[LOST] > 2 * CONFIG.outlier).sum(axis=1) >= 3).all()
-    found = reinitialise_limbs(body, start, targets, CONFIG)
+    found = reinitialise_frames(body, start, targets, CONFIG)
     assert np.abs(body.positions(found) - targets).max() < 2e-3
     others = np.setdiff1d(np.arange(30), LOST)
     assert (found[others] == start[others]).all()
@@ -44,16 +44,16 @@ def test_a_lost_limb_comes_back_and_nothing_else_moves(body, true):
 def test_with_markers_missing(body, true):
     targets = body.positions(true)
     targets[12, ::2] = np.nan
-    found = reinitialise_limbs(body, lost_limb(true), targets, CONFIG)
+    found = reinitialise_frames(body, lost_limb(true), targets, CONFIG)
     assert np.abs(body.positions(found) - body.positions(true))[LOST].max() < 5e-3
 
 
 def test_markers_that_lie_apart_move_nothing(body, true):
     targets = body.positions(true)
     targets[LOST[:, None], [3, 11, 19]] += np.random.default_rng(1).normal(0, 0.5, (len(LOST), 3, 3))
-    assert (reinitialise_limbs(body, true, targets, CONFIG) == true).all()
+    assert (reinitialise_frames(body, true, targets, CONFIG) == true).all()
 
 
 def test_without_a_good_frame_it_stays(body, true):
     targets = body.positions(true) + np.random.default_rng(2).normal(0, 1.0, (30, 30, 3))
-    assert (reinitialise_limbs(body, true, targets, CONFIG) == true).all()
+    assert (reinitialise_frames(body, true, targets, CONFIG) == true).all()

@@ -9,7 +9,7 @@ from completion_bodies import worm_with_prior
 from completion.partial.completion import (
     Completion,
     beyond_closed,
-    doubts,
+    completion_doubts,
     find_unexplained,
     load_completion,
     save_completion,
@@ -22,7 +22,7 @@ from model.fitting.scan import prepare_scan
 from model.fitting.scan_fit import scan_fit
 from scanprep.geometry import storage
 from scanprep.judgement import Judgement
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 MODEL = replace(worm_with_prior(), skeleton=replace(worm_with_prior().skeleton,
                                                     names=("trunk", "upper_arm_left", "forearm_left", "head")))
@@ -79,12 +79,12 @@ def test_parts_that_may_be_far_off_are_named_the_worst_first():
     fit = scan_fit(body, prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64), np.zeros((0, 3)),
                   CompletionConfig())
     error, seen = np.full(398, 0.004), np.ones(398, dtype=bool)
-    assert doubts(fit, x, error, seen) == []
+    assert completion_doubts(fit, x, error, seen) == []
     error[fit.part == 1] = 0.08
     seen[np.flatnonzero(fit.part == 1)[::2]] = False
     error[fit.part == 2], seen[fit.part == 2] = 0.25, False
-    assert doubts(fit, x, error, seen) == ["the left forearm may be 250 mm off, nothing of it was seen",
-                                           "the left upper arm may be 80 mm off, 50% of it was seen"]
+    assert completion_doubts(fit, x, error, seen) == ["the left forearm may be 250 mm off, nothing of it was seen",
+                                                      "the left upper arm may be 80 mm off, 50% of it was seen"]
 
 
 def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():
@@ -92,7 +92,7 @@ def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():
     for left_out, told in ((0.01, 0), (0.05, 1)):
         body = FixedBody(replace(MODEL, info={"left_out_error": left_out}).subject(None))
         fit = scan_fit(body, prepare_scan(MODEL.template.vertices), *nothing, CompletionConfig())
-        found = doubts(fit, np.zeros(15), np.full(398, 0.004), np.ones(398, dtype=bool))
+        found = completion_doubts(fit, np.zeros(15), np.full(398, 0.004), np.ones(398, dtype=bool))
         assert len(found) == told and all("50 mm off" in reason for reason in found)
     far, off = np.array([0.0, 1.0]), np.zeros(2)
     np.testing.assert_allclose(estimate_error(off, far, 0.001, 0.05), [0.001, 0.0425], rtol=1e-3)
@@ -106,8 +106,8 @@ def test_a_bend_that_the_model_never_saw_is_named():
     x = np.zeros(15)
     x[[3, 6]] = np.radians(50)                                        # of the second part poses say that it bends
     fine = np.full(398, 0.004), np.ones(398, dtype=bool)
-    assert doubts(fit, x, *fine) == ["the left elbow is 49 degrees from any way that it is known to be held"]
-    assert doubts(fit, x / 5, *fine) == []
+    assert completion_doubts(fit, x, *fine) == ["the left elbow is 49 degrees from any way that it is known to be held"]
+    assert completion_doubts(fit, x / 5, *fine) == []
 
 
 @pytest.mark.parametrize(("wide", "narrow", "kept"), [(100, 90, 1), (100, 100, 1), (95, 100, 1), (90, 100, 0)])
@@ -149,7 +149,7 @@ def test_a_joint_held_as_in_no_known_pose_is_named_and_a_known_way_is_not():
     x[:3] = 1.0                                                       # the whole body may stand anyhow
     for degrees, told in ((120, 0), (80, 0), (170, 1), (0, 1)):
         x[3] = np.radians(degrees)
-        found = [reason for reason in doubts(fit, x, *fine) if "known to be held" in reason]
+        found = [reason for reason in completion_doubts(fit, x, *fine) if "known to be held" in reason]
         assert len(found) == told, (degrees, found)
     assert f"{120 - degrees} degrees" in found[0]
 
@@ -164,7 +164,7 @@ def test_a_limbs_worth_of_scan_without_a_body_is_told(explained, told):
 
 def test_a_body_that_goes_on_where_the_scan_is_closed_is_doubted():
     """As one whose ankles were taken for the feet, 16 cm longer than the scan."""
-    scan = Person().mesh
+    scan = SyntheticPerson().mesh
     middle = scan.vertices.mean(axis=0)
     longer = scan.with_vertices(middle + (scan.vertices - middle) * [1, 1, 1.2])
     assert beyond_closed(scan, scan) == []

@@ -3,8 +3,8 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 
 from model.fitting.free_space import find_camera
-from model.fitting.named_points import distinct
-from model.fitting.scan import prepare_scan, spread
+from model.fitting.named_points import distinct_bodies
+from model.fitting.scan import prepare_scan, spread_points
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -74,7 +74,7 @@ def test_scans_that_cannot_be_used_are_refused(scan, message):
 
 def test_spread_points_cover_the_whole_evenly(body):
     points = body.sample(6000, np.random.default_rng(0))[0]
-    kept = points[spread(points, 500)]
+    kept = points[spread_points(points, 500)]
     assert 400 < len(kept) < 600
     gap = np.linalg.norm(points[:, None] - kept[None], axis=2).min(axis=1)
     assert gap.max() < 4 * np.sqrt(body.face_areas.sum() / 500)
@@ -108,8 +108,8 @@ def test_nothing_stands_beside_or_in_front_of_what_was_seen(body, view):
 
 def test_distinct_bodies_are_kept_in_order():
     places = np.array([0, 0.001, 0.1, 0.101, 0.3])[:, None, None] * np.ones((5, 7, 3))
-    assert distinct(places, 2) == [0, 2]
-    assert distinct(places, 9) == [0, 2, 4]
+    assert distinct_bodies(places, 2) == [0, 2]
+    assert distinct_bodies(places, 9) == [0, 2, 4]
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3])

@@ -11,7 +11,7 @@ from model.fitting.free_space import Outside, find_camera
 from model.fitting.limbs import examples_of
 from model.fitting.scan import prepare_scan
 from model.fitting.scan_fit import scan_fit
-from model.fitting.starts import AXES, all_rotations, at_a_glance, from_nothing, pick_varied, placements, starting_poses
+from model.fitting.starts import AXES, all_rotations, coarse_cost, from_nothing, pick_varied, placements, starting_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -68,7 +68,7 @@ def test_a_glance_tells_the_body_of_the_scan_from_others(model, scene):
     fit = scan_fit(FixedBody(model.subject(None)), prepare_scan(scene[1]), *NOTHING, QUICK)
     x = np.repeat(fit.body.join(POSE, TRANS)[None], 40, axis=0)
     x[1:, 3:12] += np.random.default_rng(1).normal(0, 0.3, (39, 9))
-    cost = at_a_glance(fit, x)
+    cost = coarse_cost(fit, x)
     misfit = np.array([fit.misfit(one) for one in x])
     assert cost.argmin() == misfit.argmin() == 0
     assert np.corrcoef(cost.argsort().argsort(), misfit.argsort().argsort())[0, 1] > 0.9

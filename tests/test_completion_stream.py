@@ -22,7 +22,7 @@ from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.geometry import rotations
-from scanprep.synthetic.people import Person, walk
+from scanprep.synthetic.people import SyntheticPerson, synthesise_walk
 
 FRAMES = 50
 CONFIG = AnimateConfig()
@@ -242,7 +242,7 @@ def test_a_low_pass_keeps_slow_turns_and_takes_fast_ones():
 @pytest.fixture(scope="module")
 def walker():
     """A synthetic person whose parts are rigid."""
-    person = Person()
+    person = SyntheticPerson()
     skeleton, J = person.skeleton, len(person.parents)
     features = linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in range(J)))
     rigid = tuple(np.broadcast_to(np.eye(3, dtype=np.float32), (1, int((skeleton.part_of_face == p).sum()), 3, 3))
@@ -251,7 +251,7 @@ def walker():
     model = ScapeModel(person.mesh, skeleton, PoseSpace(features, rigid), ShapeSpace.empty(len(person.mesh.faces)),
                        np.zeros((J, 3)), prior)
     subject = model.subject(None)
-    poses, trans = walk(60, 60.0)
+    poses, trans = synthesise_walk(60, 60.0)
     still = np.repeat(poses[:1], 60, axis=0)
     still[:, 2, 2] += 0.2 * np.sin(np.arange(60) / 8)                # only the chest turns
     spread = np.random.default_rng(0).choice(len(person.mesh.vertices), 90, replace=False)

@@ -7,11 +7,11 @@ from completion_bodies import half_view, worm_with_prior
 from test_completion_partial import MARKS, QUICK
 
 from completion import Motion, TrackConfig, smoothing, track
-from completion.smoothing import inertia, predict, smooth
+from completion.smoothing import inertia, predict, smooth_frames
 from completion.tracking import frames
 from completion.tracking.frame_fit import FrameFit, fit_shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
-from completion.tracking.sequence import Tracker
+from completion.tracking.sequence import BodyTracker
 from model.fitting.bodies import FixedBody, ShapedBody
 from scanprep.batch.values import load_value, save_value
 from scanprep.geometry import rotations
@@ -129,7 +129,7 @@ def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_
     frames = [None, *record(bodies[:8])]
     frames[4:8] = [[view * [1, 1, 0.3] for view in views] for views in frames[4:8]]     # nothing the body could be
     marks = MARKS, bodies[0].vertices[MARKS]
-    first = Tracker(model, settings, RATE, marks)
+    first = BodyTracker(model, settings, RATE, marks)
     done, states = [], [first.state]
     for frame in frames:
         done += first.push(frame)
@@ -140,7 +140,7 @@ def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_
     assert states[4].random_state != states[6].random_state != states[8].random_state
     for cut, end in ((1, 4), (2, 4), (6, 9)):
         save_value(tmp_path / "state.npz", states[cut], {})
-        other = Tracker(model, settings, RATE, marks)
+        other = BodyTracker(model, settings, RATE, marks)
         other.resume(load_value(tmp_path / "state.npz"))
         rest = [f for frame in frames[cut:end] for f in other.push(frame)] + other.finish()
         assert rest[-1].number == end - 1
@@ -193,7 +193,7 @@ def test_smoothing_bridges_a_gap_at_constant_velocity():
     wrong = x.copy()
     wrong[5:9] += 0.3
     precision[5:9] = 0
-    out = smooth(wrong, np.zeros((T, 6)), precision, inertia(6, RATE, 60.0, 15.0), 10)
+    out = smooth_frames(wrong, np.zeros((T, 6)), precision, inertia(6, RATE, 60.0, 15.0), 10)
     np.testing.assert_allclose(rotations.exp(out[:, :3]), rotations.exp(x[:, :3]), atol=1e-6)
     np.testing.assert_allclose(out[:, 3:], x[:, 3:], atol=1e-6)
 
@@ -218,9 +218,9 @@ def test_smoothing_is_the_least_squares_solution(monkeypatch):
     for t in range(T):
         A[3 * t:3 * t + 3, 3 * t:3 * t + 3] += precision[t, 3:, 3:]
     wanted = x[:, 3:] - np.linalg.solve(A, rhs).reshape(T, 3)
-    out = smooth(x, gradient, precision, weights, 1)
+    out = smooth_frames(x, gradient, precision, weights, 1)
     np.testing.assert_allclose(out[:, 3:], wanted, atol=1e-6)
-    np.testing.assert_array_equal(smooth(x[:2], gradient[:2], precision[:2], weights, 1), x[:2])
+    np.testing.assert_array_equal(smooth_frames(x[:2], gradient[:2], precision[:2], weights, 1), x[:2])
 
 
 def test_several_frames_tell_the_shape(model):

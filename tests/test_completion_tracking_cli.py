@@ -19,7 +19,7 @@ from completion import Motion
 from completion.tracking import cli, report
 from completion.tracking.folder import FrameFolder
 from completion.tracking.report import _ranges
-from completion.tracking.sequence import Tracker
+from completion.tracking.sequence import BodyTracker
 from model import load_model
 from scanprep.batch.workspace import HOME
 from scanprep.command_line import run
@@ -158,7 +158,7 @@ def test_killed_in_the_first_frames_and_started_again(recording, tmp_path, capfd
 @pytest.fixture
 def again(recording, output, tmp_path, monkeypatch):
     """The recording and what came of it, to be changed; how often a frame is followed."""
-    folder, out, numbers, push = tmp_path / "recording", tmp_path / "out", [], Tracker.push
+    folder, out, numbers, push = tmp_path / "recording", tmp_path / "out", [], BodyTracker.push
     shutil.copytree(recording[0], folder)
     shutil.copytree(output, out)
     monkeypatch.setattr(report, "track_page", quick_page)
@@ -167,7 +167,7 @@ def again(recording, output, tmp_path, monkeypatch):
         numbers.append(self.state.number)
         return push(self, frame)
 
-    monkeypatch.setattr(Tracker, "push", counted)
+    monkeypatch.setattr(BodyTracker, "push", counted)
     assert track(*arguments(folder, out, *KNOWN)) == 0 and not numbers          # the page names where the model is
     return folder, out, numbers
 
@@ -236,7 +236,7 @@ def test_all_is_followed_anew_when_it_depends_on_what_changed(again, monkeypatch
         assert self.state.number == 0
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Tracker, "push", interrupted)
+    monkeypatch.setattr(BodyTracker, "push", interrupted)
     assert track(*arguments(folder, out, *(KNOWN if what != "subject" else KNOWN[2:]), *given)) == 130
 
 

@@ -11,7 +11,7 @@ from viewing_apps import a_motion, app_of, ask, write_files
 
 from completion.__main__ import main
 from completion.partial.completion import Completion, save_completion
-from completion.viewing.arrangement import side_by_side
+from completion.viewing.arrangement import arrange_side_by_side
 from completion.viewing.contents import Stance, of_mesh
 from completion.viewing.notebook import view
 from scanprep import RegisteredSet, write_mesh
@@ -188,6 +188,6 @@ def test_things_at_one_place_are_seen_from_one_side(model):
         front = rotations.exp(np.radians(angle) * stance.up) @ stance.front
         return replace(body, stance=replace(stance, front=front, extent=stance.extent + away))
 
-    cameras, _ = side_by_side([body, standing(40), standing(170), standing(40, 5.0)])
+    cameras, _ = arrange_side_by_side([body, standing(40), standing(170), standing(40, 5.0)])
     apart = [np.degrees(np.arccos(np.clip(one.axes[2] @ cameras[0].axes[2], -1, 1))) for one in cameras]
     assert apart[1] < 1e-3 and apart[2] > 100 and 30 < apart[3] < 50

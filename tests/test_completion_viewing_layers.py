@@ -20,7 +20,7 @@ from model.files import load_model
 from model.statue.control.files import humanoid
 from model.statue.control.model import FOLDED, MEASURED, DisplacementMap, Statue
 from model.statue.detail.reconstruction import Reconstruction
-from model.statue.detail.subdivision import subdivide
+from model.statue.detail.subdivision import subdivide_uniform
 from model.statue.files import save_statue, write_body
 from scanprep import read_mesh
 from scanprep.viewer.messages import Message
@@ -73,7 +73,7 @@ def detailed(place, app):
     body, control = load_model(place.folder / "statue" / "body.npz"), place.statue.control
     pose = np.array([app.controls.turns[name] for name in app.controls.shown[0].body.parts])
     moved = body.vertices(pose, None, app.controls.trans)
-    return Reconstruction(control, place.statue.map, subdivide(control.mesh, control.chart, 2))(moved), moved
+    return Reconstruction(control, place.statue.map, subdivide_uniform(control.mesh, control.chart, 2))(moved), moved
 
 
 def told(app, layer):

@@ -13,7 +13,7 @@ from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.named import read_layout
 from completion.partial import report
 from completion.partial.interactive import CompleteApp
-from completion.partial.work import Work
+from completion.partial.work import CompletionTask
 from scanprep.batch.opening import workspace
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import write_landmarks
@@ -42,7 +42,7 @@ def worn():
 def app_of(worn, folder):
     model, body, _, _ = worn
     write_mesh(folder / "person.ply", body)
-    work = Work(model, "worm", dict(zip(NAMES, map(int, MARKS), strict=True)), QUICK)
+    work = CompletionTask(model, "worm", dict(zip(NAMES, map(int, MARKS), strict=True)), QUICK)
     app = CompleteApp(model, work, [folder / "person.ply"], folder / "out")
     app.scan.places.update({name: body.vertices[v] for name, v in zip(NAMES, MARKS, strict=True)})
     return app

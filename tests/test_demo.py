@@ -31,7 +31,7 @@ from scanprep.pipeline.prepare import PrepareConfig
 from scanprep.skeleton.find import find_skeleton
 from scanprep.surfaces.cli import template
 from scanprep.synthetic.data_set import SUBJECT, subject_pose
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 CHILD = 0.45                       # the size of a person whose views are merged quickly
 pytestmark = pytest.mark.timeout(600)
@@ -67,7 +67,7 @@ NEEDED = {"pelvis", "head", "hand_left", "hand_right", "foot_left", "foot_right"
 @pytest.fixture(scope="module")
 def light_person():
     """The true subject with few triangles: the light mesh, and which vertices of the whole one it has."""
-    whole = Person(SUBJECT)
+    whole = SyntheticPerson(SUBJECT)
     few = decimate_set(whole.mesh, None, 2000)
     return whole, few.template, few.vertex_map
 
@@ -213,10 +213,11 @@ def test_another_setting_does_anew_what_depends_on_it(demo_folder, tmp_path, cou
     shutil.copytree(demo_folder, folder)
     before = files(folder)
     with workspace(folder) as space:
-        measuring.figures(Demo(space, replace(QUICK, rate=33.0), console.bar))
+        measuring.measure_demo(Demo(space, replace(QUICK, rate=33.0), console.bar))
     changed = {name for name, data in files(folder).items() if before[name] != data}
     done = {name: calls for name, calls in counted.items() if calls}
-    assert done == {"prepare": 1, "record_walk": 1, "animate": 1}        # `prepare` looks for itself what is to be done
+    # `prepare` looks for itself what is to be done
+    assert done == {"prepare": 1, "record_walk": 1, "animate": 1}
     assert changed >= {"demo.json", "markers/walk.c3d", "animation/motion.npz"}
     assert not [name for name in changed if name.startswith(("scans/", "set/meshes", "template", "model", "comp"))]
 

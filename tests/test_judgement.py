@@ -19,14 +19,14 @@ from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import COMMANDS as SCAPE
 from completion.__main__ import main
 from completion.measuring import bodies
-from completion.mocap.animate.work import Work as Follow
+from completion.mocap.animate.work import AnimateTask as Follow
 from completion.mocap.pose.judgement import hardly_seen, judge_motions, motion_doubts, motion_problem
 from completion.mocap.pose.marked_body import AnimateConfig
 from completion.mocap.subject.person import PersonConfig
 from completion.mocap.subject.worn_elsewhere import Worn
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
-from completion.partial.work import Inputs, Work, complete_files
+from completion.partial.work import CompletionInputs, CompletionTask, complete_files
 from completion.tracking.cli import wrong_size
 from completion.tracking.sequence import tracking_doubts, tracking_problem
 from model.coregistration.rounds import coregistration_doubts, coregistration_problem
@@ -35,7 +35,7 @@ from model.learning.scape import judge_model, learn_scape, learning_problem
 from model.people import ASKED, person_judgement
 from scanprep import Mesh, command_line, config_files, write_landmarks, write_mesh
 from scanprep.alignment.views import align_views, views_doubts, views_problem
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.cli import Output
 from scanprep.console import Metric, Outcome
@@ -45,8 +45,8 @@ from scanprep.judgement import (
     ONE_OF,
     USUAL,
     Judgement,
-    beyond_people,
     carry_judgements,
+    implausible_body,
     judge_many,
     longest_betas,
     read_judgement,
@@ -86,9 +86,9 @@ def place(tmp_path, monkeypatch):
     write_mesh("large.ply", Mesh(30 * moved.vertices, moved.faces))
     write_landmarks("large.json", {name: 30 * moved.vertices[v] for name, v in MARKS.items()})
     write_points("half.ply", PointCloud(half_view(body, np.array([0.0, -1.0, 0.0]))[0]))
-    Path("quick.toml").write_text(config_files.write({"config": FEW_NODES}))
+    Path("quick.toml").write_text(config_files.write_settings({"config": FEW_NODES}))
     whole = PrepareConfig(dataclasses.replace(PrepareConfig().scan, registration=FEW_NODES))
-    Path("quick_set.toml").write_text(config_files.write({"config": whole}))
+    Path("quick_set.toml").write_text(config_files.write_settings({"config": whole}))
     return tmp_path
 
 
@@ -139,8 +139,8 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     ("half", None, None), ("ball", None, ["explains", "a scan of something else"]), ("half", "in", ["--unit"])])
 def test_completions(place, tmp_path, scan, unit, words):
     model = worm_with_prior()
-    work = Work(model.subject(None), "model.npz", MARKS, QUICK, unit)
-    rows = complete_files(work, Inputs((Path(f"{scan}.ply"),)), Room(tmp_path / "out"))
+    work = CompletionTask(model.subject(None), "model.npz", MARKS, QUICK, unit)
+    rows = complete_files(work, CompletionInputs((Path(f"{scan}.ply"),)), TaskContext(tmp_path / "out"))
     check(rows, words)
     assert (tmp_path / "out" / "completed.ply").exists()
 
@@ -181,7 +181,7 @@ def test_motions(tmp_path, case, words):
     write_markers(tmp_path / "walk.csv", markers)
     work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None, None,
                   AnimateConfig(), PersonConfig())
-    check(work(tmp_path / "walk.csv", Room(tmp_path / "out")), words)
+    check(work(tmp_path / "walk.csv", TaskContext(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 
 
@@ -442,7 +442,7 @@ def test_many_results_are_as_good_as_the_worst_of_them():
     (1.75, 400, 5.0, "failed", "several"), (1.75, 75, 9.0, "check", "standard deviations"),
     (1.75, 75, 6.5, "good", ""), (1.75, 75, 13.8, "failed", "scale")])
 def test_bodies_beyond_what_people_are(stature, volume, betas, verdict, word):
-    found = beyond_people(stature, volume, np.eye(18)[0] * betas)
+    found = implausible_body(stature, volume, np.eye(18)[0] * betas)
     assert found.verdict == verdict and word in found.why, found
 
 
@@ -525,5 +525,5 @@ def test_hardly_anybody_has_longer_betas(count):
 
 
 def test_nobody_is_a_giant_or_a_doll():
-    verdicts = [beyond_people(stature).verdict for stature in (0.5, 1.75, 2.5, 4.0)]
+    verdicts = [implausible_body(stature).verdict for stature in (0.5, 1.75, 2.5, 4.0)]
     assert verdicts == ["failed", "good", "failed", "failed"]

@@ -15,7 +15,7 @@ from model import fit_pose, load_model
 from model.built_in import STORED, load_built_in_model, load_fingered_model, pack_coefficients, unpack_coefficients
 from scanprep.geometry import storage
 from scanprep.synthetic.landmarks import landmarks, markers
-from scanprep.synthetic.people import BodyShape, Person, random_pose
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, random_pose
 from scanprep.synthetic.population import STORED as PEOPLE
 from scanprep.synthetic.population import population
 
@@ -37,14 +37,14 @@ def test_its_bodies_are_those_of_the_population(model, seed):
     """At rest nearly exactly, and in poses that it was not learned from, of people that it was not learned from."""
     rng, kept = np.random.default_rng(seed), np.array(model.info["people_vertices"])
     shape = BodyShape.random(rng, ("female", "male")[seed % 2])
-    person, subject = Person(shape), model.subject(np.array(shape.betas))
+    person, subject = SyntheticPerson(shape), model.subject(np.array(shape.betas))
     for pose, most in ((np.zeros((16, 3)), 0.0008), (random_pose(rng), 0.006)):
         truth = person.in_pose(pose)[kept]
         assert np.linalg.norm(fit_pose(subject, truth).vertices - truth, axis=1).mean() < most
 
 
 def test_its_template_is_the_mean_person_with_landmarks(model):
-    person, kept = Person(BodyShape("male", (0.0,) * 30)), np.array(model.info["people_vertices"])
+    person, kept = SyntheticPerson(BodyShape("male", (0.0,) * 30)), np.array(model.info["people_vertices"])
     np.testing.assert_allclose(model.template.vertices, person.mesh.vertices[kept], atol=1e-9)
     assert model.template.is_closed and len(model.template.faces) == 10000 and model.skeleton.names == person.names
     for named, mine in ((landmarks(), model.info["landmarks"]), (markers(), model.info["markers"])):

@@ -13,7 +13,7 @@ from model.posing.character import (
     CharacterMeshConfig,
     character_model,
     character_pose,
-    inside,
+    points_inside,
     register_character,
 )
 from model.scape import BlendScapeModel
@@ -173,7 +173,7 @@ def test_inside():
     mesh = worm_model().template
     middle = np.array([[0.3, -0.2, 0.9], [0.3, -0.2, 1.2], [1.2, -0.2, 0.9], [2.0, -0.2, 0.9]])
     for one in (mesh, Mesh(mesh.vertices, mesh.faces[:, ::-1])):
-        assert inside(one, middle).tolist() == [True, False, True, False]
+        assert points_inside(one, middle).tolist() == [True, False, True, False]
 
 
 def test_from_the_command_line(drawn, tmp_path, capsys):

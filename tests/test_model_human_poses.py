@@ -7,7 +7,7 @@ from model.human_poses import WORTH, human_poses, with_human_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import BodyShape, Person
+from scanprep.synthetic.people import BodyShape, SyntheticPerson
 from scanprep.synthetic.poses import random_pose
 
 
@@ -18,12 +18,12 @@ def as_named(person, R=None):
             Skeleton(person.part_of_face, person.parents, person.joints @ R.T, PARTS))
 
 
-PARTS = Person.names
-PERSON = Person(BodyShape.random(np.random.default_rng(3)))
+PARTS = SyntheticPerson.names
+PERSON = SyntheticPerson(BodyShape.random(np.random.default_rng(3)))
 
 
 def test_on_a_synthetic_person_they_are_those_of_the_synthetic_people():
-    found = human_poses(*as_named(Person()), 20, np.random.default_rng(1))
+    found = human_poses(*as_named(SyntheticPerson()), 20, np.random.default_rng(1))
     rng = np.random.default_rng(1)
     wanted = np.stack([random_pose(rng) for _ in range(20)])
     wanted[:, 0] = 0

@@ -21,7 +21,7 @@ from scanprep.registration.cli import judge_registration
 from scanprep.registration.lead import lead_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.unmarked import Candidate, find_rival, register_by_any, weigh_doubts
-from scanprep.synthetic.people import BodyShape, Person, find_pose
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, find_pose
 
 
 def off(found, truth):
@@ -124,7 +124,7 @@ def test_a_template_in_known_triangles_is_not_searched(monkeypatch):
     """Those of the model, or those of the synthetic people, of which the built-in model keeps some vertices."""
     monkeypatch.setattr(lead, "lay_model", lambda *given: pytest.fail("the model was sought"))
     monkeypatch.setattr(person, "register", lambda *given: pytest.fail("a person was registered"))
-    model, template = load_built_in_model(), Person(BodyShape.random(np.random.default_rng(3))).mesh
+    model, template = load_built_in_model(), SyntheticPerson(BodyShape.random(np.random.default_rng(3))).mesh
     kept = np.array(model.info["people_vertices"])
     whole = model_lead(template, "people")
     off = np.linalg.norm(whole.carry(model.template.with_vertices(template.vertices[kept])) - template.vertices, axis=1)
@@ -144,7 +144,7 @@ def test_a_crab_is_no_person(body):
 
 def test_a_person_is_found_in_any_pose_and_lands_on_the_scan(tmp_path):
     """A template of other triangles than the model's; the scan lies on its side, and nobody says which way is up."""
-    somebody = Person(BodyShape.like("female", weight=0.8))
+    somebody = SyntheticPerson(BodyShape.like("female", weight=0.8))
     template = decimate(somebody.mesh, 5000)
     place = Surface(somebody.mesh).closest(template.vertices)
     scan = somebody.in_pose(find_pose("lunge_left")) @ exp(np.array([0.3, 1.4, 0.2])).T

@@ -4,7 +4,7 @@ from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
 from model import LearnConfig, learn_scape
 from model.fitting.vertices import fit_pose, fit_shape
-from model.learning.scape import pose_examples, pose_prior
+from model.learning.scape import estimate_pose_prior, pose_examples
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh
@@ -69,8 +69,8 @@ def test_prior_is_that_of_the_training_poses(truth, training):
     rng = np.random.default_rng(0)
     poses = random_poses(truth, 40, rng, 0.4)
     poses[0] = 0
-    mean, covariance = pose_prior(truth.template, truth.skeleton,
-                                  pose_examples(truth.template, truth.skeleton, poses), len(poses))
+    mean, covariance = estimate_pose_prior(truth.template, truth.skeleton,
+                                           pose_examples(truth.template, truth.skeleton, poses), len(poses))
     np.testing.assert_allclose(mean[1:], poses[:, 1:].mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(covariance[3:, 3:], np.cov(poses[:, 1:].reshape(40, -1).T), atol=1e-12)
     assert (covariance[:3] == 0).all() and (covariance[:, :3] == 0).all() and (mean[0] == 0).all()
@@ -86,10 +86,11 @@ def test_how_people_stand_counts_as_much_as_the_poses(truth, training, learned):
     assert learned.pose_examples.shape == (52, 4, 3) and (learned.pose_examples[:, 0] == 0).all()
     wide, near = (kind.reshape(len(kind), -1) for kind in np.split(learned.pose_examples, [40]))
     assert near.std() < 0.5 * wide.std()
-    mean, covariance = pose_prior(learned.template, learned.skeleton, learned.pose_examples, 40)
+    mean, covariance = estimate_pose_prior(learned.template, learned.skeleton, learned.pose_examples, 40)
     np.testing.assert_allclose(mean.ravel(), (wide.mean(axis=0) + near.mean(axis=0)) / 2, atol=1e-12)
     np.testing.assert_array_equal(learned.pose_mean, mean)
-    twice = pose_prior(learned.template, learned.skeleton, np.concatenate([wide, near, near]).reshape(-1, 4, 3), 40)
+    twice = estimate_pose_prior(learned.template, learned.skeleton,
+                                np.concatenate([wide, near, near]).reshape(-1, 4, 3), 40)
     np.testing.assert_allclose(twice[0], mean, atol=1e-12)
     np.testing.assert_allclose(twice[1], covariance, atol=1e-12)
 

@@ -19,26 +19,26 @@ from model.measurement.catalogue import CATALOGUE, find_measurements
 from model.measurement.measure import measurement_error
 from model.measurement.path import shortest_path
 from model.measurement.reading import Reading, Standing
-from model.measurement.section import Curve, around, bulge, direction, mean_of, section, tape
+from model.measurement.section import SectionCurve, bulge, direction, mean_of, section, tape, tape_length
 from model.measurement.tapes import Girth, Span, Way, Weight
 from model.shape_statistics import draw_betas, shape_statistics
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
 from scanprep.synthetic.landmarks import landmarks
-from scanprep.synthetic.people import BodyShape, Person
-from scanprep.synthetic.topology import load
+from scanprep.synthetic.people import BodyShape, SyntheticPerson
+from scanprep.synthetic.topology import load_topology
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture(scope="module")
 def person():
-    return Person(BodyShape.like("female", weight=0.8))
+    return SyntheticPerson(BodyShape.like("female", weight=0.8))
 
 
 @pytest.fixture(scope="module")
 def tapes():
-    return find_tapes(Person().mesh, landmarks())
+    return find_tapes(SyntheticPerson().mesh, landmarks())
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,8 @@ def taped(mesh, height, normal=UP):
     points = curve.at(mesh.vertices) + bulge(mesh.vertices, mesh.vertex_normals, curve)[0]
     hull = tape(points, normal)
     apart = np.abs(hull - np.roll(hull, 1))
-    return around(points[hull], (apart == 1) | (apart == len(points) - 1))[0], around(curve.at(mesh.vertices))[0]
+    return tape_length(points[hull],
+                       (apart == 1) | (apart == len(points) - 1))[0], tape_length(curve.at(mesh.vertices))[0]
 
 
 def test_a_tape_around_a_coarse_tube_is_as_long_as_its_circle():
@@ -127,7 +128,7 @@ def test_all_is_measured_of_a_person(person, tapes):
 def test_a_way_ends_at_the_girth_wherever_the_vertices_lie(tapes, name, girth):
     """On all bodies: a vertex of the template's section was up to 2 cm from the section of another."""
     for shape in (BodyShape(), BodyShape("female"), BodyShape.like("male", stature=1.95, weight=-2)):
-        body = Person(shape).mesh
+        body = SyntheticPerson(shape).mesh
         way, ring = measure(body, tapes, tapes.axes, only=[name]).readings[name], tapes.found[girth]
         end, origin = way.curve[-1], ring.centre.at(body.vertices)
         normal = UP if ring.axis is None else direction(ring.axis, body.vertices)
@@ -137,9 +138,9 @@ def test_a_way_ends_at_the_girth_wherever_the_vertices_lie(tapes, name, girth):
 
 def test_no_chest_takes_an_arm_along():
     """Where the nipples are as high as the armpits: it was 10 % more than the average body's and what moves it say."""
-    rng, tapes = np.random.default_rng(0), find_tapes(load().mesh, landmarks())
+    rng, tapes = np.random.default_rng(0), find_tapes(load_topology().mesh, landmarks())
     for shape in [BodyShape.random(rng) for _ in range(14)]:
-        body, mean = Person(shape).mesh.vertices, Person(BodyShape(shape.sex)).mesh.vertices
+        body, mean = SyntheticPerson(shape).mesh.vertices, SyntheticPerson(BodyShape(shape.sex)).mesh.vertices
         found, usual = (measure(x, tapes, tapes.axes, only=["chest_girth"]).readings["chest_girth"]
                         for x in (body, mean))
         told = usual.value + float(usual.along((body - mean)[..., None])[0])
@@ -187,7 +188,7 @@ def test_fewer_triangles_measure_the_same():
 
     Of a man: triangles of 8 cm span the hollow that women have at the waist, 1.7% too far.
     """
-    mesh = Person(BodyShape.like("male", weight=0.8)).mesh
+    mesh = SyntheticPerson(BodyShape.like("male", weight=0.8)).mesh
     numbers = {int(v): k for k, v in enumerate(kept())}
     coarse = Mesh(mesh.vertices[kept()], small_people().template.faces)
     one = measure(mesh, find_tapes(mesh, landmarks())).values
@@ -210,13 +211,14 @@ def test_derivatives_are_finite_differences(person, tapes, smooth, monkeypatch):
     """Exact on plain triangles, but for ways that change theirs; of the smooth tape turning normals are left out."""
     if not smooth:
         monkeypatch.setattr(reading, "bulge", lambda body, normals, curve: 2 * (np.zeros((len(curve.share), 3)),))
-        monkeypatch.setattr(reading, "around", lambda points, near: around(points))
+        monkeypatch.setattr(reading, "tape_length", lambda points, near: tape_length(points))
     rng, axes = np.random.default_rng(0), tapes.axes
     body = person.mesh.vertices + 1e-4 * rng.normal(size=person.mesh.vertices.shape)       # no two soles alike
     moves = np.sin(body @ rng.normal(size=(3, 3)) * 3 + rng.normal(size=3))
     for name, found in tapes.found.items():
         def read(step, found=found):
-            return reading.read(found, Standing(person.mesh.with_vertices(body + step * moves), axes), tapes)
+            return reading.read_measurement(found, Standing(person.mesh.with_vertices(body + step * moves), axes),
+                                            tapes)
 
         limit = 0.15 if smooth and isinstance(found, Girth | Span) else 0.05 if isinstance(found, Way) else 1e-5
         step = 1e-4 if isinstance(found, Way) else 1e-6        # metres; where a way runs is found to a micrometre
@@ -286,7 +288,7 @@ def test_the_centroid_of_a_curve_counts_its_length_and_not_its_points():
     """Of a square with five points on one side, and as a carried point on another body: there with the same weights."""
     corners = np.array([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
     edges = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [1, 2], [2, 3], [3, 0]])
-    square = Curve(edges, np.array([0.0, 0.1, 0.3, 0.6, 0.0, 0.0, 0.0]), True)
+    square = SectionCurve(edges, np.array([0.0, 0.1, 0.3, 0.6, 0.0, 0.0, 0.0]), True)
     np.testing.assert_allclose(square.centroid(corners).at(corners), [0.5, 0.5, 1])
     np.testing.assert_allclose(square.centroid(corners).at(2 * corners), [1, 1, 2])
 
@@ -339,7 +341,7 @@ def test_a_cube_weighs_what_its_volume_does():
     """985 kg in a cubic metre, also inside out; growing in all directions it does so by the third power."""
     box = trimesh.creation.box((0.4, 0.5, 0.6))
     for faces in (box.faces, box.faces[:, ::-1]):
-        taken = reading.read(Weight(), Standing(Mesh(box.vertices, faces), np.eye(3)), None)
+        taken = reading.read_measurement(Weight(), Standing(Mesh(box.vertices, faces), np.eye(3)), None)
         assert taken.value == pytest.approx(985 * 0.12) and taken.unknown == pytest.approx(0.02 * taken.value)
         assert taken.along(box.vertices) == pytest.approx(3 * taken.value)
 

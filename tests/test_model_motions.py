@@ -21,7 +21,7 @@ from model.statue.files import body_model
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import walk
+from scanprep.synthetic.people import synthesise_walk
 
 
 @pytest.mark.parametrize(("unit", "how"), [
@@ -55,7 +55,7 @@ def test_a_body_without_a_persons_names_gets_its_own_back(tmp_path):
 
 
 def test_the_same_skeleton_of_another_person_turns_as_it_did_and_stands_on_its_feet(tmp_path):
-    model, (poses, trans) = small_people(), walk(20, 20)
+    model, (poses, trans) = small_people(), synthesise_walk(20, 20)
     rig = make_rig(model, np.array([1.5, -1.0]))
     write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 20.0, body=rig.mesh)
     found = read_motion(tmp_path / "a.bvh", model)

@@ -9,8 +9,8 @@ from model import BodyModel, load_model
 from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
-from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide
-from model.resolution.transfer import Follower, Piece, gradients_of, transfer_skeleton
+from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide_at_middles
+from model.resolution.transfer import Piece, SurfaceCarrier, gradients_of, transfer_skeleton
 from model.scape import BlendScapeModel, ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep import decimate, write_mesh
@@ -28,12 +28,12 @@ def model():
 
 @pytest.fixture(scope="module")
 def finer(model):
-    return change_resolution(model, subdivide(model.template))
+    return change_resolution(model, subdivide_at_middles(model.template))
 
 
 def apart(a, b, pose, betas=None):
     """Mean and largest distance of the vertices of b from the points of a on which they lie at rest, metres."""
-    ridden = Follower(a.template, b.template).positions(a.vertices(pose, betas))
+    ridden = SurfaceCarrier(a.template, b.template).positions(a.vertices(pose, betas))
     far = np.linalg.norm(ridden - b.vertices(pose, betas), axis=-1)
     return far.mean(), far.max()
 
@@ -74,7 +74,7 @@ def test_a_model_deformed_alike_everywhere_stays_exact(model, faces):
         model.template, skeleton, PoseSpace(features, tuple(np.tile(A, (1, n, 1, 1)) for n in sizes)),
         ShapeSpace(np.tile(np.eye(3) + B, (sizes.sum(), 1, 1)), np.tile(B, (1, sizes.sum(), 1, 1)), np.ones(1), 1.0),
         np.zeros((4, 3)), np.zeros((12, 12)))
-    template = subdivide(model.template) if faces is None else decimate(model.template, faces)
+    template = subdivide_at_middles(model.template) if faces is None else decimate(model.template, faces)
     carried = change_resolution(alike, template, ROUGH)
     centre = skeleton.joints[0]
     for betas, M in ((None, A), ([2.0], (np.eye(3) + 3 * B) @ A)):
@@ -107,7 +107,7 @@ def test_there_and_back(model, finer):
 
 def test_the_place_stays(model, finer):
     for pose in typical(model):
-        shift = Follower(model.template, finer.template).positions(model.vertices(pose)) - finer.vertices(pose)
+        shift = SurfaceCarrier(model.template, finer.template).positions(model.vertices(pose)) - finer.vertices(pose)
         assert np.linalg.norm(shift.mean(axis=0)) < 2e-3
     trans = np.array([1.0, 2.0, 3.0])
     np.testing.assert_allclose(finer.vertices(pose, None, trans) - finer.vertices(pose), np.tile(trans, (
@@ -135,7 +135,7 @@ def test_blended_rotations_are_carried_too(model):
     fields = {name: getattr(model, name) for name in ("template", "skeleton", "pose_space", "shape_space", "pose_mean",
                                                       "pose_covariance", "info")}
     blended = BlendScapeModel(**fields, blend=blend)
-    finer = change_resolution(blended, subdivide(model.template))
+    finer = change_resolution(blended, subdivide_at_middles(model.template))
     assert isinstance(finer, BlendScapeModel)
     np.testing.assert_allclose(finer.blend.sum(axis=1), 1, atol=1e-12)
     for pose in typical(model, 3):
@@ -174,7 +174,7 @@ def test_gradients_of_edges_and_the_rest():
 
 
 def test_averages_are_by_area(model):
-    finer = subdivide(model.template)
+    finer = subdivide_at_middles(model.template)
     every = np.arange(len(finer.faces))
     piece = Piece(finer, model.template, every, np.arange(len(model.template.faces)))
     np.testing.assert_allclose(piece.average(np.ones(len(every))), 1)
@@ -187,7 +187,7 @@ def test_followers_move_stiffly_with_a_stiff_body(model):
     rng = np.random.default_rng(0)
     rider = model.template.with_vertices(model.template.vertices + rng.normal(0, 0.01, model.template.vertices.shape))
     R, t = rotations.exp([0.3, -0.7, 1.1]), np.array([1.0, 2.0, 3.0])
-    moved = Follower(model.template, rider).positions(model.template.vertices @ R.T + t)
+    moved = SurfaceCarrier(model.template, rider).positions(model.template.vertices @ R.T + t)
     np.testing.assert_allclose(moved, rider.vertices @ R.T + t, atol=1e-12)
 
 
@@ -209,7 +209,7 @@ def test_skinning_models_are_carried_too():
         rest=plain.rest + 0.01 * waves, shape_mean=1.1 * plain.rest, shape_variances=np.ones(1), shape_total=1.0,
         shape_components=0.05 * waves[None, :, ::-1])
     poses = rng.normal(0, 0.3, (3, 5, 3))
-    finer = change_resolution(model, subdivide(template))
+    finer = change_resolution(model, subdivide_at_middles(template))
     assert isinstance(finer, type(model)) and finer.shape_total == 1586 / 398
     for betas in (None, np.ones((3, 1))):
         assert resolution_gap(model, finer, poses, betas).max() < 2e-3          # of a body 2 m long
@@ -223,7 +223,7 @@ def test_from_the_command_line(model, tmp_path):
     out = tmp_path / "fine.npz"
     assert group(["resample", str(tmp_path / "worm.npz"), "--vertices", "600", "-o", str(out)]) == 0
     assert abs(len(load_model(out).template.vertices) - 600) <= 2
-    write_mesh(tmp_path / "t.ply", subdivide(model.template))
+    write_mesh(tmp_path / "t.ply", subdivide_at_middles(model.template))
     assert group(["resample", str(tmp_path / "worm.npz"), "--template", str(tmp_path / "t.ply"), "-o", str(out)]) == 0
     assert len(load_model(out).template.vertices) == 1586
     assert group(["resample", str(tmp_path / "worm.npz"), "-o", str(out)]) == 2

@@ -18,7 +18,7 @@ from model.statue.fit import FittedStatue, Posed
 from model.statue.registration.features import FeatureFit
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.pipeline.scans import ScanTask
-from scanprep.synthetic.people import LANDMARKS, BodyShape, Person, walk
+from scanprep.synthetic.people import LANDMARKS, BodyShape, SyntheticPerson, synthesise_walk
 
 JOINTS = {"vl5": 1, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_wrist": 6, "r_shoulder": 7, "r_elbow": 8,
           "r_wrist": 9, "l_hip": 10, "l_knee": 11, "l_ankle": 12, "r_hip": 13, "r_knee": 14, "r_ankle": 15}
@@ -30,7 +30,7 @@ def run(*words):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person(BodyShape.like("male", stature=1.82))
+    return SyntheticPerson(BodyShape.like("male", stature=1.82))
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def test_an_edited_image_moves_the_surface_there_and_nowhere_else(made, tmp_path
 
 
 def test_a_walk_moves_the_statue(made, tmp_path):
-    poses, trans = walk(6, 12.0)
+    poses, trans = synthesise_walk(6, 12.0)
     np.savez(tmp_path / "walk.npz", poses=poses.reshape(6, -1), trans=trans, mocap_frame_rate=12.0)
     assert run("animate", made / "statue", tmp_path / "walk.npz", "-o", tmp_path / "walking", "--level", 1,
                "--meshes") == 0

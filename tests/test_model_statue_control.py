@@ -27,7 +27,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import LANDMARKS, MARKERS
-from scanprep.synthetic.topology import load
+from scanprep.synthetic.topology import load_topology
 
 MIRROR = np.array([-1, 1, 1])
 
@@ -159,7 +159,7 @@ def test_the_joints_lie_inside_and_every_part_carries_what_is_near():
 
 
 def test_landmarks_and_markers_are_where_people_have_them():
-    control, people = humanoid(), load()
+    control, people = humanoid(), load_topology()
     assert set(control.landmarks) == set(LANDMARKS) and set(humanoid_markers()) == set(MARKERS)
     for mine, theirs in ((control.landmarks, LANDMARKS), (humanoid_markers(), MARKERS)):
         assert len(set(mine.values())) == len(mine)
@@ -171,7 +171,7 @@ def test_landmarks_and_markers_are_where_people_have_them():
 def test_what_is_stored_is_what_its_maker_makes():
     control = humanoid()
     assert control.skeleton.names == NAMES
-    axes, limits = freedom(load().anatomy)
+    axes, limits = freedom(load_topology().anatomy)
     np.testing.assert_allclose(np.concatenate(control.axes), np.concatenate(axes), atol=1e-12)
     np.testing.assert_allclose(np.concatenate(control.limits), np.concatenate(limits), atol=1e-12)
     assert nearest_marks(control.mesh, LANDMARKS) == control.landmarks

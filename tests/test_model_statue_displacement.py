@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from model.statue.control.chart import make_chart
 from model.statue.control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
-from model.statue.detail.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
+from model.statue.detail.displacement import DisplacementConfig, bake_displacement, coverage_shares, unfold_control
 from model.statue.detail.maps import read_map, write_map
 from model.statue.detail.normal_volume import from_normal_volume, interpolate, limits, not_inverted, to_normal_volume
 from model.statue.detail.reconstruction import (
@@ -21,10 +21,10 @@ from model.statue.detail.reconstruction import (
     displace_surface,
     find_inverted,
     in_folds,
+    reconstruction_error,
     remaining_error,
-    surface_error,
 )
-from model.statue.detail.subdivision import INNER, chart_places, subdivide, subdivide_adaptive
+from model.statue.detail.subdivision import INNER, chart_places, subdivide_adaptive, subdivide_uniform
 from model.statue.detail.texels import bake_texture, continue_chart, find_texels, scan_look, vertex_of_row
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
@@ -48,7 +48,7 @@ def scan():
 
 @pytest.fixture(scope="module")
 def baked(control, scan):
-    return bake(control, scan, DisplacementConfig(size=SIZE))
+    return bake_displacement(control, scan, DisplacementConfig(size=SIZE))
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_heights_of_a_bumpy_sphere_are_those_of_its_formula(places, baked):
 
 @pytest.fixture(scope="module")
 def fine_map(control, scan):
-    return bake(control, scan, DisplacementConfig(size=768))
+    return bake_displacement(control, scan, DisplacementConfig(size=768))
 
 
 def test_both_ways_to_the_map_agree(control, scan, fine_map):
@@ -178,7 +178,7 @@ def test_overlapping_views_are_one_surface(control, scan, baked):
     """Two sheets 2 mm apart, nothing seen from inside between them: their mean, not a fold."""
     both = Mesh(np.concatenate([scan.vertices, 1.01 * scan.vertices]),
                 np.concatenate([scan.faces, scan.faces + len(scan.vertices)]))
-    upper, found = (bake(control, one, DisplacementConfig(size=SIZE))
+    upper, found = (bake_displacement(control, one, DisplacementConfig(size=SIZE))
                     for one in (scan.with_vertices(1.01 * scan.vertices), both))
     assert coverage_shares(control, found)["folded"] == 0
     inside = found.coverage == MEASURED
@@ -188,7 +188,7 @@ def test_overlapping_views_are_one_surface(control, scan, baked):
 def test_a_hole_is_told_and_filled_from_around_it(control, scan, places):
     texels, p, _ = places
     cut = scan.submesh(scan.corners.mean(axis=1)[:, 0] < 0.15)[0]
-    found = bake(control, cut, DisplacementConfig(size=SIZE))
+    found = bake_displacement(control, cut, DisplacementConfig(size=SIZE))
     kind = found.coverage.ravel()[texels.pixels]
     sure = texels.inside & (np.abs(p[:, 0] - 0.145) > 0.01)
     assert (kind[sure] == np.where(p[sure, 0] > 0.145, HOLE, MEASURED)).all()
@@ -202,7 +202,7 @@ def test_a_hole_over_the_seam_is_filled_as_high_as_all_around_it(control, places
     """A sphere 8 mm outside of the control sphere, without its side at x > 5 cm, where the seam runs."""
     ball, texels = globe(80, 120, R + 0.008)[0], places[0]
     cut = ball.submesh(ball.corners.mean(axis=1)[:, 0] < 0.05)[0]
-    found = bake(control, cut, DisplacementConfig(size=SIZE))
+    found = bake_displacement(control, cut, DisplacementConfig(size=SIZE))
     kind, heights = (of.ravel()[texels.pixels[texels.inside]] for of in (found.coverage, found.heights))
     known = heights[kind == MEASURED]
     assert (kind == HOLE).mean() > 0.2 and known.min() > 0.007
@@ -211,7 +211,7 @@ def test_a_hole_over_the_seam_is_filled_as_high_as_all_around_it(control, places
 
 @pytest.fixture(scope="module")
 def with_vectors(control):
-    return bake(control, mushroom(R), DisplacementConfig(size=384, vectors=True))
+    return bake_displacement(control, mushroom(R), DisplacementConfig(size=384, vectors=True))
 
 
 def test_vectors_mend_an_overhang_and_nothing_else(control, with_vectors):
@@ -224,9 +224,9 @@ def test_vectors_mend_an_overhang_and_nothing_else(control, with_vectors):
     assert (2 * np.pi * R**2) * 0.001 < coverage_shares(control, found)["folded"] * (4 * np.pi * R**2) < 0.03**2
     moved = found.vectors.reshape(-1, 3)[texels.pixels].any(axis=1)
     assert off[moved].max() < 0.06
-    fine = subdivide(control.mesh, control.chart, 4)
+    fine = subdivide_uniform(control.mesh, control.chart, 4)
     plain, bent = (Reconstruction(control, m, fine).mesh() for m in (replace(found, vectors=None), found))
-    assert surface_error(bent, scan, 50_000).rms < 0.6 * surface_error(plain, scan, 50_000).rms
+    assert reconstruction_error(bent, scan, 50_000).rms < 0.6 * reconstruction_error(plain, scan, 50_000).rms
     inverted = find_inverted(control, control.mesh.vertices, fine, bent.vertices)
     folds = in_folds(control, found, fine)
     assert len(inverted) and folds[inverted].all()           # the underside of the cap
@@ -243,11 +243,12 @@ def test_a_control_mesh_that_is_folded_inside_the_scan_is_drawn_out(control, sca
         control.mesh.vertices - np.where(near[:, None], [0, 0.8 * R, 0], 0)))
     config = DisplacementConfig(size=128)
     out = unfold_control(dented, scan, config)
-    maps = [(one, bake(one, scan, config)) for one in (dented, out)]
+    maps = [(one, bake_displacement(one, scan, config)) for one in (dented, out)]
     before, after = (coverage_shares(*pair)["folded"] for pair in maps)
     assert after < 0.2 * before
-    before, after = (surface_error(Reconstruction(one, found, subdivide(one.mesh, one.chart, 3)).mesh(), scan,
-                                   20_000).rms for one, found in maps)
+    before, after = (reconstruction_error(Reconstruction(one, found, subdivide_uniform(one.mesh, one.chart, 3)).mesh(),
+                                          scan,
+                                          20_000).rms for one, found in maps)
     assert after < 0.1 * before
     behind = control.mesh.vertices[:, 1] < 0
     assert (out.mesh.vertices[behind] == dented.mesh.vertices[behind]).all()
@@ -256,7 +257,7 @@ def test_a_control_mesh_that_is_folded_inside_the_scan_is_drawn_out(control, sca
 
 @pytest.mark.parametrize("level", range(5))
 def test_a_split_of_every_edge_has_four_times_the_vertices_less_six(control, level):
-    fine = subdivide(control.mesh, control.chart, level)
+    fine = subdivide_uniform(control.mesh, control.chart, level)
     count = len(control.mesh.vertices)
     for _ in range(level):
         count = 4 * count - 6
@@ -284,7 +285,7 @@ def test_adaptive_subdivision_splits_where_the_surface_bends_without_a_crack(con
     assert mesh.is_closed and mesh.is_edge_manifold
     assert len(fine.parent) - len(mesh.edges) + len(fine.faces) == 2
     np.testing.assert_allclose(mesh.face_areas.sum(), control.mesh.face_areas.sum())
-    even = subdivide(control.mesh, control.chart, 4)
+    even = subdivide_uniform(control.mesh, control.chart, 4)
     assert len(fine.faces) < 0.25 * len(even.faces)
     far = mesh.corners.mean(axis=1)[:, 1] < 0
     assert np.isin(mesh.face_areas[far], control.mesh.face_areas).all()              # nothing happens behind
@@ -327,17 +328,18 @@ def test_between_two_split_sides_runs_the_shorter_diagonal(control, face, whole)
 
 
 def test_reconstruction_comes_nearer_to_the_scan_with_every_level(control, scan, baked):
-    errors = [surface_error(Reconstruction(control, baked, subdivide(control.mesh, control.chart, level)).mesh(), scan,
-                            20_000) for level in range(4)]
+    errors = [reconstruction_error(Reconstruction(control, baked,
+                                                  subdivide_uniform(control.mesh, control.chart, level)).mesh(), scan,
+                                   20_000) for level in range(4)]
     for coarse, fine in pairwise(errors):
         assert fine.mean < 0.5 * coarse.mean and fine.mean <= fine.rms
     assert errors[3].mean < 1e-4
-    larger = surface_error(globe(80, 160, 0.203)[0], globe(80, 160, 0.2)[0], 20_000)
+    larger = reconstruction_error(globe(80, 160, 0.203)[0], globe(80, 160, 0.2)[0], 20_000)
     assert [larger.mean, larger.rms] == pytest.approx([0.003] * 2, abs=3e-5)       # the difference of the radii
 
 
 def test_detail_turns_and_moves_with_the_control_mesh(control, with_vectors):
-    fine = subdivide(control.mesh, control.chart, 3)
+    fine = subdivide_uniform(control.mesh, control.chart, 3)
     build = Reconstruction(control, with_vectors, fine)
     turn, shift = Rotation.from_rotvec([0.3, -1, 2]), np.array([1, 2, 3.0])
     rest, v = build(control.mesh.vertices), np.array(control.mesh.vertices)
@@ -346,7 +348,7 @@ def test_detail_turns_and_moves_with_the_control_mesh(control, with_vectors):
 
 
 def test_triangles_that_are_turned_over_are_found(control, baked):
-    fine = subdivide(control.mesh, control.chart, 2)
+    fine = subdivide_uniform(control.mesh, control.chart, 2)
     x = Reconstruction(control, baked, fine)(control.mesh.vertices)
     assert not len(find_inverted(control, control.mesh.vertices, fine, x))
     turned = x.copy()
@@ -382,7 +384,7 @@ def test_an_edited_image_edits_exactly_there(tmp_path, control, baked):
     change = edited.heights.astype(float) - baked.heights
     assert (change[~there] == 0).all() and change[there].mean() < -3e-4
     np.testing.assert_allclose(change[there], change[there].mean(), rtol=1e-4)
-    fine = subdivide(control.mesh, control.chart, 3)
+    fine = subdivide_uniform(control.mesh, control.chart, 3)
     moved = (Reconstruction(control, edited, fine).mesh().vertices
              != Reconstruction(control, baked, fine).mesh().vertices).any(axis=1)
     x, y = (chart_places(control.chart, fine.parent, fine.bary) * [SIZE, -SIZE] + [0, SIZE]).T
@@ -417,8 +419,8 @@ def test_unusable_edited_images_are_refused(tmp_path, baked, name, came):
 
 
 @pytest.mark.parametrize(("call", "word"), [
-    (lambda c, scan: bake(c, Mesh(scan.vertices, np.zeros((0, 3), int))), "at least one triangle"),
-    (lambda c, scan: bake(c, scan, DisplacementConfig(size=3)), "size"),
+    (lambda c, scan: bake_displacement(c, Mesh(scan.vertices, np.zeros((0, 3), int))), "at least one triangle"),
+    (lambda c, scan: bake_displacement(c, scan, DisplacementConfig(size=3)), "size"),
     (lambda c, scan: scan_look(scan), "colours")])
 def test_unusable_input_is_told(control, scan, call, word):
     with pytest.raises(ValueError, match=word):

@@ -9,14 +9,14 @@ from trimesh.remesh import subdivide_to_size
 from model.statue.control.files import humanoid
 from model.statue.fit import StatueConfig, pose_automatically, pose_by_features
 from model.statue.registration import automatic
-from model.statue.registration.articulated import Articulated, Points
-from model.statue.registration.automatic import Features, find_features, likely_unit
+from model.statue.registration.articulated import Articulated, BoundPoints
+from model.statue.registration.automatic import Features, find_features, guess_person_unit
 from model.statue.registration.clicks import MedialAxis
-from model.statue.registration.features import fit_features, head_share, misfit, warp
+from model.statue.registration.features import feature_misfit, fit_features, head_share, warp
 from model.statue.registration.person_search import LENGTH, control_body
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.people import BodyShape, Person, compose
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, compose_pose
 
 FACE = ("nose tip", "chin", "left eye", "right eye", "left ear", "right ear", "top of head")
 
@@ -77,13 +77,13 @@ def test_a_length_moves_the_joints_beyond_it_and_stretches_its_own_vertices_only
 def test_derivatives_are_finite_differences(control, model):
     rng = np.random.default_rng(1)
     x, some = drawn(model, rng), rng.choice(len(control.mesh.vertices), 40)
-    points = Points(control.weights[some], control.mesh.vertices[some])
+    points = BoundPoints(control.weights[some], control.mesh.vertices[some])
     goal = rng.normal(size=(40, 3))
     found = model.derivatives(model.frames(x), points)
     by_point = differences(lambda x: model.positions(model.frames(x), points), x, 1e-5)
     assert np.abs(found - by_point).max() < 1e-8 * np.abs(found).max()
-    gradient = misfit(model, x, points, goal)[1]
-    numeric = differences(lambda x: misfit(model, x, points, goal)[0], x, 1e-5)
+    gradient = feature_misfit(model, x, points, goal)[1]
+    numeric = differences(lambda x: feature_misfit(model, x, points, goal)[0], x, 1e-5)
     assert np.abs(gradient - numeric).max() < 1e-8 * np.abs(gradient).max()
 
 
@@ -247,13 +247,14 @@ def test_a_click_on_a_limb_finds_its_bone(control):
 
 @pytest.mark.parametrize(("length", "unit"), [(1.8, "m"), (0.8, "m"), (1750, "mm"), (171, "cm"), (70, "in")])
 def test_the_unit_is_told_by_the_height(length, unit):
-    points = length * (Person().mesh.vertices @ rotations.exp(np.array([0.4, 1.0, 0])).T) / 1.75
-    assert likely_unit(points) == unit
+    points = length * (SyntheticPerson().mesh.vertices @ rotations.exp(np.array([0.4, 1.0, 0])).T) / 1.75
+    assert guess_person_unit(points) == unit
 
 
 def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_arm(control):
-    person = Person(BodyShape.like("female", stature=1.62, weight=1.0))
-    pose = compose(left_arm={"direction": (0.8, 0.5, -0.3), "elbow": 40}, back={"turn": 15}, right_leg={"knee": 20})
+    person = SyntheticPerson(BodyShape.like("female", stature=1.62, weight=1.0))
+    pose = compose_pose(left_arm={"direction": (0.8, 0.5, -0.3), "elbow": 40}, back={"turn": 15},
+                        right_leg={"knee": 20})
     vertices, joints = person.in_pose(pose), person.joints_in_pose(pose)
     rng = np.random.default_rng(4)
     centres = vertices[person.mesh.faces].mean(axis=1)
@@ -269,7 +270,7 @@ def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_
     dense, faces, before = subdivide_to_size(vertices, person.mesh.faces, 0.015, return_index=True)
     scan, _ = Mesh(seen(dense), faces).submesh(keep[before])
     found = find_features(control, scan)
-    assert likely_unit(scan.vertices) == "mm" and found.problem is None
+    assert guess_person_unit(scan.vertices) == "mm" and found.problem is None
     assert {"r_wrist", "right middle finger", "right wrist"} <= set(found.missing)
     for name, part in {"l_elbow": 5, "l_wrist": 6, "l_hip": 10, "l_knee": 11, "r_knee": 14, "skullbase": 3}.items():
         assert np.linalg.norm(found.joints[name] - seen(joints[part])) < 40, name
@@ -281,7 +282,7 @@ def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_
 
 
 def test_half_a_person_is_found_at_that_end(control):
-    person = Person()
+    person = SyntheticPerson()
     centres = person.mesh.vertices[person.mesh.faces].mean(axis=1)
     found = find_features(control, person.mesh.submesh(centres[:, 2] > np.median(person.mesh.vertices[:, 2]))[0])
     joints = person.joints_in_pose(np.zeros((16, 3)))
@@ -303,7 +304,7 @@ def test_a_ball_is_no_person(control):
 def test_what_has_too_few_joints_says_so(control, monkeypatch):
     stands = [SimpleNamespace(off=off, mesh=control.mesh) for off in (0.01, 0.02)]
     nothing = SimpleNamespace(mesh=control.mesh, uncovered=0.0, confidence=np.zeros(len(control.mesh.vertices)))
-    monkeypatch.setattr(automatic, "find_person", lambda *given: stands)
+    monkeypatch.setattr(automatic, "find_stand", lambda *given: stands)
     monkeypatch.setattr(automatic, "register", lambda *given, **named: nothing)
     found = find_features(control, control.mesh)
     assert found.fit is None and "0 joints and 0 points" in found.problem

@@ -12,28 +12,28 @@ from PIL import Image
 from model.rig import turn_up
 from model.statue.control.chart import Chart
 from model.statue.control.files import humanoid
-from model.statue.detail.subdivision import subdivide
+from model.statue.detail.subdivision import subdivide_uniform
 from model.statue.detail.texels import chart_tangents, normal_image, vertex_of_row
 from model.statue.files import ABOUT, KIND, load_statue, write_statue_glb, write_x3d
 from model.statue.motion.motions import people_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
-from scanprep.synthetic.people import walk
+from scanprep.synthetic.people import synthesise_walk
 
 NAMES = humanoid().skeleton.names
 
 
 @pytest.fixture(scope="module")
 def motion():
-    return people_motion(humanoid(), np.zeros((17, 3)), *walk(4, 4), 4.0)
+    return people_motion(humanoid(), np.zeros((17, 3)), *synthesise_walk(4, 4), 4.0)
 
 
 @pytest.fixture(scope="module")
 def detailed():
     """Two levels, with waves on the skin."""
     control = humanoid()
-    fine = subdivide(control.mesh, control.chart, 2)
+    fine = subdivide_uniform(control.mesh, control.chart, 2)
     smooth = fine.mesh(control.mesh)
     return fine, smooth.vertices + 0.004 * np.sin(60 * smooth.vertices[:, [2]]) * smooth.vertex_normals
 
@@ -112,7 +112,7 @@ def test_the_control_mesh_with_images_of_detail(detailed, tmp_path):
 
 def test_a_surface_without_detail_has_an_even_normal_image():
     control = humanoid()
-    image = normal_image(control, control.mesh.vertices, subdivide(control.mesh, control.chart, 0), 128)
+    image = normal_image(control, control.mesh.vertices, subdivide_uniform(control.mesh, control.chart, 0), 128)
     assert np.abs(image.astype(int) - [128, 128, 255]).max() <= 1
 
 

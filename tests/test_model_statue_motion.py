@@ -13,12 +13,12 @@ from model.motion.onto import read_motion
 from model.rig import joint_places
 from model.skinning import SkinningModel
 from model.statue.control.files import humanoid
-from model.statue.motion.motions import Follower, _bound, bvh_motion, own_motion, people_motion, write_motion
+from model.statue.motion.motions import BoundControl, _bound, bvh_motion, own_motion, people_motion, write_body_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.roles import find_roles, trunk
-from scanprep.synthetic.people import PARTS, Person, find_pose, walk
+from scanprep.synthetic.people import PARTS, SyntheticPerson, find_pose, synthesise_walk
 
 GENERIC = np.zeros((17, 3))
 NAMES = humanoid().skeleton.names
@@ -53,7 +53,7 @@ def test_a_motion_of_its_own_parts(tmp_path):
                           np.zeros((0, *rest.shape)), np.zeros(0), 0.0, np.zeros((17, 3)), np.eye(51))
     assert np.abs(control.rig.vertices(found.poses, found.trans) - model.vertices(poses, None, trans)).max() < 1e-9
     assert np.linalg.norm(found.trans - trans, axis=1).max() > 1e-3, "skinning moves the middle of the root part"
-    write_motion(tmp_path / "again.npz", control, found)
+    write_body_motion(tmp_path / "again.npz", control, found)
     again = own_motion(control, tmp_path / "again.npz")
     assert np.array_equal(again.poses, poses) and np.abs(again.trans - found.trans).max() < 1e-12 and again.rate == 25
     assert np.abs(read_motion(tmp_path / "again.npz", model).trans - trans).max() < 1e-12
@@ -65,7 +65,7 @@ def test_a_motion_of_its_own_parts(tmp_path):
 
 
 def test_parts_turn_in_the_world_as_those_of_the_people():
-    control, person = humanoid(), Person()
+    control, person = humanoid(), SyntheticPerson()
     poses = np.stack([find_pose("lunge_left"), find_pose("surrender")])
     poses[1, 2] = 0                                             # the trunk turns in one joint
     found = people_motion(control, GENERIC, poses)
@@ -78,7 +78,7 @@ def test_parts_turn_in_the_world_as_those_of_the_people():
 
 
 def test_a_trunk_of_two_joints_carries_the_shoulders_nearly_as_far():
-    person, poses = Person(), find_pose("left_arm_up")[None].copy()
+    person, poses = SyntheticPerson(), find_pose("left_arm_up")[None].copy()
     poses[:, [0, *range(3, 16)]] = 0
     poses[:, 1:3] *= 2                                          # 24 degrees aside
     R = world(humanoid(), people_motion(humanoid(), GENERIC, poses))[0, 1]
@@ -108,7 +108,7 @@ def test_clavicles_rise_with_arms_above_the_horizontal():
 @pytest.mark.parametrize("turn", [(0, 0, 0.7), (np.pi / 2, 0, 0)])
 def test_the_pose_of_the_scan_does_not_matter(turn):
     """Joints go the same ways, in the scan's axes, whatever the pose that the statue was scanned in."""
-    poses, trans = walk(20, 20)
+    poses, trans = synthesise_walk(20, 20)
     plain = people_motion(humanoid(), GENERIC, poses, trans, 20)
     control, pose = scanned(turn)
     found = people_motion(control, pose, poses, trans, 20)
@@ -224,8 +224,8 @@ def test_a_file_whose_rest_says_nothing_is_refused():
 
 
 def test_a_bvh_that_was_exported_drives_the_statue(tmp_path):
-    control, person = humanoid(), Person()
-    poses, trans = walk(12, 12)
+    control, person = humanoid(), SyntheticPerson()
+    poses, trans = synthesise_walk(12, 12)
     write_bvh(tmp_path / "walk.bvh", person.skeleton, poses, trans, 12, "in", body=person.mesh)
     found = bvh_motion(control, GENERIC, read_bvh(tmp_path / "walk.bvh", "in"))
     direct = people_motion(control, GENERIC, poses, trans, 12)
@@ -257,7 +257,7 @@ def learned():
 
 def test_a_control_mesh_follows_a_model(learned):
     subject, pose, trans, control = learned
-    follower = Follower(control, subject, pose, trans)
+    follower = BoundControl(control, subject, pose, trans)
     assert np.abs(follower.vertices(pose, trans) - control.vertices).max() < 1e-9, "the scan's own pose gives it back"
     # the whole body turns and travels: the control mesh does so too
     turn, moved = np.array([0.4, -0.8, 1.1]), pose.copy()
@@ -281,16 +281,16 @@ def test_points_of_the_skin_follow_exactly_and_a_registered_scan_says_which(lear
     slid = body.with_vertices(body.vertices + [0.3, 0, 0])               # stands elsewhere than the model has it
     on = Surface(body).closest(control.vertices)
     mesh = control.with_vertices(on.transfer(slid.vertices, body.faces))
-    follower = Follower(mesh, subject, pose, trans, slid.vertices)
+    follower = BoundControl(mesh, subject, pose, trans, slid.vertices)
     assert np.abs(follower.vertices(pose, trans) - mesh.vertices).max() < 1e-9
-    straight = Follower(control.with_vertices(on.points), subject, pose, trans)
+    straight = BoundControl(control.with_vertices(on.points), subject, pose, trans)
     poses = np.random.default_rng(5).normal(0, 0.3, (2, 4, 3))
     for t, x in enumerate(straight.vertices(poses)):
         assert np.abs(x - on.transfer(subject.vertices(poses[t]), body.faces)).max() < 1e-9
     off = follower.vertices(poses[0]) - straight.vertices(poses[0])
     assert np.abs(np.linalg.norm(off, axis=1) - 0.3).max() < 1e-9, "the offset turns with the skin"
     with pytest.raises(ValueError, match=r"registered: expected shape \(398, 3\)"):
-        Follower(mesh, subject, pose, trans, slid.vertices[:5])
+        BoundControl(mesh, subject, pose, trans, slid.vertices[:5])
 
 
 def test_a_vertex_is_bound_to_its_own_side(learned):

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 from scipy.special import logsumexp
 
 from model.statue.registration.local_shape import local_shape
-from model.statue.registration.soft_assignment import ScanPoints, assign
+from model.statue.registration.soft_assignment import DirectedPoints, assign_softly
 from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
 from scanprep.alignment.icp import align_landmarks, apply
 from scanprep.geometry import rotations
@@ -121,8 +121,8 @@ def test_soft_assignment_agrees_with_a_dense_one(slack, temperature):
     rng = np.random.default_rng(4)
     x, y = rng.random((20, 3)), rng.random((50, 3))
     up = np.tile([0.0, 0.0, 1.0], (50, 1))
-    near, squared = ScanPoints(y, up, np.zeros(50, bool)).nearest(x, up[:20], 12)
-    found = assign(near, squared, 50, temperature, slack, tolerance=1e-9, most=500)
+    near, squared = DirectedPoints(y, up, np.zeros(50, bool)).nearest(x, up[:20], 12)
+    found = assign_softly(near, squared, 50, temperature, slack, tolerance=1e-9, most=500)
     logs = np.full((20, 50), -np.inf)
     logs[np.arange(20)[:, None], near] = -((x[:, None] - y[near]) ** 2).sum(axis=2) / temperature
     least = np.where(np.isinf(logs), 0, logs).min(axis=0)
@@ -146,24 +146,24 @@ def test_cold_assignment_is_that_of_the_closest_points_on_the_same_side(body):
     points, face, _ = body.sample(4000, rng)
     normals = body.face_normals[face]
     x, n = 0.9 * body.vertices, body.vertex_normals
-    near, squared = ScanPoints(points, normals, np.zeros(4000, bool)).nearest(x, n, 12)
+    near, squared = DirectedPoints(points, normals, np.zeros(4000, bool)).nearest(x, n, 12)
     assert (np.einsum("ikd,id->ik", normals[near], n)[near >= 0] > 0).all()
     agree = np.where(normals @ n.T > 0, ((points[:, None] - x) ** 2).sum(axis=2), np.inf)
     closest = agree.argmin(axis=0)
     assert (near[:, 0] == closest).all()
-    cold = assign(near, squared, 4000, 1e-12)
+    cold = assign_softly(near, squared, 4000, 1e-12)
     assert cold.excess < 1e-6
     alone = np.bincount(closest, minlength=4000)[closest] == 1   # several vertices cannot share one point
     assert cold.matches.toarray()[np.flatnonzero(alone), closest[alone]] == pytest.approx(1, abs=1e-6)
-    published = assign(near, squared, 4000, 1e-4, "published", most=200).matches.toarray()
-    assert (assign(near, squared, 4000, 1e-4).matches.toarray().argmax(axis=1) == closest)[alone].mean() > 0.9
+    published = assign_softly(near, squared, 4000, 1e-4, "published", most=200).matches.toarray()
+    assert (assign_softly(near, squared, 4000, 1e-4).matches.toarray().argmax(axis=1) == closest)[alone].mean() > 0.9
     assert (published.argmax(axis=1) == closest).mean() < 0.5    # why it is not the default
 
 
 def test_a_vertex_that_knows_no_point_and_more_vertices_than_points():
     near = np.array([[0, 1], [0, 1], [1, 0], [-1, -1]])
     squared = np.array([[0.0, 1.0], [0.1, 0.9], [0.0, 1.2], [np.inf, np.inf]])
-    found = assign(near, squared, 2, 0.05)
+    found = assign_softly(near, squared, 2, 0.05)
     assert found.seen.tolist() == [True, True, True, False]
     assert found.matches.sum(axis=1) == pytest.approx([1, 1, 1, 0])
     assert found.excess == pytest.approx(0.5, abs=0.5) and found.excess > 0.1        # Eq. 14 has no solution

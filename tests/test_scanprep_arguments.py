@@ -16,7 +16,7 @@ PATHS = command_line.list_commands(COMMANDS, "scape")
 
 
 def parsed(path):
-    return command_line.Arguments(command_line.load(PATHS[path]), path, [])
+    return command_line.Arguments(command_line.load_command(PATHS[path]), path, [])
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -19,7 +19,7 @@ from scanprep.batch.digests import Digests
 from scanprep.batch.opening import workspace
 from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers
-from scanprep.batch.room import Job, Room, attempt
+from scanprep.batch.room import Job, TaskContext, attempt
 from scanprep.batch.values import load_value, save_value
 from scanprep.batch.workspace import Task
 from scanprep.console import Metric
@@ -159,7 +159,7 @@ def test_what_another_program_made_is_made_anew(tmp_path, texts, monkeypatch):
             before = list(space.results(work))
             space.run(work, [Task(p.stem, p, p.stem) for p in texts], Workers(1))
             space.step("table", 1, lambda folder: steps.append(1))
-            Room(tmp_path, tmp_path / "steps").step("part of a task", 1, lambda: steps.append(1))
+            TaskContext(tmp_path, tmp_path / "steps").step("part of a task", 1, lambda: steps.append(1))
             assert list(space.results(work)) == (before or ["a", "b", "c"])
         return len((tmp_path / "count").read_text()), len(steps), Digests().of(TRIANGLE)
 

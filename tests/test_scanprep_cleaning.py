@@ -13,13 +13,13 @@ from scanprep.cleaning.clean_scan import (
     SPECKS,
     CleanScanConfig,
     clean_scan,
-    pieces,
+    label_pieces,
     take_clutter,
 )
 from scanprep.cleaning.floor import find_plane, floor_points, inside_outline, local_noise
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 NOISE = 0.002
 
@@ -50,7 +50,7 @@ UPRIGHT = rotations.exp(np.array([0, np.pi / 2, 0]))
 @pytest.fixture(scope="module")
 def person():
     """With four triangles for one: scans have points every centimetre."""
-    mesh = Person().mesh
+    mesh = SyntheticPerson().mesh
     mesh = Mesh(*igl.upsample(mesh.vertices, mesh.faces, 1))
     return moved(mesh, [0, 0, -mesh.vertices[:, 2].min()])
 
@@ -187,7 +187,7 @@ def test_views_side_by_side_are_one_piece():
     one = ball(4)
     left, right = (one.submesh(s * one.corners[:, :, 0].mean(axis=1) > -0.01)[0] for s in (1, -1))
     both = joined(left, right)
-    assert pieces(both, np.arange(len(both.vertices)), 0.012).max() == 0
+    assert label_pieces(both, np.arange(len(both.vertices)), 0.012).max() == 0
     with pytest.warns(UserWarning, match="scan: 512 repeated triangles dropped"):
         clean = clean_scan(both)
     assert clean.kept.all() and clean.mesh.face_areas.sum() == pytest.approx(one.face_areas.sum(), rel=1e-12)
@@ -196,7 +196,7 @@ def test_views_side_by_side_are_one_piece():
 def test_pieces_are_those_of_the_scan_wherever_it_stands():
     """The cells began at the origin of the file: three metres away other points stood for them."""
     points = np.random.default_rng(0).random((300, 3)) * [1, 1, 0.02]
-    there = [pieces(Mesh(points + offset, np.zeros((0, 3), dtype=int)), np.arange(300), 0.05)
+    there = [label_pieces(Mesh(points + offset, np.zeros((0, 3), dtype=int)), np.arange(300), 0.05)
              for offset in ([0, 0, 0], [3, -3.015625, 3.0078125])]
     np.testing.assert_array_equal(*there)
 

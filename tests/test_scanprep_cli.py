@@ -60,7 +60,7 @@ def quick(tmp_path, monkeypatch):
         monkeypatch.setattr(place, "register", few_steps)
     path = tmp_path / "quick.toml"
     config = replace(QUICK, min_poses=5, scan=replace(QUICK.scan, pictures=True))
-    path.write_text(config_files.write({"config": config}))
+    path.write_text(config_files.write_settings({"config": config}))
     return path
 
 

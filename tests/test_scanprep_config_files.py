@@ -142,10 +142,10 @@ def settings_of(prog):
 def test_every_command_writes_its_settings_and_reads_them_again(prog, tmp_path):
     settings = settings_of(prog)
     path = tmp_path / "all.toml"
-    path.write_text(config_files.write(settings), encoding="utf-8")
-    assert config_files.read(path, settings) == settings
+    path.write_text(config_files.write_settings(settings), encoding="utf-8")
+    assert config_files.read_settings(path, settings) == settings
     for config in settings.values():
-        assert set(config_files.sentences(type(config))) == {f.name for f in dataclasses.fields(config)}
+        assert set(config_files.settings_sentences(type(config))) == {f.name for f in dataclasses.fields(config)}
 
 
 @pytest.mark.parametrize("prog", [prog for prog in CALLS if hasattr(next(iter(settings_of(prog).values()), None),

@@ -9,14 +9,14 @@ import pytest
 
 from scanprep.correspondence import potentials as ce
 from scanprep.correspondence.correlated import find_correspondences, find_seeds, match_ends
-from scanprep.correspondence.potentials import Places, gradients
+from scanprep.correspondence.potentials import SurfaceFeatures, gradients
 from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
 from scanprep.correspondence.sheet import Sheet
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, target_of
-from scanprep.synthetic.people import Person, find_pose
+from scanprep.synthetic.people import SyntheticPerson, find_pose
 
 SMALL = CorrelatedConfig(points=100, keep=80, levels=(BeliefLevel(1200, 60), BeliefLevel(10**6, 40)))
 
@@ -39,8 +39,8 @@ def sheets(body: Mesh, rng: np.random.Generator, noise: float = 0.001) -> Mesh:
 
 
 @pytest.fixture(scope="module")
-def person() -> Person:
-    return Person()
+def person() -> SyntheticPerson:
+    return SyntheticPerson()
 
 
 @pytest.fixture(scope="module")
@@ -176,8 +176,8 @@ def test_energies_of_true_images_are_zero_and_mirrors_cost():
     rng = np.random.default_rng(0)
     n = 12
     normals = rotations.exp(rng.normal(size=(n, 3)))[:, 2]
-    places = Places(rng.normal(size=(n, 3)), normals, rng.uniform(0.2, 1, (n, 4)), rng.uniform(-1, 1, (n, 6)),
-                    np.ones((n, 4)))
+    places = SurfaceFeatures(rng.normal(size=(n, 3)), normals, rng.uniform(0.2, 1, (n, 4)), rng.uniform(-1, 1, (n, 6)),
+                             np.ones((n, 4)))
     mirrored = replace(places, angles=-places.angles)
     edges = np.array([[0, 1], [4, 7], [3, 11]])
     own = np.arange(n)[:, None]

@@ -8,7 +8,7 @@ from scanned_shapes import SIX, bumpy, triangle_quality, view
 from scanprep.adapters.open3d_filters import MissingLibrary
 from scanprep.decimation import edge_collapse
 from scanprep.decimation.decimate import DecimateConfig, collapse, decimate, fast_collapses
-from scanprep.decimation.quadrics import lowest, plane_quadrics, point_quadrics, surface_quadrics, value
+from scanprep.decimation.quadrics import minimise_quadrics, plane_quadrics, point_quadrics, surface_quadrics, value
 from scanprep.fusion.tsdf import MergeConfig
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
@@ -62,7 +62,7 @@ def test_a_quadric_is_the_squared_distance_to_planes():
                                atol=1e-12)
     total = plane_quadrics(n, through, weight).sum(axis=0)
     A, b = (np.sqrt(weight)[:, None] * n), np.sqrt(weight) * np.einsum("pd,pd->p", n, through)
-    np.testing.assert_allclose(lowest(total), np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-9)
+    np.testing.assert_allclose(minimise_quadrics(total), np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-9)
 
 
 def test_the_quadric_of_a_vertex_has_the_planes_around_it_by_their_areas():

@@ -8,10 +8,10 @@ from PIL import Image
 
 from model.fitting.free_space import PictureView
 from model.fitting.upright import PICTURE, Upright
-from scanprep.depth_camera.person import find_person, room_planes
+from scanprep.depth_camera.person import room_planes, segment_person
 from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry import rotations
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 ROW, COLUMN = np.indices((240, 320))
@@ -74,7 +74,7 @@ def test_floor_and_wall_are_planes_and_a_person_is_not():
 def test_the_person_is_found():
     noise = np.random.default_rng(0).normal(size=(240, 320)) * 0.0015
     depth = standing(room(), 160, 0.2)
-    found = find_person(DepthPicture.of(depth + noise * depth**2, K), SIZE)
+    found = segment_person(DepthPicture.of(depth + noise * depth**2, K), SIZE)
     truth = (depth < 1.55)[::2, ::2]
     assert (found.mask & truth).sum() > 0.93 * truth.sum() and (found.mask & ~truth).sum() < 0.05 * truth.sum()
     points, normals, edge = found.points_and_normals()
@@ -89,18 +89,18 @@ def test_the_person_is_found():
 ], ids=["nobody", "a leg", "two", "too large"])
 def test_a_picture_of_anything_else_is_refused_with_the_reason(depth, words):
     with pytest.raises(ValueError, match=words):
-        find_person(DepthPicture.of(depth, K), SIZE)
+        segment_person(DepthPicture.of(depth, K), SIZE)
 
 
 def test_landmarks_say_who_of_two_is_meant():
     picture = DepthPicture.of(standing(standing(room(), 60, 0.2), 250, 0.2), K)
     marks = picture.points()[[80, 120, 200], [250, 240, 260]]
-    found = find_person(picture, SIZE, marks)
+    found = segment_person(picture, SIZE, marks)
     assert found.mask[:, 90:].any() and not found.mask[:, :60].any()
 
 
 def test_a_body_may_be_behind_what_was_seen_and_beyond_the_border():
-    view = PictureView(find_person(DepthPicture.of(standing(room(), 160, 0.2), K), SIZE))
+    view = PictureView(segment_person(DepthPicture.of(standing(room(), 160, 0.2), K), SIZE))
     places = np.array([[0, 0, 1.6], [0, 1.5, 1.5], [0, 0, 1.1], [0.5, 0, 1.5], [0.5, 0, 3.5], [0, 0, -1.0]])
     behind, beyond, before, beside, in_the_wall, at_the_back = view.violation(places).excess
     assert behind == beyond == in_the_wall == at_the_back == 0
@@ -146,7 +146,7 @@ def test_a_depth_picture_is_read_with_its_camera(tmp_path):
                          ids=["ours", "side first", "of old"])
 def test_which_way_is_up_in_a_body_whatever_its_parts_are_called(spell):
     """Also the built-in people, whose thighs were called l_thigh: --up was refused with them."""
-    person = Person()
+    person = SyntheticPerson()
     skeleton = replace(person.skeleton, names=tuple(map(spell, person.names)))
     found = Upright.of(person.mesh, skeleton, (0.0, 2.0, 0.0), picture=False)
     assert found is not None and (found.of_body == [0, 0, 1]).all() and (found.ups == [[0, 1, 0]]).all()

@@ -124,7 +124,7 @@ def test_a_new_result_follows_no_link_out_of_the_output(home):
 
 READERS = (load_model, read_published, read_camera, read_distances, read_landmarks, read_markers, Skeleton.load,
            MarkerLayout.load, read_motion_file, lambda path: read_mask(path, np.zeros((2, 3))),
-           lambda path: config_files.read(path, {}), small_picture, lambda path: read_names(str(path)),
+           lambda path: config_files.read_settings(path, {}), small_picture, lambda path: read_names(str(path)),
            lambda path: read_edited(path, (4, 4)))
 
 

@@ -13,7 +13,7 @@ from mesh_files import PLY_HEADER, PLY_ROWS, TETRAHEDRON, body, quiet, refused
 from scanprep.geometry.files import UNITS, list_meshes, name_of, read_mesh, read_registered, write_mesh
 from scanprep.geometry.format_glb import tallest, turn_up
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.people import BodyShape, Person
+from scanprep.synthetic.people import BodyShape, SyntheticPerson
 
 EXACT = {".ply": 0, ".ply.gz": 0, ".obj": 1e-11, ".off": 1e-11, ".glb": 1e-6}
 
@@ -116,7 +116,7 @@ def test_glb_has_y_up_and_comes_back_as_it_was(tmp_path, up):
 
 
 def test_arms_spread_wider_than_a_body_is_tall_do_not_lay_it_over():
-    person = Person(BodyShape()).mesh.vertices
+    person = SyntheticPerson(BodyShape()).mesh.vertices
     width, _, height = np.ptp(person, axis=0)
     for wide in (0.9, 1.0, 1.1):
         assert tallest(person * [wide * height / width, 1, 1]) == 2

@@ -18,7 +18,7 @@ from scanprep.geometry.landmarks import (
     write_landmarks,
 )
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 MESH = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 POINTS = {"nose": [0.1, -0.2, 1.6], "left knee": [0.3, 0.25, 0.5], "10th rib": [-0.2, 0.1, 1.2]}
@@ -350,7 +350,7 @@ def test_landmarks_that_lie_on_no_scan_of_any_unit_stay_as_they_are(tmp_path, re
 
 def test_axes_that_a_slicer_file_tells_are_doubted_only_where_the_others_fit_far_better(tmp_path):
     """A body looks alike from in front and behind: few triangles, and clicks between their corners, tell nothing."""
-    body = decimate(Person().mesh, 300)
+    body = decimate(SyntheticPerson().mesh, 300)
     for seed in range(8):
         points = dict(zip("abcdefghijkl", body.sample(12, np.random.default_rng(seed))[0], strict=True))
         write_landmarks(tmp_path / "a.mrk.json", points)

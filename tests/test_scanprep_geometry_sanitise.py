@@ -12,12 +12,12 @@ from scanprep.geometry.sanitise import _agree_with_camera, invert_triangles, san
 from scanprep.geometry.surface import Rays
 from scanprep.geometry.target import target_of
 from scanprep.geometry.thinning import thin_scan
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 
 @pytest.fixture(scope="module")
 def person():
-    return Person().mesh
+    return SyntheticPerson().mesh
 
 
 @pytest.fixture(scope="module", params=[0, 1, 2])

@@ -7,7 +7,7 @@ from scipy.sparse import csc_array, eye_array, random_array
 from scipy.spatial import ConvexHull
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import Factored, conjugate_gradients, distinct, factor, harmonic, solve_smooth
+from scanprep.geometry.sparse import Factored, conjugate_gradients, factor, harmonic, solve_smooth, unique_integers
 
 
 def system(n=80, seed=0):
@@ -96,6 +96,6 @@ def test_harmonic_values_are_means_of_their_neighbours():
 def test_distinct_numbers_are_those_of_numpy():
     rng = np.random.default_rng(0)
     for numbers in (rng.integers(-50, 50, (40, 3)), np.arange(0), np.array([7, 7]), rng.integers(0, 2**60, 500)):
-        found = distinct(numbers)
+        found = unique_integers(numbers)
         assert found.dtype == numbers.dtype
         np.testing.assert_array_equal(found, np.unique(numbers))

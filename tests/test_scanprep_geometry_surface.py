@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from model.posing.character import inside
+from model.posing.character import points_inside
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Rays, Surface, barycentric
 
@@ -129,7 +129,7 @@ QUERIES = {
     "cast": lambda bad: Rays(ball()).cast(bad, np.array([0, 0, 1.0])),
     "cast, directions": lambda bad: Rays(ball()).cast(np.zeros((3, 3)), bad),
     "occluded": lambda bad: Rays(ball()).test_occlusion(bad, np.array([0, 0, 1.0])),
-    "inside": lambda bad: inside(ball(), bad)}
+    "inside": lambda bad: points_inside(ball(), bad)}
 
 
 @pytest.mark.parametrize("query", QUERIES.values(), ids=QUERIES)
@@ -144,7 +144,7 @@ def test_no_query_answers_for_a_point_that_is_nowhere(query, value):
 def test_without_triangles_nothing_is_nearest_and_nothing_is_hit(vertices):
     bare = Mesh(np.zeros((vertices, 3)), np.zeros((0, 3), dtype=int))
     points = np.array([[0, 0, 1.0]])
-    for ask in (lambda: Surface(bare), lambda: inside(bare, points)):
+    for ask in (lambda: Surface(bare), lambda: points_inside(bare, points)):
         with pytest.raises(ValueError, match=rf"mesh: expected at least one triangle, got Mesh\({vertices} vertices"):
             ask()
     with pytest.raises(ValueError, match="points: expected at least one to search among, got none"):

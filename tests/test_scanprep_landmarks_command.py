@@ -26,7 +26,7 @@ from scanprep.pipeline.landmarks import (
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
 from scanprep.synthetic.landmarks import landmarks as landmarks_of_people
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 NEAR_POSE = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, through="pose"))
 CLAWS = {"left claw": 5, "back": 400, "right claw": 800}
@@ -154,7 +154,7 @@ def test_expected_errors_grow_with_what_speaks_against_a_landmark():
 def test_templates_and_their_landmarks(tmp_path):
     with workspace(tmp_path / "out") as space:
         person, marks = template_and_landmarks(None, space, None)
-        assert marks == landmarks_of_people() and np.array_equal(person.vertices, Person().mesh.vertices)
+        assert marks == landmarks_of_people() and np.array_equal(person.vertices, SyntheticPerson().mesh.vertices)
         body = crab(20, 10)
         write_mesh(tmp_path / "crab.ply", body)
         with pytest.raises(ValueError, match=r"crab\.landmarks\.json beside it, or the body of a person.*--template"):

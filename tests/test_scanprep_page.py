@@ -27,7 +27,7 @@ from scanprep.registration.figures import (
     write_failures,
     write_figures,
 )
-from scanprep.registration.limbs import Doubt
+from scanprep.registration.limbs import PlausibilityIssue
 from scanprep.registration.nonrigid import principal_stretches, share_stretched, share_uncovered
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
@@ -158,8 +158,9 @@ def test_order_of_verdicts():
 
 def test_a_rolled_limb_puts_a_scan_on_top(tmp_path):
     figures = [replace(GOOD, name=name) for name in "abc"]
-    rolled = Doubt(3.0, "the left forearm is rolled by 160 degrees against the left upper arm")
-    write_doubts(tmp_path, {"b": [rolled, Doubt(1.2, "the head is 20% smaller than on the template")], "a": []})
+    rolled = PlausibilityIssue(3.0, "the left forearm is rolled by 160 degrees against the left upper arm")
+    write_doubts(tmp_path,
+                 {"b": [rolled, PlausibilityIssue(1.2, "the head is 20% smaller than on the template")], "a": []})
     verdicts = review(figures, {}, 1.4, 25_000, doubts=read_doubts(tmp_path))
     assert verdicts[0].name == "b" and verdicts[0].badness == 3.0 and verdicts[0].reasons[0] == rolled.words
     assert [v.judgement.verdict for v in verdicts] == ["check", "good", "good"]

@@ -14,12 +14,12 @@ from scanprep.pictures.shading import (
     balls,
     capsules,
     color_bar,
+    contact_sheet,
     heat,
     part_colors,
     png_bytes,
     render,
     save_png,
-    side_by_side,
     sphere,
 )
 
@@ -218,16 +218,16 @@ def test_sheets_hold_all_pictures(tmp_path):
     from PIL import Image
 
     images = [np.full((40, 30, 3), 10 * i, dtype=np.uint8) for i in range(5)]
-    sheet = side_by_side(images, columns=3, gap=4)
+    sheet = contact_sheet(images, columns=3, gap=4)
     assert sheet.shape == (2 * 40 + 4, 3 * 30 + 2 * 4, 3)
     for i in range(5):
         assert (sheet[(i // 3) * 44 + 20, (i % 3) * 34 + 15] == 10 * i).all()
-    labelled = side_by_side(images[:2], ["one", "two"])
+    labelled = contact_sheet(images[:2], ["one", "two"])
     assert labelled.shape[0] > 40 and (labelled[42:] < 128).any()
     with pytest.raises(ValueError, match="labels: expected 5"):
-        side_by_side(images, ["one"])
+        contact_sheet(images, ["one"])
     with pytest.raises(ValueError, match="images"):
-        side_by_side([])
+        contact_sheet([])
     save_png(tmp_path / "a" / "sheet.png", sheet)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a" / "sheet.png")), sheet)
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["sheet.png"]

@@ -22,7 +22,7 @@ from scanprep.pipeline import scan as one_scan
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import unmarked
-from scanprep.registration.limbs import Doubt
+from scanprep.registration.limbs import PlausibilityIssue
 from scanprep.registration.nonrigid import LedRegistration, register
 
 
@@ -66,9 +66,9 @@ def test_limbs_are_rolled_otherwise_where_the_template_is_a_person(scans, templa
         given.append((parts, len(landmarks[0]), config, correspondences))
         return dataclasses.replace(fit, rolled=parts is person)
 
-    told = (Doubt(1.5, "the head is rolled by 90 degrees against the chest"),)
+    told = (PlausibilityIssue(1.5, "the head is rolled by 90 degrees against the chest"),)
     monkeypatch.setattr(unmarked, "repair_limbs", repaired)
-    small = Doubt(1.0, "the person is 1.20 m tall: a child, or the wrong scale?")
+    small = PlausibilityIssue(1.0, "the person is 1.20 m tall: a child, or the wrong scale?")
     monkeypatch.setattr(one_scan, "limb_doubts", lambda body, parts, vertices: told)
     monkeypatch.setattr(one_scan, "find_exchanged_sides", lambda body, parts, vertices: None)
     monkeypatch.setattr(one_scan, "size_doubts", lambda body, parts, vertices: (small,))

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from scanprep.registration.figures import EVIDENCE, WEIGHTS, Limits, ScanFigures, evidence_of, probability_right, review
-from scanprep.registration.limbs import Doubt
+from scanprep.registration.limbs import PlausibilityIssue
 
 FINE = ScanFigures("a", "model people", 0.001, 0.001, 0.9, 0.9, 0.001, 0.002, np.nan, 0, True)
 SIZE, FACES = 1.4, 25_000
@@ -28,7 +28,8 @@ def test_no_evidence_speaks_for_a_registration():
 def test_evidence_is_told_in_multiples_of_limits():
     worse = ScanFigures("a", "", 2 * Limits().distance * SIZE, 0.001, 0.9 - 3 * Limits().unseen, 0.9,
                         4 * Limits().missed, 5 * Limits().stretch, np.nan, round(6 * Limits().inverted * FACES), False)
-    found = evidence_of(worse, SIZE, FACES, 0.1, Limits(), [Doubt(1.5, "one"), Doubt(2.0, "another")])
+    found = evidence_of(worse, SIZE, FACES, 0.1, Limits(),
+                        [PlausibilityIssue(1.5, "one"), PlausibilityIssue(2.0, "another")])
     assert found == pytest.approx({"missed": 4, "distance": 2, "unseen": 3, "stretch": 5, "inverted": 6, "landmarks": 0,
                                    "not_converged": 0.5, "limbs": 3.5})
 
@@ -36,7 +37,7 @@ def test_evidence_is_told_in_multiples_of_limits():
 def test_many_small_doubts_need_a_look_together():
     """Each is below its limit; the reason says what all of them leave."""
     assert not judge().suspect and 0.75 < judge().right < 0.85
-    doubts = [Doubt(0.99, f"limb {k}") for k in range(12)]
+    doubts = [PlausibilityIssue(0.99, f"limb {k}") for k in range(12)]
     told = judge(doubts=doubts)
     assert told.right < 0.5 and told.badness == 1.0 and told.suspect
     assert told.reasons == (f"all figures together leave {100 * told.right:.0f}% that it is right within 20 mm",)

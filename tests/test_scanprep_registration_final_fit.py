@@ -14,7 +14,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
 from scanprep.registration.final_fit import FinalFit, final_fit, smooth_scan
 from scanprep.registration.schedule import FinalFitConfig, FinalFitRound
-from scanprep.registration.stretches import Triangles
+from scanprep.registration.stretches import GradientOperator
 
 LEFT, RIGHT = np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.7, 0.0])
 NOISE = 0.002
@@ -82,7 +82,7 @@ def test_folds_are_laid_flat():
     start = body.vertices.copy()
     start[[405, 406]] = start[[406, 405]]
     start[700] += 0.9 * (body.vertices[720] - body.vertices[700]) + 0.8 * (body.vertices[701] - body.vertices[700])
-    triangles = Triangles(body)
+    triangles = GradientOperator(body)
     normal = body.face_normals
     assert (np.einsum("fd,fd->f", triangles.mesh.with_vertices(start).face_normals, normal) < 0).sum() >= 2
     found = fitted(body, start, cloud(body, noise=0.001))
@@ -143,7 +143,7 @@ def test_even_growth_costs_nothing():
 
 def test_a_field_is_measured_and_laid_out_again(truth):
     body = crab()
-    triangles = Triangles(body)
+    triangles = GradientOperator(body)
     field = triangles.measure(truth.vertices)
     np.testing.assert_allclose(field.R @ field.R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), field.R.shape),
                                atol=1e-9)
@@ -159,7 +159,7 @@ def test_a_field_is_measured_and_laid_out_again(truth):
 def test_the_force_is_the_slope_of_the_energy(truth):
     rng = np.random.default_rng(3)
     body = crab()
-    triangles = Triangles(body)
+    triangles = GradientOperator(body)
     w = triangles.areas * rng.random(len(body.faces))
     wanted = rng.normal(size=(len(body.faces), 3, 3))
     wanted -= np.einsum("fij,fj,fk->fik", wanted, body.face_normals, body.face_normals)
@@ -175,7 +175,7 @@ def test_the_force_is_the_slope_of_the_energy(truth):
 
 def test_smoothing_keeps_an_even_field_and_drops_a_fold():
     body = crab()
-    triangles = Triangles(body)
+    triangles = GradientOperator(body)
     M = np.diag([1.2, 1.2, 1.2]) @ rotations.exp(np.array([0.2, 0.5, -1.0]))
     even = triangles.measure(body.vertices @ M.T)
     smooth = triangles.smooth(even, 0.1, np.ones(len(body.faces)))

@@ -9,7 +9,7 @@ from scanprep.registration.ground import find_floor, foot_of_vertex, put_on_floo
 from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import PersonParts
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import BodyShape, Person, find_pose
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, find_pose
 
 UP = np.array([0, 0, 1.0])
 R, T = rotations.exp(np.array([0.9, -0.4, 1.3])), np.array([0.5, -2.0, 0.7])
@@ -56,7 +56,7 @@ def walled(mesh, height):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person(BodyShape.like("male", stature=1.82, weight=0.4))
+    return SyntheticPerson(BodyShape.like("male", stature=1.82, weight=0.4))
 
 
 @pytest.fixture(scope="module")

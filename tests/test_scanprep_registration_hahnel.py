@@ -9,12 +9,12 @@ from jointed_bodies import bent, crab
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.registration.graph_fit import GraphFit, start_fit
-from scanprep.registration.matches import prepare, pull
+from scanprep.registration.matches import prepare_problem, pull
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 LEFT, RIGHT = np.array([0, 0, 0.6]), np.array([0, 0.6, 0])
-GIVEN = prepare(crab(), crab())
+GIVEN = prepare_problem(crab(), crab())
 SIZE = GIVEN.size
 
 

@@ -70,9 +70,9 @@ def test_holes_are_reported_and_filled_with_volume(truth, found):
 
 
 def test_a_mesh_gives_the_same_as_its_points(truth):
-    from scanprep.geometry.target import orient, target_of
+    from scanprep.geometry.target import orient_by_mesh, target_of
     mesh, cloud = target_of(truth), target_of(truth.vertices)
-    cloud = orient(cloud, truth, 0.05)
+    cloud = orient_by_mesh(cloud, truth, 0.05)
     assert (np.einsum("nd,nd->n", mesh.normals, cloud.normals) > 0.7).mean() > 0.97
 
 
@@ -119,9 +119,9 @@ def test_a_folded_patch_is_laid_flat_again():
     x[[405, 406]] = x[[406, 405]]                                # two neighbours have changed places
     x[700] += 0.05 * body.vertex_normals[700] + 0.05 * (body.vertices[721] - body.vertices[700]) / 0.02
     upright = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-    assert folds.inverted_triangles(body, x, upright).sum() >= 2
+    assert folds.find_inverted_triangles(body, x, upright).sum() >= 2
     laid = folds.unfold(body, x, upright)
-    assert not folds.inverted_triangles(body, laid, upright).any()
+    assert not folds.find_inverted_triangles(body, laid, upright).any()
     np.testing.assert_allclose(laid, body.vertices, atol=1e-12)
 
 

@@ -10,8 +10,8 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration import person as person_module
 from scanprep.registration.deformation_graph import build_graph, deform, motion_of
 from scanprep.registration.graph_fit import start_fit
-from scanprep.registration.limbs import beyond_people, find_exchanged_sides, frames, joint_angles, limb_doubts
-from scanprep.registration.matches import prepare
+from scanprep.registration.limbs import anatomical_angles, angle_excess, find_exchanged_sides, frames, limb_doubts
+from scanprep.registration.matches import prepare_problem
 from scanprep.registration.nonrigid import Registration, measure_fit
 from scanprep.registration.person import PersonParts, average_person, person_parts
 from scanprep.registration.repair import better, repair_limbs, roll_parts
@@ -40,7 +40,7 @@ def parts(person):
 def registration(person, scan, x):
     """What a registration with vertices (N, 3) says of itself."""
     fit = replace(start_fit(person.mesh, np.eye(4), 300), x=x, moved=0.0)
-    return measure_fit(prepare(person.mesh, scan), fit, scan)
+    return measure_fit(prepare_problem(person.mesh, scan), fit, scan)
 
 
 def with_rolled_skin(person, body, part, angle):
@@ -86,7 +86,7 @@ def test_a_rolled_limb_is_asked_to_roll_back(person, parts, part, angle):
     assert set(np.flatnonzero(first)) <= set(touched) & set(LIMBS)
     assert np.cos(first[part] + np.radians(angle)) > 0.2             # joints leave some play
     back = np.stack([R[p] @ rotations.exp(first[p] * frames()[p, 0]) for p in range(len(PARTS))])
-    assert beyond_people(joint_angles(R)).max() > 40 and beyond_people(joint_angles(back)).max() < 5       # degrees
+    assert angle_excess(anatomical_angles(R)).max() > 40 and angle_excess(anatomical_angles(back)).max() < 5   # degrees
 
 
 def test_where_no_joint_tells_a_doubted_limb_is_turned_by_quarters(person, parts):

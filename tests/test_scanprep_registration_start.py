@@ -15,12 +15,12 @@ from scanprep.geometry.target import target_of
 from scanprep.registration.folds import vertex_rotations
 from scanprep.registration.limb_ends import RigidFit, find_ends, rotate_ends
 from scanprep.registration.matches import (
-    Likeness,
+    MatchWeights,
     hint_pull,
     initial_transform,
     match_both_ways,
     path_anchors,
-    prepare,
+    prepare_problem,
     pull,
     tukey,
 )
@@ -102,7 +102,7 @@ def test_paths_cross_gaps_but_leave_crumbs_out():
 def test_a_body_upside_down_and_bent_is_placed_by_its_descriptors():
     mesh = body()
     x = moved(bent(mesh, *BEND))
-    T = initial_transform(prepare(mesh, Mesh(x, mesh.faces), (spread(mesh), x[spread(mesh)])))
+    T = initial_transform(prepare_problem(mesh, Mesh(x, mesh.faces), (spread(mesh), x[spread(mesh)])))
     R, _ = rotations.procrustes(mesh.vertices, x)
     assert np.linalg.norm(rotations.log(T[:3, :3] @ R.T)) < 0.2
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
@@ -178,7 +178,8 @@ def test_descriptors_alone_find_every_vertex_wherever_it_lies():
     mine = np.random.default_rng(0).normal(size=(len(x), 3))
     target = replace(target_of(Mesh(x, mesh.faces)), descriptors=mine)
     area = float(mesh.face_areas.sum())
-    wanted = match_both_ways(mesh, np.arange(len(x)), area, target, 1e3, 1.0, Likeness(positions=0.0, descriptors=1.0),
+    wanted = match_both_ways(mesh, np.arange(len(x)), area, target, 1e3, 1.0,
+                             MatchWeights(positions=0.0, descriptors=1.0),
                              mine)
     inner = ~target.border
     A, b = wanted.A[inner], wanted.b[inner]

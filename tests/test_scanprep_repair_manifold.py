@@ -3,11 +3,11 @@ import pytest
 from scanned_shapes import ball, bumpy, triangle_quality
 
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.remeshing import flip_edges, improve_triangles, smooth
+from scanprep.geometry.remeshing import flip_edges, improve_triangles, smooth_taubin
 from scanprep.geometry.surface import Surface
 from scanprep.repair.manifold import (
     drop_small_components,
-    orient,
+    orient_triangles,
     repair,
     split_vertices,
     weld,
@@ -91,9 +91,9 @@ def test_turned_triangles_are_turned_back(share):
 
 def test_a_piece_that_is_inside_out_keeps_its_side():
     inside_out = Mesh(ball(2).vertices, ball(2).faces[:, ::-1])
-    assert orient(inside_out) is inside_out
+    assert orient_triangles(inside_out) is inside_out
     both = joined(ball(3), inside_out)
-    assert np.array_equal(orient(both).faces, both.faces)
+    assert np.array_equal(orient_triangles(both).faces, both.faces)
 
 
 def moebius(count=60):
@@ -201,7 +201,7 @@ def test_smoothing_takes_noise_off_and_keeps_the_size():
     rng = np.random.default_rng(3)
     exact = ball(4)
     noisy = exact.with_vertices(exact.vertices * (1 + 0.01 * rng.normal(size=(len(exact.vertices), 1))))
-    even = smooth(noisy, 10)
+    even = smooth_taubin(noisy, 10)
     off = np.linalg.norm(even.vertices, axis=1) - 0.1
     assert off.std() < 0.4 * 0.001
     assert abs(off.mean()) < 2e-4

@@ -7,21 +7,21 @@ import pytest
 from scanprep.geometry.storage import StorageError
 from scanprep.skeleton.edit import (
     apply_edits,
+    find_part_number,
     merge_parts,
     move_joint,
-    part_number,
     read_edits,
     rename_part,
     split_part,
 )
-from scanprep.skeleton.labels import pieces
-from scanprep.synthetic.people import Person
+from scanprep.skeleton.labels import label_patches
+from scanprep.synthetic.people import SyntheticPerson
 from scanprep.synthetic.poses import find_pose
 
 
 @pytest.fixture(scope="module")
 def person():
-    return Person()
+    return SyntheticPerson()
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_a_part_is_split_across_its_length_into_connected_halves(person):
     top, end = faces(after, "thigh_top"), faces(after, "thigh_end")
     assert np.array_equal(top | end, faces(before, "thigh_left"))
     for half in (top, end):
-        assert len(np.unique(pieces(mesh.face_pairs, np.where(half, 0, 1))[half])) == 1
+        assert len(np.unique(label_patches(mesh.face_pairs, np.where(half, 0, 1))[half])) == 1
         assert mesh.face_areas[half].sum() > 0.3 * mesh.face_areas[faces(before, "thigh_left")].sum()
     assert parent(after, "thigh_top") == "pelvis" and parent(after, "thigh_end") == "thigh_top"
     assert parent(after, "shin_left") == "thigh_end"
@@ -172,10 +172,10 @@ def test_files_that_hold_no_edits_are_refused(tmp_path):
 
 
 def test_parts_are_known_by_name_and_number(person):
-    assert [part_number(person.skeleton, part) for part in ("head", 3, "3", np.int64(3))] == [3, 3, 3, 3]
+    assert [find_part_number(person.skeleton, part) for part in ("head", 3, "3", np.int64(3))] == [3, 3, 3, 3]
     for wrong in (-1, 16, True, "Head", None):
         with pytest.raises(ValueError, match="part: expected one of"):
-            part_number(person.skeleton, wrong)
+            find_part_number(person.skeleton, wrong)
 
 
 def test_a_skeleton_of_another_template_is_refused(person):

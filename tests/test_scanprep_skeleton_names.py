@@ -10,7 +10,7 @@ from scanprep.skeleton.names import name_parts
 from scanprep.skeleton.roles import find_roles, in_words, joint_in_words, limb_parts, missing_joints, part_name
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import BodyShape, Person
+from scanprep.synthetic.people import BodyShape, SyntheticPerson
 
 SIDES = "left", "right"
 
@@ -25,13 +25,13 @@ def named(mesh, skeleton):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person()
+    return SyntheticPerson()
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_people_of_any_build_and_direction_are_named(seed):
     rng = np.random.default_rng(seed)
-    body = Person(BodyShape.random(rng, sex=("male", "female")[seed % 2]))
+    body = SyntheticPerson(BodyShape.random(rng, sex=("male", "female")[seed % 2]))
     R, t = rotations.exp(rng.normal(0, 2, 3)), rng.normal(0, 3, 3)
     mesh = Mesh(body.mesh.vertices @ R.T + t, body.mesh.faces)
     skeleton = Skeleton(body.part_of_face, body.parents, body.joints @ R.T + t)

@@ -15,7 +15,7 @@ from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.sides import Sides, cover, mirror_pairs
 from scanprep.skeleton.symmetry import Symmetry, find_symmetry, mirror_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
-from scanprep.synthetic.people import Person, mirror_pose
+from scanprep.synthetic.people import SyntheticPerson, mirror_synthetic_pose
 
 CONFIG = SkeletonConfig(restarts=1, patches=120, start=20)
 
@@ -50,7 +50,7 @@ def adjusted_rand(a, b):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_plane_of_a_person_is_found_in_any_direction_and_order(seed):
-    rng, body = np.random.default_rng(seed), Person()
+    rng, body = np.random.default_rng(seed), SyntheticPerson()
     R, old = rotations.exp(rng.normal(0, 2, 3)), rng.permutation(len(body.mesh.faces))
     symmetry = find_symmetry(Mesh(body.mesh.vertices @ R.T + rng.normal(0, 3, 3), body.mesh.faces[old]))
     assert symmetry.holds and symmetry.distance < 0.005 and symmetry.returns > 0.99
@@ -60,7 +60,7 @@ def test_the_plane_of_a_person_is_found_in_any_direction_and_order(seed):
 
 
 def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
-    body, bent = Person(), np.zeros((16, 3))
+    body, bent = SyntheticPerson(), np.zeros((16, 3))
     bent[[4, 5, 10]] = [[0, -1.5, 0.4], [0, 0.8, 0.8], [-1.4, 0, 0]]
     crooked = body.mesh.with_vertices(body.in_pose(bent))
     alone = find_symmetry(crooked)
@@ -71,19 +71,19 @@ def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
 
 @pytest.mark.parametrize("crooked", [False, True])
 def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
-    body, bent = Person(), np.zeros((16, 3))
+    body, bent = SyntheticPerson(), np.zeros((16, 3))
     bent[[4, 5, 10]] = [[0, -1.0, 0.4], [0, 0.8, 0.8], [-1.2, 0, 0]]
     poses = np.stack([body.mesh.vertices, body.in_pose(bent)])
     template = body.mesh.with_vertices(poses[1]) if crooked else body.mesh
     found = mirror_poses(template, poses, find_symmetry(template, poses))
-    wanted = np.stack([body.mesh.vertices, body.in_pose(mirror_pose(bent))])
+    wanted = np.stack([body.mesh.vertices, body.in_pose(mirror_synthetic_pose(bent))])
     for one, other in zip(found, wanted, strict=True):
         R, t = rotations.procrustes(one, other)
         assert np.linalg.norm(one @ R.T + t - other, axis=1).max() < 0.01
 
 
 def test_parts_that_moved_on_one_side_alone_are_found_on_both():
-    body, rng = Person(), np.random.default_rng(1)
+    body, rng = SyntheticPerson(), np.random.default_rng(1)
     bent = np.zeros((5, 16, 3))
     for part in ("forearm_left", "thigh_right", "head", "upper_arm_left"):
         bent[1:, body.names.index(part)] = rng.normal(0, 0.5, (4, 3))

@@ -14,12 +14,12 @@ from model.measurement.measure import measure
 from model.measurement.survey import survey
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.registration.limbs import beyond_people, joint_angles
+from scanprep.registration.limbs import anatomical_angles, angle_excess
 from scanprep.synthetic import people, topology
 from scanprep.synthetic.data_set import subject_pose
 from scanprep.synthetic.landmarks import landmarks
 from scanprep.synthetic.muscles import COLUMNS, masks
-from scanprep.synthetic.people import NAMED_POSES, PARENTS, PARTS, BodyShape, Person
+from scanprep.synthetic.people import NAMED_POSES, PARENTS, PARTS, BodyShape, SyntheticPerson
 from scanprep.synthetic.population import STORED, population
 
 ROOT = Path(__file__).parents[1]
@@ -30,12 +30,12 @@ OTHERS = [BodyShape.like("female", stature=1.52, weight=2.0), BodyShape.like("ma
 
 
 @pytest.fixture(scope="module")
-def bodies() -> list[Person]:
-    return [Person(shape) for shape in (MAN, WOMAN, *OTHERS)]
+def bodies() -> list[SyntheticPerson]:
+    return [SyntheticPerson(shape) for shape in (MAN, WOMAN, *OTHERS)]
 
 
 @pytest.fixture(scope="module")
-def man(bodies: list[Person]) -> Person:
+def man(bodies: list[SyntheticPerson]) -> SyntheticPerson:
     return bodies[0]
 
 
@@ -57,7 +57,7 @@ def test_everybody_is_one_closed_outward_surface(bodies):
 
 
 def test_all_have_one_topology_and_its_file_is_small(bodies):
-    assert all(np.array_equal(person.mesh.faces, topology.load().mesh.faces) for person in bodies)
+    assert all(np.array_equal(person.mesh.faces, topology.load_topology().mesh.faces) for person in bodies)
     assert STORED.stat().st_size < 5e6
 
 
@@ -75,7 +75,7 @@ def test_the_file_is_what_the_recipe_makes():
 def test_people_of_a_sex_measure_as_those_of_the_survey(sex):
     """Means of measures, their spread and correlations, of 64 whose betas have exactly the moments of the sex."""
     people_, (mean, covariance), table = population(), population().moments[sex], survey(sex)
-    tapes = find_tapes(topology.load().mesh, landmarks())
+    tapes = find_tapes(topology.load_topology().mesh, landmarks())
     z = np.random.default_rng(3).standard_normal((32, len(mean)))
     z = np.vstack([z, -z]) @ np.linalg.inv(np.linalg.cholesky(z.T @ z / len(z))).T
     drawn = [people_.rows(b)[:len(people_.weights)] for b in mean + z @ np.linalg.cholesky(covariance).T]
@@ -118,12 +118,12 @@ def test_mass_is_that_of_the_survey(bodies):
     for person, sex in zip(bodies[:2], ("male", "female"), strict=True):
         table = survey(sex)
         assert 985 * person.mesh.volume == pytest.approx(table.mean[table.names.index("weight")], rel=0.03)
-    heavier = Person(BodyShape.like(weight=1.0))
+    heavier = SyntheticPerson(BodyShape.like(weight=1.0))
     assert 6 < 985 * (heavier.mesh.volume - bodies[0].mesh.volume) < 18
 
 
 def test_left_and_right_are_mirror_images(bodies):
-    twin = topology.load().mirror
+    twin = topology.load_topology().mirror
     assert np.array_equal(twin[twin], np.arange(len(twin)))
     for person in bodies:
         v = person.mesh.vertices
@@ -132,9 +132,9 @@ def test_left_and_right_are_mirror_images(bodies):
 
 
 def test_mirrored_pose_gives_the_mirrored_body(man):
-    twin = topology.load().mirror
+    twin = topology.load_topology().mirror
     pose = people.find_pose("throw_right")
-    assert np.abs(man.posed(people.mirror_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 1e-9
+    assert np.abs(man.posed(people.mirror_synthetic_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 1e-9
 
 
 def test_joints_lie_inside_the_body(bodies):
@@ -240,10 +240,10 @@ def test_posing_is_not_linear_blend_skinning(man):
 
 def test_muscles_bulge_with_strength():
     """A bent elbow raises the biceps in the frame of the upper arm, more on a man."""
-    bent = people.compose(left_arm={"elbow": 95})
+    bent = people.compose_pose(left_arm={"elbow": 95})
     rises = []
     for sex in ("female", "male"):
-        person = Person(BodyShape(sex, tuple(population().moments["male"][0])))
+        person = SyntheticPerson(BodyShape(sex, tuple(population().moments["male"][0])))
         biceps = masks()[:, COLUMNS["biceps", "l"]].argmax()
         rest = person.mesh.vertices[biceps] - person.joints[4]
         R = person.part_rotations(bent)[4]
@@ -278,7 +278,7 @@ def test_poses_are_many_and_unknown_ones_refused():
     with pytest.raises(ValueError, match="no pose 'cartwheel'"):
         people.find_pose("cartwheel")
     with pytest.raises(ValueError, match="pose: expected finite"):
-        Person().in_pose(np.zeros((15, 3)))
+        SyntheticPerson().in_pose(np.zeros((15, 3)))
 
 
 def test_random_poses_are_repeatable_varied_and_scale_with_spread():
@@ -290,19 +290,19 @@ def test_random_poses_are_repeatable_varied_and_scale_with_spread():
 
 
 def test_walk_goes_ahead_with_a_foot_on_the_floor(man):
-    poses, trans = people.walk(44, rate=20.0)
+    poses, trans = people.synthesise_walk(44, rate=20.0)
     assert poses.shape == (44, 16, 3) and trans.shape == (44, 3)
     assert 0.8 < -(trans[-1, 1] - trans[0, 1]) / (43 / 20) < 2.0            # metres a second, towards -y
     assert (-np.diff(trans[:, 1]) * 20).min() > 0.6, "nobody steps back between the feet"
     lowest = np.array([(man.posed(p, t))[:, 2].min() for p, t in zip(poses[::4], trans[::4], strict=True)])
     assert np.abs(lowest).max() < 0.03
-    once, _ = people.walk(1, rate=20.0)
-    again, _ = people.walk(23, rate=20.0)
+    once, _ = people.synthesise_walk(1, rate=20.0)
+    again, _ = people.synthesise_walk(23, rate=20.0)
     assert np.abs(again[22] - once[0]).max() < 1e-9                          # a cycle is 1.1 s
 
 
 def test_landmarks_and_markers(bodies):
-    twin = topology.load().mirror
+    twin = topology.load_topology().mirror
     assert 36 <= len(people.LANDMARKS) <= 48 and len(people.MARKERS) == 41
     for table in (people.LANDMARKS, people.MARKERS):
         assert len(set(table.values())) == len(table)
@@ -320,4 +320,4 @@ def test_the_poses_of_the_demonstration_are_ones_that_people_do(man):
     """No limb lies so that its registration would be doubted, whatever the seed."""
     poses = [subject_pose(k, np.random.default_rng([seed, 1, k]))[1] for seed in range(6) for k in range(1, 12)]
     bodies = np.stack([man.posed(pose) for pose in poses])
-    assert not beyond_people(joint_angles(man.skeleton.fit_rotations(man.mesh, bodies))).any()
+    assert not angle_excess(anatomical_angles(man.skeleton.fit_rotations(man.mesh, bodies))).any()

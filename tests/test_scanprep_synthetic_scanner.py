@@ -10,7 +10,7 @@ from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.synthetic import data_set, people, scanner
-from scanprep.synthetic.people import BodyShape, Person
+from scanprep.synthetic.people import BodyShape, SyntheticPerson
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 COARSE = ScannerConfig(resolution=0.014)
@@ -18,7 +18,7 @@ COARSE = ScannerConfig(resolution=0.014)
 
 @pytest.fixture(scope="module")
 def body() -> Mesh:
-    return Person(BodyShape()).mesh
+    return SyntheticPerson(BodyShape()).mesh
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_synthetic_scans_are_complete_repeatable_and_resumable(tmp_path):
         assert sum(len(v.points) for v in views) == len(mesh.vertices)
         assert Surface(truth.mesh).closest(mesh.vertices).distances.mean() < 0.003
         assert truth.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
-        person = Person(truth.shape)
+        person = SyntheticPerson(truth.shape)
         assert np.abs(person.in_pose(truth.pose, truth.trans) - truth.vertices).max() < 1e-9
         clicked = json.loads(entry.landmarks.read_text())
         errors = np.array([np.linalg.norm(point - truth.vertices[people.LANDMARKS[name]]) for name,

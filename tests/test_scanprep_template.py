@@ -18,14 +18,14 @@ from scanprep.geometry.surface import Surface
 from scanprep.surfaces.cloud import mesh_of_cloud, mesh_of_view, spacing_of
 from scanprep.surfaces.template import carry_landmarks, share_on_left, template_of_scan, views_without_cameras
 from scanprep.synthetic.landmarks import landmarks
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 NAME = "2024.05.01 anna"
 
 
 @pytest.fixture(scope="module")
 def body():
-    return Person().mesh
+    return SyntheticPerson().mesh
 
 
 def off(mesh, truth):

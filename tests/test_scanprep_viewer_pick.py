@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import sphere
 from scanprep.pipeline.pick import pick_landmarks
 from scanprep.synthetic.landmarks import landmarks
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 from scanprep.viewer.clicked import KEPT, Clicked, camera_like, camera_of, predict_landmarks
 from scanprep.viewer.landmark_names import CAESAR, TEN, next_name, read_names
 from scanprep.viewer.messages import Message
@@ -38,7 +38,7 @@ def on_page(page, place):
 
 @pytest.fixture(scope="module")
 def person():
-    return Person()
+    return SyntheticPerson()
 
 
 @pytest.fixture

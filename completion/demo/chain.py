@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
-from scanprep.batch.room import Room, inside
+from scanprep.batch.room import TaskContext, substeps
 from scanprep.batch.workspace import KeptSteps, Task, Workspace
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage, tables
@@ -38,7 +38,7 @@ from scanprep.synthetic.data_set import (
     synthetic_scan,
     write_scan,
 )
-from scanprep.synthetic.people import MARKERS, Person, random_pose, walk
+from scanprep.synthetic.people import MARKERS, SyntheticPerson, random_pose, synthesise_walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 from scanprep.threads import one_thread
 
@@ -101,7 +101,7 @@ class ScanPerson:
     seed: int
     scanner: ScannerConfig
 
-    def __call__(self, which: tuple[int, bool], room: Room) -> SyntheticScan:
+    def __call__(self, which: tuple[int, bool], room: TaskContext) -> SyntheticScan:
         found = synthetic_scan(room.folder / "scans", self.seed, *which, self.scanner)
         return replace(found, folder=Path("scans"))
 
@@ -214,7 +214,7 @@ class Demo:
 
         def make(folder: Path) -> None:
             with self.bar("learning the model") as progress:
-                model = learn_scape(*bodies, self.config.learn, progress, inside(KeptSteps(self.space), "model"))
+                model = learn_scape(*bodies, self.config.learn, progress, substeps(KeptSteps(self.space), "model"))
             replace(model, info={**model.info, "landmarks": self.template_landmarks}).save(folder / MODEL)
 
         self.space.step("model", (bodies, self.config.learn, self.template_landmarks), make)
@@ -235,9 +235,9 @@ class Demo:
                 for name, vertices in zip(registered.names, registered.vertices(), strict=True)}
 
     @cached_property
-    def person(self) -> Person:
+    def person(self) -> SyntheticPerson:
         """The true subject."""
-        return Person(SUBJECT)
+        return SyntheticPerson(SUBJECT)
 
     @cached_property
     def held_out(self) -> list[GroundTruth]:
@@ -283,7 +283,7 @@ class Demo:
     @cached_property
     def walk(self) -> tuple[MarkerSequence, MarkerLayout, np.ndarray]:
         """Markers of a walking subject, where they sit on the template, and the true vertices (T, N, 3)."""
-        poses, trans = walk(self.config.frames, self.config.rate)
+        poses, trans = synthesise_walk(self.config.frames, self.config.rate)
         bodies = np.stack([self.person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
         template, config = self.template, self.config
 

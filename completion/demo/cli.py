@@ -28,14 +28,14 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False,
         full: A large run: more scans, finer.
         seed: Another seed scans other people.
     """
-    from .figures import figures, judge
+    from .figures import judge_demo, measure_demo
     from .page import write_page
 
     if quick and full:
         raise UsageError("--quick, --full: expected at most one of the two")
     run = Demo(space, replace(QUICK if quick else FULL if full else DemoConfig(), seed=seed), bar)
-    metrics = figures(run)
-    judgement = judge(run, metrics)
+    metrics = measure_demo(run)
+    judgement = judge_demo(run, metrics)
     with bar("drawing the report") as progress, space.staging("page") as staged:
         write_page(run, metrics, judgement, progress, staged.folder)
     return Outcome(out, metrics, {"demo": run.config}, judgement=judgement,

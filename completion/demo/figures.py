@@ -22,7 +22,7 @@ NAMED = ("head", "hand_left", "hand_right", "foot_left", "foot_right")     # wit
 LIMITS = {"model": 12.0, "completion, hidden": 25.0, "completion, seen": 3.0, "animation": 15.0, "registration": 1.5}
 
 
-def figures(demo: Demo) -> list[Metric]:
+def measure_demo(demo: Demo) -> list[Metric]:
     """Run what has not been run, and measure it against the ground truth: errors on what was not learned come first."""
     template, at = demo.template, demo.truth_map
     # poses that the model never saw
@@ -61,7 +61,7 @@ def figures(demo: Demo) -> list[Metric]:
                    MM * float(joint_errors(skeleton, demo.rest).mean()), "mm")]
 
 
-def judge(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
+def judge_demo(demo: Demo, metrics: Sequence[Metric]) -> Judgement:
     """What each result says of itself, whether it came near the truth, and whether parts have the names of exports."""
     folder = demo.folder / "set"
     set_of_scans = judge_whole(judge_set(folder), RegisteredSet.load(folder).skeleton)

@@ -20,7 +20,7 @@ from scanprep.geometry.files import list_meshes, name_of, read_mesh
 from scanprep.geometry.landmark_names import translate_landmarks
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import beyond_people
+from scanprep.judgement import implausible_body
 from scanprep.registration.person import find_landmarks
 from scanprep.words import number_of
 
@@ -125,7 +125,7 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
     ten were clicked, the average person finds them.
     """
     from scanprep.synthetic.landmarks import landmarks
-    from scanprep.synthetic.topology import load
+    from scanprep.synthetic.topology import load_topology
 
     # the template, and the landmarks that somebody gave it
     first = bodies[0] if bodies else None
@@ -143,7 +143,7 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
         known = dict(model.info["landmarks"])
     elif beside is not None:
         known = read_landmark_vertices(beside, template)
-    elif np.array_equal(template.faces, load().mesh.faces):
+    elif np.array_equal(template.faces, load_topology().mesh.faces):
         known = landmarks()
 
     # those that tapes begin at besides
@@ -154,7 +154,7 @@ def landmarks_of(given: Path | None, bodies: Sequence[Body], model: BodyModel | 
         found = find_landmarks(template, known, progress)
     more = {name: found[name] for name in lacking if name in found}
     if not more and not known:
-        size = beyond_people(*stature_and_volume(template)).reasons
+        size = implausible_body(*stature_and_volume(template)).reasons
         raise ValueError("".join(f"{reason}; " for reason in size[:1]) + "measuring begins at landmarks of the "
                          "template, and there are none, nor does the average person come to lie on it; name a file of "
                          "them with --landmarks (scape pick makes one), or a model that keeps them with -m")

@@ -25,7 +25,7 @@ from scanprep.geometry.files import write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import write_json
 from scanprep.geometry.tables import write_table
-from scanprep.judgement import Judgement, beyond_people
+from scanprep.judgement import Judgement, implausible_body
 from scanprep.words import number_of
 
 from ..cli import ModelOrNone, read_model
@@ -129,7 +129,7 @@ def judge_bodies(names: Sequence[str], found: Sequence[Measurements], bodies: Se
     absurd, doubts = list[str](), list[str]()
     for name, mine, body in zip(names, found, bodies, strict=True):
         if "stature" in mine.values:
-            known = beyond_people(mine.values["stature"], stature_and_volume(body)[1])
+            known = implausible_body(mine.values["stature"], stature_and_volume(body)[1])
             absurd += [f"{name}: {reason}" for reason in known.problems]
             doubts += [f"{name}: {reason}" for reason in known.doubts]
         out = [word for word, value in mine.values.items() if word != "weight" and      # judged by its volume above

@@ -50,7 +50,7 @@ class Joint:
 
 
 @dataclass(frozen=True, eq=False)
-class Anatomy:
+class SegmentAxes:
     """The segments of a person at rest: the part that carries each and the axes (3, 3), columns ahead, up, right."""
 
     axes: np.ndarray                 # of the whole body
@@ -89,7 +89,7 @@ class JointAngles:
     guessed: tuple[str, ...] = ()    # angles of joints that the markers do not tell of, which are left out
 
 
-def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> Anatomy:
+def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> SegmentAxes:
     """The segments of a person with joints (J, 3) at rest.
 
     Raises
@@ -135,7 +135,7 @@ def anatomy(names: tuple[str, ...], parents: np.ndarray, joints: np.ndarray) -> 
                 frame = frame @ _turn(1, np.pi / 2 if side == "r" else -np.pi / 2)
         if frame is not None:
             parts[f"{name}_{side}"], frames[f"{name}_{side}"] = begin, frame
-    return Anatomy(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
+    return SegmentAxes(body, parts, frames, tuple(roles[r] for r in ("l_hip", "r_hip") if r in roles))
 
 
 def _long_axes(long: np.ndarray, body: np.ndarray, by_front: bool) -> np.ndarray:
@@ -177,7 +177,7 @@ def rest_joints(subject: Subject) -> np.ndarray:
     return subject.joints(np.zeros((len(subject.skeleton.parents), 3)))
 
 
-def angles_of(found: Anatomy, ground: np.ndarray, R: np.ndarray) -> np.ndarray:
+def angles_of(found: SegmentAxes, ground: np.ndarray, R: np.ndarray) -> np.ndarray:
     """(T, K) degrees, of part rotations (T, J, 3, 3): those of the joints one after the other, three each."""
     columns = []
     for joint in found.joints():
@@ -188,7 +188,7 @@ def angles_of(found: Anatomy, ground: np.ndarray, R: np.ndarray) -> np.ndarray:
     return np.degrees(np.concatenate(columns, axis=1))
 
 
-def _axes_of(found: Anatomy, ground: np.ndarray, R: np.ndarray, segment: str) -> np.ndarray:
+def _axes_of(found: SegmentAxes, ground: np.ndarray, R: np.ndarray, segment: str) -> np.ndarray:
     return np.broadcast_to(ground, R[:, 0].shape) if segment == "ground" else \
         R[:, found.parts[segment]] @ found.frames[segment]
 

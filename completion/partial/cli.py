@@ -19,7 +19,7 @@ from ..cli import ModelOrNone, body_of, marks_of_template, read_model
 from .colors import ColorConfig
 from .folder import FolderCall
 from .settings import CompletionConfig
-from .work import Inputs, Work
+from .work import CompletionInputs, CompletionTask
 
 ScansArg = Annotated[tuple[Path, ...], Place("SCAN [SCAN ...]")]
 AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
@@ -77,9 +77,10 @@ def complete_scan(scans: ScansArg = (), *, output: Output, model: ModelOrNone = 
     if interactive:
         return _in_browser(scans, output, model, subject, template_landmarks, unit, config)
     loaded, name = read_model(model)
-    inputs = Inputs(scans, landmarks or landmarks_beside(scans[0]), mask)
+    inputs = CompletionInputs(scans, landmarks or landmarks_beside(scans[0]), mask)
     marks = {} if inputs.landmarks is None else marks_of_template(loaded, template_landmarks, name)
-    work = Work(body_of(loaded, subject, unit), name, marks, config, unit, ColorConfig(fill=config.fill_colors))
+    work = CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit,
+                          ColorConfig(fill=config.fill_colors))
     if inputs.landmarks is None:
         say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
     return do_one("completing", space, work, Task("completion", inputs), {"complete": config, "model": name},
@@ -116,7 +117,8 @@ def _in_browser(scans: tuple[Path, ...], output: Path, model: Path | None, subje
     labels = [label for path in scans for label in labels_of(path)]
     scans = tuple(path for path in scans if not is_recording(path))
     files = [path for one in scans for path in ([task.scan for task in find_scans(one)] if one.is_dir() else [one])]
-    app = CompleteApp(loaded, Work(body_of(loaded, subject, unit), name, marks, config, unit), files, output, labels)
+    app = CompleteApp(loaded, CompletionTask(body_of(loaded, subject, unit), name, marks, config, unit), files, output,
+                      labels)
     serve(app)
     judged = {scan.name: app.made[scan].completion.judgement for scan in app.saved}
     rows = [Metric("bodies saved", len(judged)), *(Metric(name, one.verdict) for name, one in judged.items())]

@@ -37,7 +37,7 @@ def on_scan(done: Completion, marks: Mapping[str, int], scan: Clickable) -> dict
             for name, vertex in marks.items() if done.seen[vertex]}
 
 
-def doubts(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> str:
+def landmark_doubts(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> str:
     """What landmarks at (3,), metres, are worth beside those of a body that was found without them."""
     wrong = wrong_ones(places, found)
     if not wrong:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from model.fitting.free_space import find_camera
-from model.fitting.scan import View, as_views, check_viewpoints, in_metres, prepare_scan
+from model.fitting.scan import View, as_views, check_viewpoints, prepare_scan, scale_view
 from scanprep.geometry import sparse
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
@@ -128,7 +128,7 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
 def views_with_colors(scan: View | Sequence[View], viewpoint: object = None, metres: float = 1.0,
                       textures: Sequence[Texture | None] = ()) -> list[ColoredView]:
     """The views that have colours, or a texture."""
-    views = [in_metres(view, metres) for view in as_views(scan)]
+    views = [scale_view(view, metres) for view in as_views(scan)]
     cameras = check_viewpoints(viewpoint, len(views), metres)
     found = []
     for i, view in enumerate(views):

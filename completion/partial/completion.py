@@ -31,7 +31,7 @@ from scanprep.threads import one_thread
 from .alternation import turns_of
 from .confidence import distance_to_seen, estimate_error, posterior_error, probability_within
 from .free_surface import distance_to, free_surface
-from .inputs import in_metres
+from .inputs import prepare_in_metres
 from .scale import ScaledBody
 from .settings import CompletionConfig
 
@@ -157,7 +157,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     config, tell = config or CompletionConfig(), progress or (lambda done, total: None)
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
-    given = in_metres(person, scan, landmarks, masked, config)
+    given = prepare_in_metres(person, scan, landmarks, masked, config)
     sized = ScaledBody(person) if config.free_scale else person
     fit = scan_fit(sized, given.cloud, given.vertices, given.points, config)
     few = fit.few()
@@ -187,7 +187,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
                       probability_within(error, config.tolerance), soles=standing.beyond if standing else None)
     problems = [problem for problem in (completion_problem(done, given.cloud.points, config.free_scale),
                                         find_contortion(fit, solved.x, float(seen.mean()), len(off) > 0)) if problem]
-    found = doubts(fit, solved.x, error, seen) + find_unexplained(fit, done.explained) + ambiguous(fit, solved.x, rival)
+    found = completion_doubts(fit, solved.x, error,
+                              seen) + find_unexplained(fit, done.explained) + ambiguous(fit, solved.x, rival)
     found += beyond_closed(scan, completed) if isinstance(scan, Mesh) and not config.free_scale else []
     judgement = Judgement.of(problems, found)
     if isinstance(body, BodyModel):
@@ -210,7 +211,7 @@ def find_contortion(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> s
             f"known to be held: {cause}, or something else than a person?")
 
 
-def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
+def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
     """Why the body of unknowns (P,) is to be looked at before it is used: what is not known of it, and what is wrong.
 
     `error` (N,), metres, as `estimate_error`; `seen` (N,) bool, the vertices with data. What is beyond the border of a

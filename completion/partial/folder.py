@@ -21,7 +21,7 @@ from scanprep.pipeline.scans import find_scans
 from ..cli import body_of, marks_of_template, read_model
 from .colors import ColorConfig
 from .settings import CompletionConfig
-from .work import EXPLAINED, MEANS, Inputs, Work
+from .work import EXPLAINED, MEANS, CompletionInputs, CompletionTask
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,16 @@ class FolderCall(KeptCall):
             raise UsageError("--mask: expected a folder of masks for a folder of scans, there is none at "
                              f"{self.masks}")
         masks = {name_of(path): path for path in sorted(self.masks.iterdir(), reverse=True)} if self.masks else {}
-        return {scan.name: Task(scan.name, Inputs((scan.scan,), scan.landmarks, tuple(
+        return {scan.name: Task(scan.name, CompletionInputs((scan.scan,), scan.landmarks, tuple(
             masks[name] for name in [scan.name] if name in masks)), scan.name)
                 for scan in find_scans(self.scans, self.landmarks)}
 
-    def work(self, wanted: bool) -> tuple[BodyModel, Work]:
+    def work(self, wanted: bool) -> tuple[BodyModel, CompletionTask]:
         """The model, and the work on each scan; `wanted`: landmarks of the template must be known."""
         loaded, name = read_model(self.model)
         marks = marks_of_template(loaded, self.template_landmarks, name, wanted)
-        return loaded, Work(body_of(loaded, self.subject, self.unit), name, marks, self.config, self.unit,
-                            ColorConfig(fill=self.config.fill_colors), f"scape complete {self.scans}")
+        return loaded, CompletionTask(body_of(loaded, self.subject, self.unit), name, marks, self.config, self.unit,
+                                      ColorConfig(fill=self.config.fill_colors), f"scape complete {self.scans}")
 
     def carry_out(self, space: Workspace, workers: Workers) -> Outcome:
         """Complete the scans of the folder."""

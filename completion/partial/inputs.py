@@ -31,8 +31,8 @@ class Given:
                        metres=factor * self.metres)
 
 
-def in_metres(body: FixedBody, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None,
-              masked: np.ndarray | None, config: CompletionConfig) -> Given:
+def prepare_in_metres(body: FixedBody, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None,
+                      masked: np.ndarray | None, config: CompletionConfig) -> Given:
     """A scan made ready for matching; of unknown scale, as nearly in metres as can be told before the fit."""
     metres = 1.0
     if isinstance(scan, DepthPicture):

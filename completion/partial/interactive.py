@@ -28,10 +28,20 @@ from scanprep.viewer.messages import Message
 from scanprep.viewer.pick import PickApp
 from scanprep.viewer.surface_clicks import Clickable
 
-from .clicked_landmarks import doubts, far_apart_first, helpful, on_scan, pairs_of
+from .clicked_landmarks import far_apart_first, helpful, landmark_doubts, on_scan, pairs_of
 from .completion import Completion, complete
 from .report import completion_panes
-from .work import Inputs, ScanFiles, Work, figures, person_in, read_masks, read_picture, read_views, write_results
+from .work import (
+    CompletionInputs,
+    CompletionTask,
+    ScanFiles,
+    completion_figures,
+    person_in,
+    read_masks,
+    read_picture,
+    read_scan_views,
+    write_results,
+)
 from .worn import extra_markers, labels_of, write_worn
 
 ENDING = ".landmarks.json"           # of landmark files
@@ -71,7 +81,7 @@ class CompleteApp(PickApp):
 
     name, title = "complete", "Complete a scan"
 
-    def __init__(self, model: BodyModel, work: Work, scans: Sequence[Path], output: Path,
+    def __init__(self, model: BodyModel, work: CompletionTask, scans: Sequence[Path], output: Path,
                  labels: Sequence[str] = (), dropped: Dropped | None = None) -> None:
         self.model, self.work, self.output = model, work, output
         self.dropped = dropped or Dropped()
@@ -95,7 +105,7 @@ class CompleteApp(PickApp):
     def _load_input(self, path: Path) -> ScanFiles | DepthPicture:
         """What is in a file, read when it is first wanted."""
         if path not in self._read:
-            self._read[path] = read_picture([path], self.work.unit) or read_views([path], self.work.unit)
+            self._read[path] = read_picture([path], self.work.unit) or read_scan_views([path], self.work.unit)
         return self._read[path]
 
     def _surface(self, path: Path) -> Clickable | None:
@@ -106,8 +116,8 @@ class CompleteApp(PickApp):
         view = given.views[0]
         return Clickable(view if isinstance(view, Mesh) else view.points)
 
-    def _inputs(self, scan: Clicked) -> Inputs:
-        return Inputs((scan.path,), scan.file)
+    def _inputs(self, scan: Clicked) -> CompletionInputs:
+        return CompletionInputs((scan.path,), scan.file)
 
     def _files(self, path: Path, pairs: tuple[np.ndarray, np.ndarray] | None) -> ScanFiles:
         """The views of a scan; of a depth picture the person in it, whom landmarks tell from others."""
@@ -154,7 +164,7 @@ class CompleteApp(PickApp):
     def _figures(self, made: Made) -> list[Metric]:
         assert self.scan is not None
         pairs = pairs_of(made.places, self.work.marks)
-        return figures(self.work, self._inputs(self.scan), made.completion, pairs, made.masked)
+        return completion_figures(self.work, self._inputs(self.scan), made.completion, pairs, made.masked)
 
     def _is_outdated(self, made: Made) -> bool:
         """Whether landmarks, or anything else that it was made from, were changed since."""
@@ -265,8 +275,8 @@ class CompleteApp(PickApp):
                 return "the body is not found without landmarks either"
             with self._lock:
                 scan.predicted = on_scan(done, self.work.marks, scan.body)
-            told = doubts({name: done.scale * place for name, place in places.items()},
-                          {name: done.completed.vertices[vertex] for name, vertex in self.work.marks.items()})
+            told = landmark_doubts({name: done.scale * place for name, place in places.items()},
+                                   {name: done.completed.vertices[vertex] for name, vertex in self.work.marks.items()})
             return told if done.judgement.verdict == "good" else f"{told}; but that body is itself doubtful"
 
         self.beside("finding the body without the landmarks", work, send, "it could not be found")

@@ -25,7 +25,7 @@ from .clicked_landmarks import on_scan, pairs_of
 from .completion import Completion, load_completion
 from .folder import FolderCall
 from .interactive import ENDING, CompleteApp, Made
-from .work import Inputs
+from .work import CompletionInputs
 
 
 def mend_completions(folder: Path) -> CompletionsApp:
@@ -66,7 +66,7 @@ class CompletionsApp(ResultsApp, CompleteApp):
         except ValueError:
             return Clicked(path, found, unit)
 
-    def _inputs(self, scan: Clicked) -> Inputs:
+    def _inputs(self, scan: Clicked) -> CompletionInputs:
         """As the command would find them now."""
         return self.tasks[self._name_of[scan.path]].given
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model.fitting.scan import View, all_points, as_views, in_metres
+from model.fitting.scan import View, all_points, as_views, scale_view
 from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
@@ -16,7 +16,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.pictures.camera import Camera, stance
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots, Heat, Shape, Solid, render, side_by_side
+from scanprep.pictures.shading import Dots, Heat, Shape, Solid, contact_sheet, render
 from scanprep.pictures.sheets import webp_bytes
 
 from .completion import Completion
@@ -44,8 +44,8 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
     aspect = max(view.width / view.height for view in views)
     height = max(1, min(HEIGHT, round(2 * HEIGHT / aspect)))
     width = int(height * aspect) + 10
-    return side_by_side([render(shape, view, width, height) for shape, view, _ in shown],
-                        [label for _, _, label in shown])
+    return contact_sheet([render(shape, view, width, height) for shape, view, _ in shown],
+                         [label for _, _, label in shown])
 
 
 def sides(completion: Completion, template: Mesh) -> list[Camera]:
@@ -65,7 +65,7 @@ def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, m
     """What a picture shows of a scan: its views, each in its own shade, and what is masked."""
     out: list[Solid | Dots] = []
     start = 0
-    for number, view in enumerate(in_metres(view, metres) for view in as_views(scan)):
+    for number, view in enumerate(scale_view(view, metres) for view in as_views(scan)):
         points = view.vertices if isinstance(view, Mesh) else view.points if isinstance(view, PointCloud) \
             else view[:, :3]
         hidden = np.zeros(len(points), dtype=bool) if masked is None else masked[start:start + len(points)]

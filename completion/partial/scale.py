@@ -11,7 +11,7 @@ from model.fitting import energy
 from model.fitting.bodies import FixedBody, Follow, NearPoints
 from model.fitting.energy import MovingPoints
 from model.fitting.named_points import anneal
-from model.fitting.scan import spread
+from model.fitting.scan import spread_points
 from model.fitting.starts import all_rotations
 from model.priors import gaussian_prior, typical_poses
 from scanprep.geometry import rotations
@@ -103,10 +103,10 @@ def rough_scale(body: FixedBody, points: np.ndarray) -> float:
     Poses the body was learned from are looked at from all sides; those that extend in the scan's proportions, long,
     wide and deep, say how large it is.
     """
-    some = points[spread(points, POINTS)]
+    some = points[spread_points(points, POINTS)]
     size, form = _extent(some[None])
     poses = _usual_poses(body)
-    ids = spread(body.template.vertices, POINTS)
+    ids = spread_points(body.template.vertices, POINTS)
     places = body.subject.points(ids).evaluate(poses, np.zeros((len(poses), 3)))
     part = body.skeleton.part_of_vertex(body.template)[ids]
     R = body.skeleton.part_rotations(poses)[:, part]
@@ -159,7 +159,8 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
     weights = np.full(len(points), config.landmark_sd**-2)
 
     def equations(x: np.ndarray, stiff: float) -> Dense:
-        return normal_equations([energy.point_to_point(follow(x), points, weights), energy.pose_prior(x, prior, stiff),
+        return normal_equations([energy.point_to_point(follow(x), points, weights),
+                                 energy.pose_prior_term(x, prior, stiff),
                                  energy.shape_prior(x, body.n_angles + 3)])
 
     found = anneal(lambda x, stiff: levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3), x)

@@ -12,7 +12,7 @@ from model.body import BodyModel
 from model.fitting.scan import all_points, point_count, prepare_picture
 from model.linear import Subject
 from scanprep.arguments import UsageError
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, details, judgement_of, judgement_row, write_report
 from scanprep.depth_camera.picture import DepthPicture, read_depth
@@ -24,7 +24,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import size
 from scanprep.pictures.scene import SCENE, small_scene
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
+from scanprep.pictures.textures import Texture, bake_texture, read_texture, write_textured
 from scanprep.registration.ground import soles_row
 
 from .colors import ColorConfig, blend, carry_colors, views_with_colors
@@ -41,7 +41,7 @@ MEANS = (EXPECTED, EXPLAINED, MEASURED, LEFT)
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class CompletionTask:
     """What the scans of one call have in common."""
 
     body: BodyModel | Subject
@@ -52,7 +52,7 @@ class Work:
     colors: ColorConfig = field(default_factory=ColorConfig)
     command: str = field(default="", metadata={"digest": False})     # for the report of each scan of a folder
 
-    def __call__(self, inputs: Inputs, room: Room) -> list[Metric]:
+    def __call__(self, inputs: CompletionInputs, room: TaskContext) -> list[Metric]:
         """Complete the scan of some files; the figures."""
         start = time.perf_counter()
         metrics = complete_files(self, inputs, room)
@@ -63,7 +63,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Inputs:
+class CompletionInputs:
     """The files of one scan: its views, landmarks, and masks for all of them or one for each."""
 
     scans: tuple[Path, ...]
@@ -90,14 +90,14 @@ class ScanFiles:
         return only if isinstance(only, Mesh) else None
 
 
-def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
+def complete_files(work: CompletionTask, inputs: CompletionInputs, room: TaskContext) -> list[Metric]:
     """Complete the scan of some files into the folder of a room, report.html in it; the figures.
 
     The first says what the completion is worth.
     """
     unit = "m" if work.config.free_scale else work.unit            # then as it stands in the files
     depth = read_picture(inputs.scans, work.unit)
-    files = read_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
+    files = read_scan_views(inputs.scans, unit) if depth is None else ScanFiles((), ())
     surface = files.mesh or (all_points(files.views) if files.views else None)
     named = read_landmarks(inputs.landmarks, surface, unit) if inputs.landmarks else {}
     landmarks = try_match_landmarks(inputs.landmarks, work.marks, named) if inputs.landmarks else None
@@ -113,7 +113,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
             *write_worn(room.folder, done, extra_markers(named, work.marks))]
 
 
-def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion,
+def write_results(work: CompletionTask, inputs: CompletionInputs, files: ScanFiles, done: Completion,
                   landmarks: tuple[np.ndarray, np.ndarray] | None, masked: np.ndarray | None, output: Path
                   ) -> list[Metric]:
     """Write a completion with its colours, its pictures and its page into a folder; the figures."""
@@ -122,11 +122,11 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
         colors = carry_colors(mesh, done.seen, views, work.colors, viewpoint, done.scale, files.textures)
         if any(texture is not None for texture in files.textures):
             known = views_with_colors(views, viewpoint, done.scale, files.textures)
-            write_textured(output / "completed.glb", bake(
+            write_textured(output / "completed.glb", bake_texture(
                 mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
         done = replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
     save_completion(output, done)
-    metrics = [judgement_row(done.judgement), *figures(work, inputs, done, landmarks, masked)]
+    metrics = [judgement_row(done.judgement), *completion_figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
     name = ", ".join(path.name for path in inputs.scans)
@@ -134,12 +134,13 @@ def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion
                              {vertex: name for name, vertex in work.marks.items()})
     completion_page(panes, name, metrics, picture, masked is not None).write(output / "report.html")
     if work.command:
-        storage.write(output / SCENE, small_scene(panes))
+        storage.write_file(output / SCENE, small_scene(panes))
     return metrics
 
 
-def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.ndarray, np.ndarray] | None,
-            masked: np.ndarray | None) -> list[Metric]:
+def completion_figures(work: CompletionTask, inputs: CompletionInputs, done: Completion,
+                       landmarks: tuple[np.ndarray, np.ndarray] | None,
+                       masked: np.ndarray | None) -> list[Metric]:
     """The rows of the closing table."""
     rows = [Metric(EXPLAINED, 100 * done.explained, "%"),
             Metric(MEASURED, 100 * float(done.seen.mean()), "%"),
@@ -174,7 +175,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
                            for path, a, b in zip(paths, starts[:-1], starts[1:], strict=True)])
 
 
-def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
+def read_scan_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
     """Read the views of a scan, which share one unit."""
     unit = common_unit(paths, unit) if len(paths) > 1 else unit
     views = tuple(read_view(path, unit) for path in paths)

@@ -21,7 +21,7 @@ from scanprep.ranges import Positive
 
 from ..cli import ModelOrNone, body_of, read_landmark_pairs, read_model
 from .folder import FrameFolder, follow_folder
-from .sequence import Tracker, as_motion, tracking_doubts, tracking_problem
+from .sequence import BodyTracker, as_motion, tracking_doubts, tracking_problem
 from .settings import TrackConfig
 
 FramesArg = Annotated[Path, Place("FRAMES")]
@@ -55,7 +55,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         surfaces: Write the completed surface of every frame to surfaces/.
         config: Settings.
     """
-    from ..mocap.files.motion_files import write_glb, write_motion
+    from ..mocap.files.motion_files import write_glb, write_motion_folder
     from .report import track_page
 
     found = FrameFolder(frames, cameras, unit)
@@ -65,7 +65,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     whose = Path(subject) if subject not in (None, "template") else subject
     key = space.digests.of(model or loaded, whose, marked, unit, replace(config, smoothing=0), rate, surfaces)
     with bar("following the body") as progress:
-        done = follow_folder(Tracker(body, config, rate, marked), found, space, key, surfaces, progress)
+        done = follow_folder(BodyTracker(body, config, rate, marked), found, space, key, surfaces, progress)
     if done.fresh < len(found):
         say(f"{len(found) - done.fresh} of {len(found)} frames were tracked before")
     motion = as_motion(done.frames, done.state.betas, rate, config)
@@ -77,7 +77,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
                Metric("the same, worst frame", MM * float(residual.max()), "mm")]
 
     def write(folder: Path) -> None:
-        write_motion(folder, motion, person)
+        write_motion_folder(folder, motion, person)
         track_page(motion, person, lambda t: _points(found[t]), frames.name, found.numbers, metrics).write(
             folder / "report.html")
 

@@ -24,7 +24,7 @@ from scanprep.geometry.files import (
 )
 
 from ..motion import Progress
-from .sequence import TrackedFrame, Tracker, TrackerState, without_points
+from .sequence import BodyTracker, TrackedFrame, TrackerState, without_points
 
 
 class FrameFolder:
@@ -115,7 +115,7 @@ START = "frames/"                    # of the names of what is kept
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class TrackedFolder:
     """All frames of a folder."""
 
     frames: list[TrackedFrame]
@@ -124,8 +124,8 @@ class Followed:
     fresh: int                      # frames that were followed now; the others had been before
 
 
-def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: str, surfaces: bool = False,
-                  progress: Progress | None = None) -> Followed:
+def follow_folder(tracker: BodyTracker, frames: FrameFolder, space: Workspace, key: str, surfaces: bool = False,
+                  progress: Progress | None = None) -> TrackedFolder:
     """Follow a body through a folder of frames; those that were followed before are not followed again.
 
     What is kept of a chunk, with the tracker's state, depends on every file up to its last frame and nothing after it:
@@ -161,4 +161,4 @@ def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: 
         if progress is not None:
             progress(first + len(mine), len(frames))
     space.drop_others(START, names)                          # the recording was longer
-    return Followed(done, state, key, fresh)
+    return TrackedFolder(done, state, key, fresh)

@@ -9,7 +9,7 @@ import numpy as np
 from model.fitting import energy
 from model.fitting.bodies import FixedBody, ShapedBody
 from model.fitting.limbs import reinitialise_limbs
-from model.fitting.scan import ScanPoints, spread
+from model.fitting.scan import ScanPoints, spread_points
 from model.fitting.scan_fit import ScanFit, scan_fit
 from model.fitting.starts import approach, best_starts, first_starts
 from scanprep.geometry.farthest_points import farthest_points
@@ -54,7 +54,7 @@ class FrameFit:
     def __init__(self, body: FixedBody, cloud: ScanPoints, config: TrackConfig, rate: float) -> None:
         self.body, self.config = body, config
         self.scan = scan_fit(body, cloud, *NOTHING, config.scan)
-        self.few = self.scan.some(spread(body.template.vertices, VERTICES), config.body_points)
+        self.few = self.scan.some(spread_points(body.template.vertices, VERTICES), config.body_points)
         self.inertia = inertia(body.n_angles + 3, rate, config.angle_acceleration, config.place_acceleration)
 
     def good(self, found: Refined) -> bool:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model.fitting.scan import NEIGHBOURS, ScanPoints, View, prepare_scan, spread
+from model.fitting.scan import NEIGHBOURS, ScanPoints, View, prepare_scan, spread_points
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.places import distinct_places
@@ -60,7 +60,7 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
     return ScanPoints(points, normals, border, spacing, number, np.arange(len(points)))
 
 
-def as_views(cloud: ScanPoints) -> list[PointCloud]:
+def frame_views(cloud: ScanPoints) -> list[PointCloud]:
     """A prepared frame as the views that `complete` takes."""
     return [PointCloud(cloud.points[cloud.view == k], cloud.normals[cloud.view == k]) for k in np.unique(cloud.view)]
 
@@ -107,9 +107,10 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
 def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some points of a view, their normals, and the denser points that these were made from."""
-    many = spread(view.points, DENSER * count) if len(view.points) > DENSER * count else np.arange(len(view.points))
+    many = spread_points(view.points,
+                         DENSER * count) if len(view.points) > DENSER * count else np.arange(len(view.points))
     dense = view.points[many]
-    few = spread(dense, count) if len(dense) > count else np.arange(len(dense))
+    few = spread_points(dense, count) if len(dense) > count else np.arange(len(dense))
     _, near = cKDTree(dense).query(dense[few], neighbours)
     around = dense[near] - _middles(dense, near)[:, None]
     normals = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)[1][:, :, 0]

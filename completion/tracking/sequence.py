@@ -18,9 +18,9 @@ from scanprep.threads import one_thread
 from ..motion import Motion, Progress
 from ..partial.completion import complete
 from ..partial.free_surface import free_surface
-from ..smoothing import inertia, predict, smooth
+from ..smoothing import inertia, predict, smooth_frames
 from .frame_fit import FrameFit, Refined, fit_shared_shape, spread_poses
-from .frames import Frame, as_views, prepare_frame
+from .frames import Frame, frame_views, prepare_frame
 from .settings import TrackConfig
 
 Surfaces = Callable[[int, Mesh], None]
@@ -72,7 +72,7 @@ def track(body: BodyModel | Subject, frames: Iterable[Frame], config: TrackConfi
     config = config or TrackConfig()
     if not rate > 0:
         raise ValueError(f"rate: expected frames per second above 0, got {rate}")
-    tracker = Tracker(body, config, rate, landmarks, viewpoints)
+    tracker = BodyTracker(body, config, rate, landmarks, viewpoints)
     total = len(frames) if isinstance(frames, Sized) else 0
     done: list[TrackedFrame] = []
     for frame in tracker.follow(frames):
@@ -94,8 +94,8 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
     x = np.stack([frame.x for frame in frames])
     if config.smoothing:
         weights = inertia(x.shape[1], rate, config.angle_acceleration, config.place_acceleration)
-        x = smooth(x, np.stack([frame.gradient for frame in frames]), np.stack([f.precision for f in frames]),
-                   weights, config.smoothing)
+        x = smooth_frames(x, np.stack([frame.gradient for frame in frames]), np.stack([f.precision for f in frames]),
+                          weights, config.smoothing)
     residuals = np.array([[frame.residual] for frame in frames])
     return Motion(x[:, :-3].reshape(len(x), -1, 3), x[:, -3:].copy(), betas, rate, residuals, ("surface",),
                   converged=np.array([frame.found for frame in frames]))
@@ -158,7 +158,7 @@ class TrackerState:
     random_state: dict[str, Any] | None = None       # of the random numbers of a search from scratch
 
 
-class Tracker:
+class BodyTracker:
     """Follows one body through frames that are handed over one by one.
 
     For a model the first frames are kept until the shape is found. `landmarks` are of the first frame, as for
@@ -218,7 +218,7 @@ class Tracker:
 
     def _begin(self, cloud: ScanPoints) -> Refined:
         """The first frame that shows something."""
-        start = complete(self.given, as_views(cloud), self.landmarks, self.config.start)
+        start = complete(self.given, frame_views(cloud), self.landmarks, self.config.start)
         self._has_shape(start.betas)
         fitter = self._fitter(cloud)
         return fitter.refine(fitter.scan.on(cloud), fitter.body.join(start.pose, start.trans))

@@ -16,7 +16,7 @@ from scanprep.viewer.app import App, Send
 from scanprep.viewer.dropped import Dropped, with_camera
 from scanprep.viewer.messages import Message
 
-from .arrangement import over_each_other, side_by_side
+from .arrangement import arrange_side_by_side, over_each_other
 from .controls import Controls, Shown
 from .files import Entry, Files
 from .pages import Inside
@@ -127,7 +127,7 @@ class ViewApp(Things):
     def _make_scene(self) -> None:
         """A pane and its first layer for everything that is shown, residuals of its markers, sliders of its bodies."""
         contents = [self.contents[i] for i in self.shown]
-        self.cameras, panes = over_each_other(contents) if self.over else side_by_side(contents)
+        self.cameras, panes = over_each_other(contents) if self.over else arrange_side_by_side(contents)
         self.number += 1
         self._scene = [Message("scene", {"number": self.number}, pack_scene(panes, whole=True))]
         bodies, below = list[Shown](), 0

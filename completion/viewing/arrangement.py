@@ -17,7 +17,7 @@ from .contents import Content, Stance
 LAID_OVER = (CLAY, (0.55, 0.66, 0.80), (0.83, 0.62, 0.55), (0.62, 0.75, 0.60), (0.72, 0.63, 0.78))
 
 
-def side_by_side(contents: Sequence[Content], up: np.ndarray | None = None) -> tuple[list[Camera], list[Pane]]:
+def arrange_side_by_side(contents: Sequence[Content], up: np.ndarray | None = None) -> tuple[list[Camera], list[Pane]]:
     """A pane for each, in one scale, so that they can be compared; what has a view of its own keeps it."""
     # things at one place, such as a scan and what was made of it, are seen from the side of the first of them
     stances = list[Stance]()

@@ -17,14 +17,14 @@ from scanprep.dataset import RegisteredSet
 from scanprep.depth_camera.picture import is_camera
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.landmarks import landmarks_beside, read_landmarks
-from scanprep.viewer.clicked import read_surface
+from scanprep.viewer.clicked import read_shown_surface
 from scanprep.viewer.dropped import with_camera
 
 from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion
 from ..partial.completion import load_completion
 from .contents import Content, collect_warnings, from_camera, mark_places, of_completion, of_mesh, of_model
-from .kinds import kind_of, layout_places, model_of_report, worst_first
+from .kinds import layout_places, model_of_report, viewable_kind, worst_first
 from .motions import of_markers, of_motion, read_recording
 from .soft import soft_tissue_of, with_soft_tissue
 from .statues import read_statue
@@ -139,7 +139,7 @@ class Files:
     # files
 
     def _of_file(self, path: Path, name: str) -> Entry:
-        kind = kind_of(path)
+        kind = viewable_kind(path)
         loads: dict[str, Callable[[], Content]] = {
             "model": lambda: of_model(name, self.read_model(path)),
             "motion": lambda: collect_warnings(lambda: self._motion(path, name)),
@@ -155,7 +155,7 @@ class Files:
         return Entry(name, loads[kind], kind != "markers" or not self.over, path, kind)
 
     def _surface(self, path: Path, name: str) -> Content:
-        shape, file = read_surface(path, self.unit), landmarks_beside(path)
+        shape, file = read_shown_surface(path, self.unit), landmarks_beside(path)
         if file is None:
             return of_mesh(name, shape)
         try:
@@ -210,7 +210,7 @@ class Files:
                     yield from self._inside(path, f"{name}/{path.name}", deep - 1)
                 # tables may hold anything, and BVH be of any body
                 elif path.is_file() and path.suffix.lower() not in (".csv", ".tsv", ".txt", ".bvh") \
-                        and kind_of(path) in SHOWN:
+                        and viewable_kind(path) in SHOWN:
                     yield self._of_file(path, f"{name}/{path.name}")
 
     def _of_set(self, folder: Path, name: str) -> Iterator[Entry]:

@@ -19,13 +19,13 @@ from ..mocap.files.markers import READERS
 from ..mocap.marker_sets.layout import MarkerLayout
 
 
-def kind_of(path: Path) -> str:
+def viewable_kind(path: Path) -> str:
     """What a file is: model, motion, completion, markers, surface, picture, or words for what it is instead."""
     if zipfile.is_zipfile(path):
         names = storage.names_in(path, "a model or a motion")
         if storage.HEADER not in names:
             return "motion" if is_motion(path) else f"an archive of {', '.join(sorted(names)) or 'nothing'}"[:100]
-        kind = storage.kind_of(path)
+        kind = storage.stored_kind(path)
         return "model" if kind in KINDS else kind if kind == "completion" else f"a file of kind '{kind}'"
     suffix = path.suffix.lower()
     if suffix == ".bvh":

@@ -68,13 +68,13 @@ def with_markers(content: Content, motion: Motion, markers: MarkerSequence) -> C
                                                       & np.isnan(residuals)[..., None], np.nan, markers.positions))
     seen = np.isfinite(residuals)
     mean = np.where(seen, residuals, 0).sum(axis=0) / np.where(seen.any(axis=0), seen.sum(axis=0), np.nan)
-    dots = replace(marker_dots(markers), color=heat(mean, 0.0, SHOWN_OFF) if seen.any() else MARKER)
+    dots = replace(first_marker_dots(markers), color=heat(mean, 0.0, SHOWN_OFF) if seen.any() else MARKER)
     shown = Moving(dots, markers.positions, markers.rate)
     about = MarkersTold(len(content.shapes), markers.labels, residuals) if seen.any() else None
     return replace(content, shapes=[*content.shapes, shown], markers=about)
 
 
-def marker_dots(markers: MarkerSequence) -> Dots:
+def first_marker_dots(markers: MarkerSequence) -> Dots:
     """The markers of the first frame that has any."""
     return Dots(markers.positions[0], MARKER, 0.013, name="markers")
 
@@ -101,7 +101,7 @@ def of_markers(name: str, markers: MarkerSequence) -> Content:
     every = markers.positions[::max(1, len(markers.positions) // 200)].reshape(-1, 3)
     every = every[np.isfinite(every).all(axis=1)]
     every = np.concatenate([every, points])
-    dots = replace(marker_dots(markers), labels=markers.labels, color=CLAY)
+    dots = replace(first_marker_dots(markers), labels=markers.labels, color=CLAY)
     about = f"{number_of(len(markers.labels), 'marker')}, {lasting(markers.positions, markers.rate)}"
     return Content(name, [Moving(dots, markers.positions, markers.rate)], stance.around(every), about,
                    stance.around(points))

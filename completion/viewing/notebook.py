@@ -19,7 +19,7 @@ from scanprep.pictures.page import Page
 from ..mocap.soft_tissue.soft_tissue import SoftTissue
 from ..motion import Motion
 from ..partial.completion import Completion
-from .arrangement import over_each_other, side_by_side
+from .arrangement import arrange_side_by_side, over_each_other
 from .contents import AXES, Content, of_completion, of_mesh, of_model, of_subject
 from .files import Files
 from .motions import of_motion
@@ -41,7 +41,7 @@ class Viewed:
     def html(self) -> str:
         """A whole page."""
         up = None if self.up is None else AXES[self.up]
-        _, panes = (over_each_other if self.over else side_by_side)(list(self.contents), up)
+        _, panes = (over_each_other if self.over else arrange_side_by_side)(list(self.contents), up)
         page = Page("scapekit").bodies(panes, height=HEIGHT).html()
         return page.replace("<header><h1>scapekit</h1></header>\n", "").replace("<main>", '<main style="padding: 0">')
 
@@ -49,7 +49,7 @@ class Viewed:
         """The same as a page that can be opened by itself."""
         from scanprep.geometry import storage
 
-        storage.write(path, self.html)
+        storage.write_file(path, self.html)
 
     def _repr_html_(self) -> str:
         return (f'<iframe srcdoc="{escape(self.html)}" title="bodies, drag to turn" '

@@ -7,7 +7,7 @@ from typing import Any
 
 from model.body import BodyModel
 from scanprep.batch.calls import command_of
-from scanprep.command_line import load
+from scanprep.command_line import load_command
 from scanprep.viewer.app import App
 from scanprep.viewer.clicked import Clicked
 from scanprep.viewer.dropped import Dropped
@@ -15,7 +15,7 @@ from scanprep.viewer.dropped import Dropped
 from ..cli import marks_of_template
 from ..partial.interactive import CompleteApp, Made
 from ..partial.settings import CompletionConfig
-from ..partial.work import Work
+from ..partial.work import CompletionTask
 from .files import Entry, Files
 from .saving import free_name
 
@@ -34,7 +34,7 @@ MENDED: Mapping[str, tuple[str, str]] = {
 class CompletePage(CompleteApp):
     """Completion inside of the view: each body that is saved gets a folder of its own beside what is there."""
 
-    def __init__(self, model: BodyModel, work: Work, output: Path, dropped: Dropped) -> None:
+    def __init__(self, model: BodyModel, work: CompletionTask, output: Path, dropped: Dropped) -> None:
         super().__init__(model, work, (), output, dropped=dropped)
         self.entries: dict[Path, Entry] = {}
         self._folders: dict[Path, Path] = {}
@@ -95,7 +95,7 @@ class Inside:
         if what != "mend" or folder is None or command not in MENDED:
             raise ValueError(f"page: expected one that the list of things offers, got {what} of {wanted['folder']}")
         if (what, folder) not in self.opened:
-            self.opened[what, folder] = load(MENDED[command][1])(folder)
+            self.opened[what, folder] = load_command(MENDED[command][1])(folder)
         return self.opened[what, folder]
 
     def _completion(self, scan: Entry, model: str, progress: Progress) -> App:
@@ -113,7 +113,8 @@ class Inside:
             else:
                 loaded, name = self.files.read_model(path), str(path)
             body = loaded if loaded.n_betas else loaded.subject(None)
-            work = Work(body, name, marks_of_template(loaded, None, name), CompletionConfig(), self.files.unit)
+            work = CompletionTask(body, name, marks_of_template(loaded, None, name), CompletionConfig(),
+                                  self.files.unit)
             page = self.opened["complete", path] = CompletePage(loaded, work, self.output, self.dropped)
         page.open(scan)
         return page

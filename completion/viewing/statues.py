@@ -9,7 +9,7 @@ from model.body import BodyModel
 from model.files import load_model
 from model.statue.control.model import FOLDED, HOLE, MEASURED, Statue
 from model.statue.detail.reconstruction import Reconstruction, coverage_at
-from model.statue.detail.subdivision import chart_places, subdivide
+from model.statue.detail.subdivision import chart_places, subdivide_uniform
 from model.statue.files import body_model, load_statue
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import part_colors
@@ -35,7 +35,7 @@ class MovableStatue(MovableBody):
 
     def __init__(self, statue: Statue, model: BodyModel) -> None:
         super().__init__(model)
-        fine = subdivide(statue.control.mesh, statue.control.chart, LEVEL)
+        fine = subdivide_uniform(statue.control.mesh, statue.control.chart, LEVEL)
         self.detailed = Reconstruction(statue.control, statue.map, fine)
         self._corners, self._bary = statue.control.mesh.faces[fine.parent], fine.bary
         self._control = np.zeros((0, 3), dtype=np.float32)
@@ -81,7 +81,7 @@ def read_statue(name: str, folder: Path) -> Content:
 def of_statue(name: str, statue: Statue, model: BodyModel | None = None) -> Content:
     """The surface of a statue where the scan stood, and its control mesh to be shown too."""
     control = statue.control
-    fine = subdivide(control.mesh, control.chart, LEVEL)
+    fine = subdivide_uniform(control.mesh, control.chart, LEVEL)
     mesh = Reconstruction(control, statue.map, fine).mesh()
     # measured, folded, or filled where the scan has a hole
     kind = coverage_at(control, statue.map, fine.parent, fine.bary)

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from scanprep.batch.opening import workspace
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import extent, unit_problem
@@ -80,7 +80,7 @@ class RegisterWithModel:
         """The template's own body, made once for all scans."""
         return self.model.subject()
 
-    def __call__(self, given: OneScan, room: Room) -> ModelRegistration:
+    def __call__(self, given: OneScan, room: TaskContext) -> ModelRegistration:
         body = self.person if given.own or not self.model.n_betas else self.model
         return register_with_model(body, given.scan, given.landmarks, given.start, self.config)
 

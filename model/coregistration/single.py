@@ -9,14 +9,14 @@ import numpy as np
 from scanprep.correspondence.correspondences import check_pairs
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.geometry.target import Target, orient, target_of
+from scanprep.geometry.target import Target, orient_by_mesh, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..features import twists
 from ..fitting.bodies import FixedBody, as_body
-from ..fitting.limbs import limbs_amiss, reinitialise_limbs, with_limbs
+from ..fitting.limbs import misplaced_limbs, reinitialise_limbs, with_limbs
 from ..fitting.rounds import meet_vertices, solve_jointly
 from ..fitting.scan_fit import ScanFit, prepare_scan_fit
 from ..fitting.starts import best_starts, first_starts
@@ -128,7 +128,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
     off_marks = np.linalg.norm(mesh.vertices[vertices] - points, axis=1)
     limit = EXPLAINED * size
-    explained = float((apart(mesh, orient(target.thin(0.01 * size), mesh, limit), limit) < limit).mean())
+    explained = float((apart(mesh, orient_by_mesh(target.thin(0.01 * size), mesh, limit), limit) < limit).mean())
     return ModelRegistration(mesh, predicted, twists(pose), trans, betas if person.n_betas else None, seen,
                              aligned.distances, aligned.rms, explained, _rms(off_model), _rms(off_marks),
                              aligned.inverted, aligned.confidence, tried)
@@ -140,7 +140,7 @@ def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray,
     if given is not None:
         best, tried = reinitialise_limbs(few, best_starts(few, given)[0]), 1
     explains = best is not None and few.find_unexplained(best, few.thin).mean() <= 1 - ENOUGH
-    if best is None or not explains or limbs_amiss(few, best):
+    if best is None or not explains or misplaced_limbs(few, best):
         starts = first_starts(fit, few)
         tried += len(starts)
         other = with_limbs(fit, few, best_starts(few, starts))[0]

@@ -16,7 +16,7 @@ from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.files import name_of, write_mesh
 from scanprep.judgement import Judgement
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 from scanprep.ranges import Beta, Positive
 
 from ..body import BodyModel
@@ -28,7 +28,7 @@ from ..motion.onto import BodyMotion, read_motion
 from ..people import ASKED, person_judgement
 from ..rig import Rig, joint_places, make_rig
 from .bvh import write_bvh
-from .conventions import for_programs, standing
+from .conventions import for_programs, stand_mesh
 from .correctives import motion_correctives, off_exact, pose_features, write_body_npz
 from .glb import write_skinned_glb
 from .names import Names, names_of
@@ -142,7 +142,7 @@ def _mesh(order: Order) -> list[Metric]:
     model = order.model
     rest = np.zeros((len(model.skeleton.parents), 3))
     body = model.template.with_vertices(model.vertices(rest, order.person))
-    write_mesh(order.output, standing(body, body, order.up, order.ground, order.front))
+    write_mesh(order.output, stand_mesh(body, body, order.up, order.ground, order.front))
     return [Metric("vertices", len(body.vertices)), _size(order.output)]
 
 
@@ -221,7 +221,7 @@ def _poses_to_measure(order: Order) -> tuple[Metric, np.ndarray, np.ndarray]:
 
 def _write_rig(order: Order, rig: Rig, write: Callable[..., None]) -> list[Metric]:
     """Write a rig and its motion as other programs want them, and say what became of the skeleton."""
-    axis = upright(rig.mesh)[0] if order.up is None else order.up
+    axis = guess_upright(rig.mesh)[0] if order.up is None else order.up
     rest = np.zeros((0, len(rig.skeleton.parents), 3))
     moves = order.moves or BodyMotion(rest, rest[:, 0], order.person, 30.0)
     ready, poses, trans = for_programs(rig, moves.poses, moves.trans, axis, order.root, order.names, order.ground,

@@ -8,7 +8,7 @@ import numpy as np
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sides import side_of
-from scanprep.pictures.camera import stance, upright
+from scanprep.pictures.camera import guess_upright, stance
 
 from ..rig import Rig, change_root, transform_rig, turn_up
 from .bvh import part_ends
@@ -95,13 +95,13 @@ def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, gro
     return transform_rig(rig, poses, trans, (np.eye(3), shift), (np.eye(3), step))
 
 
-def standing(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool, turned: np.ndarray | None = None
-             ) -> Mesh:
+def stand_mesh(body: Mesh, rest: Mesh, up: int | None, ground: bool, front: bool, turned: np.ndarray | None = None
+               ) -> Mesh:
     """A mesh with its lowest point at height 0, and its face to the viewer: -y where z is up, else +z.
 
     What is up, without `up` (0, 1 or 2), and front is told by the same body at rest, whose root is `turned` (3, 3).
     """
-    up = upright(rest)[0] if up is None else up
+    up = guess_upright(rest)[0] if up is None else up
     points = body.vertices
     if front:
         points = points @ to_viewer(*stance(rest, turned, np.eye(3)[up]), up).T

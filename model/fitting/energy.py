@@ -78,7 +78,7 @@ def point_to_point(points: MovingPoints, targets: np.ndarray, weights: np.ndarra
     return Residual(r.reshape(*r.shape[:-2], -1), J.reshape(*J.shape[:-3], -1, J.shape[-1]))
 
 
-def pose_prior(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray = 1.0) -> Residual:
+def pose_prior_term(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray = 1.0) -> Residual:
     """Squared Mahalanobis distance of the pose from the training poses (the root is free).
 
     [SCAPE] §9
@@ -91,7 +91,7 @@ def pose_prior(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray =
     return Residual(r, J)
 
 
-def upright(x: np.ndarray, of_body: np.ndarray, up: np.ndarray, sd: float) -> Residual:
+def upright_term(x: np.ndarray, of_body: np.ndarray, up: np.ndarray, sd: float) -> Residual:
     """How far the root's axis `of_body` (3,) leans from the direction `up` (..., 3); `sd`, radians."""
     R = rotations.exp(x[..., :3])
     axis = R @ of_body

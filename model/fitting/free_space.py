@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, minimum_filter
 from scipy.spatial import cKDTree
 
-from scanprep.depth_camera.person import Person
+from scanprep.depth_camera.person import PicturedPerson
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
@@ -69,7 +69,7 @@ class CameraView:
 class PictureView:
     """A person as a depth camera saw them: nothing is in front of what was measured, beyond the border anything."""
 
-    def __init__(self, person: Person) -> None:
+    def __init__(self, person: PicturedPerson) -> None:
         self.picture = person.picture
         self.points, self.viewpoint = person.picture.points()[person.mask], np.zeros(3)
         known = np.isfinite(person.picture.depth)

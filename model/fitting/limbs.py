@@ -11,8 +11,8 @@ from scanprep.skeleton.tree import Skeleton
 from ..priors import GaussianPrior
 from .bodies import FixedBody
 from .free_space import INSIDE, PRESSED, Outside
-from .named_points import distinct
-from .scan import spread
+from .named_points import distinct_bodies
+from .scan import spread_points
 from .scan_fit import EVIDENCE, ScanFit
 from .starts import approach
 
@@ -44,7 +44,7 @@ def with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> tuple[np.ndarr
     ends = [reinitialise_limbs(few, starts[0])]
     for x in starts[1:]:
         both = len(ends) == 1 and fit.cloud.person is not None and not len(fit.vertices)
-        if not both and not limbs_amiss(few, min(ends, key=few.misfit), GRAVE):
+        if not both and not misplaced_limbs(few, min(ends, key=few.misfit), GRAVE):
             break
         ends.append(reinitialise_limbs(few, x))
     if len(ends) == 1:
@@ -61,13 +61,13 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     The worst has its turn first. Once one was moved the others are looked at anew: what they could have explained may
     be explained, and what stood in their way gone.
     """
-    if not limbs_amiss(fit, x):
+    if not misplaced_limbs(fit, x):
         return x
     free, held = fit.body.n_angles + 3, fit.fix_shape(x)
     moved = approach(held, x[:free], REACHES)
     tried: list[list[int]] = []                      # as the body is now
-    for _ in range(ROUNDS * len(limbs(fit.body.skeleton))):
-        limb = next((limb for limb in limbs_amiss(held, moved) if limb not in tried), None)
+    for _ in range(ROUNDS * len(limb_runs(fit.body.skeleton))):
+        limb = next((limb for limb in misplaced_limbs(held, moved) if limb not in tried), None)
         if limb is None:
             break
         before, moved = moved, _reinitialise(held, moved, limb)
@@ -75,19 +75,19 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     return np.concatenate([moved, x[free:]])
 
 
-def limbs_amiss(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[int]]:
+def misplaced_limbs(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[int]]:
     """The limbs, runs of parts, that stand where nothing can be or could explain what nothing does; worst first."""
     wrong = np.zeros(len(fit.ids))
     for weight, ids, found in fit.objections(fit.skin(x)):
         wrong[ids] += weight * np.minimum(found.excess, CAP)**2 / len(ids)
     lost, strange = fit.thin.points[fit.find_unexplained(x, fit.thin)], fit.strange(x)
-    found_amiss = {tuple(limb): amiss(fit, x, limb, wrong, lost) + float(strange[limb].sum())
-                   for limb in limbs(fit.body.skeleton)}
+    found_amiss = {tuple(limb): misplacement(fit, x, limb, wrong, lost) + float(strange[limb].sum())
+                   for limb in limb_runs(fit.body.skeleton)}
     return [list(limb) for limb in sorted(found_amiss, key=lambda limb: -found_amiss[limb])
             if found_amiss[limb] > least]
 
 
-def amiss(fit: ScanFit, x: np.ndarray, limb: list[int], wrong: np.ndarray, lost: np.ndarray) -> float:
+def misplacement(fit: ScanFit, x: np.ndarray, limb: list[int], wrong: np.ndarray, lost: np.ndarray) -> float:
     """Energy of what is wrong with a limb, and of what it could explain.
 
     `wrong` (n,), of each vertex; `lost` (m, 3), metres, points of the scan with nothing near.
@@ -141,7 +141,7 @@ class LimbSearch:
         """The search for a limb of unknowns (P,)."""
         skin, mine = fit.skin(x), np.isin(fit.part, limb)
         ids = np.flatnonzero(mine)
-        ids = ids[spread(fit.body.template.vertices[fit.ids[ids]], SKIN)]
+        ids = ids[spread_points(fit.body.template.vertices[fit.ids[ids]], SKIN)]
         away = cKDTree(skin.places[~mine]).query(fit.coarse.points)[0] > EXPLAINED
         return LimbSearch(fit, limb, ids, np.flatnonzero(fit.part[ids] == limb[-1]), fit.part[ids] != limb[0],
                           fit.coarse.some(away).thin(SCAN).points, float(away.mean()),
@@ -153,13 +153,13 @@ class LimbSearch:
         for cap, noise in zip(CAPS, NOISES, strict=True):
             places, cost = self.evaluate(drawn, cap)
             order = np.argsort(cost)
-            kept = drawn[order[distinct(places[order][:, self.end], KEPT, noise / 4)]]
+            kept = drawn[order[distinct_bodies(places[order][:, self.end], KEPT, noise / 4)]]
             near = np.repeat(kept, len(drawn) // len(kept), axis=0)
             near[:, angles] += self.fit.rng.normal(0, noise, (len(near), len(angles)))
             drawn = np.vstack([kept, near])
         places, cost = self.evaluate(drawn, CAPS[-1])
         order = np.argsort(cost)
-        return drawn[order[distinct(places[order][:, self.end], FOLLOWED, APART)]]
+        return drawn[order[distinct_bodies(places[order][:, self.end], FOLLOWED, APART)]]
 
     def evaluate(self, drawn: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
         """Places (n, L, 3), metres, of the limb's vertices for unknowns (n, P), and energies (n,) up to a constant.
@@ -217,7 +217,7 @@ class InsideBody:
         return np.where(within, self.deep[cell[..., 0], cell[..., 1], cell[..., 2]], 0.0)
 
 
-def unbranched_runs(parents: np.ndarray) -> list[list[int]]:
+def runs_without_branch(parents: np.ndarray) -> list[list[int]]:
     """The limbs of a tree of parts: longest runs without a branch, the root in none."""
     children = [np.flatnonzero(np.asarray(parents) == j) for j in range(len(parents))]
     runs = []
@@ -231,10 +231,10 @@ def unbranched_runs(parents: np.ndarray) -> list[list[int]]:
     return runs
 
 
-def limbs(skeleton: Skeleton) -> list[list[int]]:
+def limb_runs(skeleton: Skeleton) -> list[list[int]]:
     """Runs of parts without a branch that end in a part from which nothing hangs, the largest first."""
     parents = skeleton.parents
-    return sorted((run for run in unbranched_runs(parents) if run[-1] not in parents), key=len, reverse=True)
+    return sorted((run for run in runs_without_branch(parents) if run[-1] not in parents), key=len, reverse=True)
 
 
 def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -16,8 +16,8 @@ from .bodies import FixedBody, Follow
 ANNEALING = (10.0, 3.0, 1.0)         # weight of the pose prior: first near the usual poses, then free
 
 
-def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prior: GaussianPrior, axes: int
-           ) -> tuple[np.ndarray, np.ndarray]:
+def search_bodies(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prior: GaussianPrior, axes: int
+                  ) -> tuple[np.ndarray, np.ndarray]:
     """Likely bodies that bring points to their targets, from many starts at once.
 
     `follow` x (B, P) -> L moving points; `targets` (L, 3), metres, naN where there is none; at least 3 are needed;
@@ -31,7 +31,8 @@ def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prio
     still[body.n_angles + 3:] = 1e6
 
     def equations(x: np.ndarray, stiff: float) -> Dense:
-        return normal_equations([energy.point_to_point(follow(x), targets, weights), energy.pose_prior(x, prior, stiff),
+        return normal_equations([energy.point_to_point(follow(x), targets, weights),
+                                 energy.pose_prior_term(x, prior, stiff),
                                  energy.stay_near(x, 0 * x, still)])
 
     end = anneal(lambda x, stiff: levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3), x)
@@ -69,7 +70,7 @@ def lay_on_points(body: FixedBody, positions: Callable[[np.ndarray], np.ndarray]
     return x
 
 
-def distinct(places: np.ndarray, count: int, apart: float = 0.02) -> list[int]:
+def distinct_bodies(places: np.ndarray, count: int, apart: float = 0.02) -> list[int]:
     """The first `count` of the bodies (n, L, 3) that differ from those before, by mean distance in metres."""
     kept: list[int] = []
     for i, place in enumerate(places):

@@ -18,7 +18,7 @@ ONE_VIEW = 0.9                       # share of the points that face one viewpoi
 AGREE = 0.95                         # share of neighbours that must agree for given normals to be of one sign
 
 
-def spread(points: np.ndarray, count: int) -> np.ndarray:
+def spread_points(points: np.ndarray, count: int) -> np.ndarray:
     """Indices of about `count` points, one to each cell of a grid, so that they cover the whole evenly."""
     extent = np.ptp(points, axis=0).max()
     low, high = extent / 2048, extent
@@ -80,7 +80,7 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
         for i, parent, turn_it in zip(mine.tolist(), above.tolist(), turned.tolist(), strict=True):
             flipped[i] = flipped[parent] != turn_it
     out = np.where(np.array(flipped)[:, None], -normals, normals)
-    coarse = points[spread(points, COARSE)] if n > COARSE else points
+    coarse = points[spread_points(points, COARSE)] if n > COARSE else points
     some = np.r_[roots, 0:n:EACH]
     far, around = cKDTree(coarse).query(points[some], 48, distance_upper_bound=WIDE, workers=search_threads(len(some)))
     found = np.isfinite(far)
@@ -103,7 +103,7 @@ def faces(viewpoint: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.
 
 def facing_point(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """The viewpoint (3,) from which the fewest normals (n, 3) of points (n, 3) turn away; its distance is not exact."""
-    keep = spread(points, FEW) if len(points) > FEW else slice(None)
+    keep = spread_points(points, FEW) if len(points) > FEW else slice(None)
     normals, centre = normals[keep], points[keep].mean(axis=0)
     points = points[keep] - centre
     size = max(np.linalg.norm(points, axis=1).max(), 1e-12)

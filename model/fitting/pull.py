@@ -12,7 +12,7 @@ from .bodies import NearPoints
 
 
 @dataclass(frozen=True, eq=False)
-class Pull:
+class MatchTargets:
     """`Σ a |y - t|² + b (n·(y - t))²` over matches, each of one of some points y of a body.
 
     Attributes

@@ -10,7 +10,7 @@ import numpy as np
 from scanprep.geometry.least_squares import Deferred, levenberg_marquardt
 
 from .energy import shape_prior
-from .pull import Pull
+from .pull import MatchTargets
 from .scan_fit import EVIDENCE, FINAL_REACH, REACH, Matched, ScanFit
 from .vertices import share_of_vertices
 
@@ -75,7 +75,7 @@ def meet_vertices(fit: ScanFit, x: np.ndarray, vertices: np.ndarray, weights: np
     targets = np.concatenate([fit.points, vertices[ids]])
     for _ in range(ALIGNINGS):
         points, at = fit.body.gather(np.concatenate([fit.vertices, ids]), x)
-        pull = Pull(points, at, targets, np.zeros_like(targets), to_point, np.zeros(len(targets)))
+        pull = MatchTargets(points, at, targets, np.zeros_like(targets), to_point, np.zeros(len(targets)))
         x = levenberg_marquardt(partial(_equations, Matched(pull, len(fit.vertices), len(ids), fit.prior_terms),
                                         fit.body.n_angles + 3), x[None], 3, 1e-5).x[0]
     return x

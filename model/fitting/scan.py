@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.depth_camera.person import Person, find_person
+from scanprep.depth_camera.person import PicturedPerson, segment_person
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
@@ -16,7 +16,7 @@ from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
 from scanprep.threads import search_threads
 
-from .normals import complete_normals, one_sign, plane_normals, spread, turn_outward
+from .normals import complete_normals, one_sign, plane_normals, spread_points, turn_outward
 
 NEIGHBOURS = 16                      # points that make one normal
 
@@ -36,7 +36,7 @@ class ScanPoints:
     index: np.ndarray       # (n,) int, its number among all points that were given, one view after the other
     masked: ScanPoints | None = None  # the points that are clothing or hair; they are not among `points`
     viewpoints: np.ndarray | None = None  # (views, 3), metres, where each view was seen from, when that was told
-    person: Person | None = None      # in the picture that the points are from, where they are from one
+    person: PicturedPerson | None = None      # in the picture that the points are from, where they are from one
 
     @property
     def views(self) -> int:
@@ -55,7 +55,7 @@ class ScanPoints:
 
     def thin(self, count: int) -> ScanPoints:
         """At most about `count` of the points, spread evenly."""
-        return self if len(self.points) <= count else self.some(spread(self.points, count))
+        return self if len(self.points) <= count else self.some(spread_points(self.points, count))
 
     def scale_by(self, factor: float) -> ScanPoints:
         """The scan in another unit: all lengths times a factor."""
@@ -73,7 +73,7 @@ def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.
     `scan` Mesh, PointCloud, (n, 3) or (n, 6), metres, or a sequence of these; `viewpoint` (3,), metres, or one for
     each view; `masked` (n,) bool, points, one view after the other, that are clothing or hair.
     """
-    views = [in_metres(view, metres) for view in as_views(scan)]
+    views = [scale_view(view, metres) for view in as_views(scan)]
     from_where = check_viewpoints(viewpoint, len(views), metres)
     parts, start = [], 0
     for number, view in enumerate(views):
@@ -91,7 +91,7 @@ def prepare_picture(picture: DepthPicture, size: float, marks: np.ndarray) -> Sc
 
     `size`, metres, of the body, the root of its surface area; `marks` (L, 3), metres, points on the person.
     """
-    person = find_person(picture, size, marks)
+    person = segment_person(picture, size, marks)
     points, normals, edge = person.points_and_normals()
     spacing = float(np.median(points[:, 2])) / person.picture.intrinsics[0, 0]
     every = np.arange(len(points))
@@ -116,7 +116,7 @@ def point_count(view: View) -> int:
         else len(view)
 
 
-def in_metres(view: View, metres: float) -> View:
+def scale_view(view: View, metres: float) -> View:
     """A view times a factor; normals stay."""
     if metres == 1:
         return view

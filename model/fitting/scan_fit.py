@@ -16,8 +16,8 @@ from ..priors import LEAST_POSES, GaussianPrior, JointLimits, gaussian_prior
 from . import energy
 from .bodies import FixedBody, ResizedBody
 from .free_space import Clothing, Contact, Outside, Violation, find_cameras, free_space_violation
-from .pull import Pull
-from .scan import ScanPoints, prepare_scan, spread
+from .pull import MatchTargets
+from .scan import ScanPoints, prepare_scan, spread_points
 from .settings import ScanFitConfig
 from .upright import TILT, Upright
 
@@ -88,7 +88,7 @@ def sample_body(body: FixedBody, ids: np.ndarray | None, count: int, ignored_par
     template, skeleton = body.template, body.skeleton
     gaps = 0.0 if ids is None else float(np.sqrt(template.face_areas.sum() / len(ids)))
     all_or_some = np.arange(len(template.vertices)) if ids is None else ids
-    chosen = spread(template.vertices[all_or_some], count)
+    chosen = spread_points(template.vertices[all_or_some], count)
     ignored = part_vertices(template, skeleton, ignored_parts)[all_or_some]
     part = skeleton.part_of_vertex(template)[all_or_some]
     return BodySample(body if ids is None else body.some(ids), all_or_some, chosen, chosen[~ignored[chosen]], ignored,
@@ -175,7 +175,7 @@ class ScanFit:
         """The same with few vertices of the body and points of the scan: for a search."""
         template, skeleton = self.body.template, self.body.skeleton
         rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
-        some = self.some(np.concatenate([spread(template.vertices, FEW), *rings]), self.config.model_points // 2)
+        some = self.some(np.concatenate([spread_points(template.vertices, FEW), *rings]), self.config.model_points // 2)
         return replace(some, scan_points=self.config.scan_points // 2)
 
     def mesh(self, x: np.ndarray) -> Mesh:
@@ -250,9 +250,9 @@ class ScanFit:
         """
         weight = self.config.prior_weight
         limits = {} if self.limits is None else {"joint_limits": energy.joint_limits(x, self.limits, weight)}
-        stands = {} if self.upright is None else {"upright": energy.upright(x, self.upright.of_body,
-                                                                            self.upright.nearest(x), TILT)}
-        return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits, **stands}
+        stands = {} if self.upright is None else {"upright": energy.upright_term(x, self.upright.of_body,
+                                                                                 self.upright.nearest(x), TILT)}
+        return {"pose_prior": energy.pose_prior_term(x, self.prior, weight), **limits, **stands}
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float, steps: int = 1) -> tuple[np.ndarray, Matched]:
         """Better unknowns (P,) for one matching, and that matching."""
@@ -281,10 +281,10 @@ class ScanFit:
         ids, target, normal, weights = self.matches(skin, scan, reach)
         out_ids, out_target, out_normal, out_weights = self.violations(skin)
         points, at = self.body.gather(np.concatenate([self.vertices, ids, out_ids]), x)
-        pull = Pull(points, at, np.concatenate([self.points, target, out_target]),
-                    np.concatenate([np.zeros_like(self.points), normal, out_normal]),
-                    np.concatenate([free, 0.1 * weights, 0 * out_weights]),
-                    np.concatenate([0 * free, weights, out_weights]))
+        pull = MatchTargets(points, at, np.concatenate([self.points, target, out_target]),
+                            np.concatenate([np.zeros_like(self.points), normal, out_normal]),
+                            np.concatenate([free, 0.1 * weights, 0 * out_weights]),
+                            np.concatenate([0 * free, weights, out_weights]))
         return Matched(pull, len(free), len(ids), self.prior_terms)
 
     def matches(self, skin: Skin, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
@@ -377,7 +377,7 @@ class Matched:
     unknowns (B, P).
     """
 
-    pull: Pull
+    pull: MatchTargets
     landmarks: int
     free: int
     known: Callable[[np.ndarray], Terms]

@@ -11,8 +11,8 @@ from scanprep.geometry.least_squares import normal_equations
 from ..priors import GaussianPrior, typical_poses
 from . import energy
 from .bodies import FixedBody, Follow
-from .named_points import distinct, search
-from .scan import ScanPoints, spread
+from .named_points import distinct_bodies, search_bodies
+from .scan import ScanPoints, spread_points
 from .scan_fit import EVIDENCE, ScanFit
 from .upright import SPREAD, SPREAD_OF_MANY
 
@@ -72,18 +72,19 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
     mean = np.zeros(fit.body.n_angles + 3 + fit.body.n_betas)
     body = fit.body.fix_shape(mean)
     follow = body.follow(vertices, mean)
-    x, _ = search(body, follow, points, sd, fit.prior, AXES)
-    x = x[distinct(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), CANDIDATES)]
-    drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, fit.config.random_starts, fit.rng)
+    x, _ = search_bodies(body, follow, points, sd, fit.prior, AXES)
+    x = x[distinct_bodies(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), CANDIDATES)]
+    drawn = np.concatenate([x, *(sample_around(body, follow, start, points, sd, fit.prior, fit.config.random_starts,
+                                               fit.rng)
                                 for start in x)])
     drawn = np.hstack([drawn, np.zeros((len(drawn), fit.body.n_betas))])
-    drawn = drawn[np.argsort(at_a_glance(few, drawn))]
-    return drawn[distinct(places_of(few, drawn), CANDIDATES)]
+    drawn = drawn[np.argsort(coarse_cost(few, drawn))]
+    return drawn[distinct_bodies(sample_vertices(few, drawn), CANDIDATES)]
 
 
-def at_a_glance(fit: ScanFit, x: np.ndarray) -> np.ndarray:
+def coarse_cost(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     """How badly bodies (n, P) explain the scan, on very few points, whatever parts enter each other."""
-    scan, ids = fit.cloud.thin(POINTS), spread(fit.body.template.vertices[fit.ids], VERTICES)
+    scan, ids = fit.cloud.thin(POINTS), spread_points(fit.body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.pose_points(ids, *fit.body.split(x)[:2])
     apart = np.array([_distances(y, n, np.eye(3)[None], np.zeros((1, 3)), scan)[0]
                       for y, n in zip(places, normals, strict=True)])
@@ -93,14 +94,14 @@ def at_a_glance(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     return EVIDENCE / fit.config.scan_sd**2 * apart + unlikely
 
 
-def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
-           count: int, rng: np.random.Generator) -> np.ndarray:
+def sample_around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
+                  count: int, rng: np.random.Generator) -> np.ndarray:
     """Draws (count, P) of what the landmarks and the pose prior leave open around their optimum x (P,).
 
     The normal distribution whose precision is the Gauss-Newton matrix (Laplace's approximation).
     """
     weights = np.full(len(targets), sd**-2)
-    terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior(x[None], prior)]
+    terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior_term(x[None], prior)]
     free = body.n_angles + 3
     precision = normal_equations(terms).hessian[0, :free, :free] + 1e-6 * np.eye(free)
     drawn = np.repeat(x[None], count, axis=0)
@@ -120,15 +121,15 @@ def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
             ends = ends[:left]
             ends[:, :free] = [approach(held, x[:free], (reach,)) for x in ends]
             ends = ends[np.argsort([held.misfit(x[:free]) for x in ends], kind="stable")]
-        ends = ends[distinct(places_of(fit, ends), FINALISTS, ELSEWHERE)]
+        ends = ends[distinct_bodies(sample_vertices(fit, ends), FINALISTS, ELSEWHERE)]
         ends = np.array([approach(fit, x, COARSE[2:]) for x in ends])
     else:
         ends = np.array([approach(fit, x) for x in ends])
     ends = ends[np.argsort([fit.misfit(x) for x in ends], kind="stable")]
-    return ends[distinct(places_of(fit, ends), FINALISTS, ELSEWHERE)]
+    return ends[distinct_bodies(sample_vertices(fit, ends), FINALISTS, ELSEWHERE)]
 
 
-def places_of(fit: ScanFit, x: np.ndarray) -> np.ndarray:
+def sample_vertices(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     """Some vertices (n, L, 3) of bodies (n, P), in one shape, to tell which are alike."""
     return fit.body.subject.points(fit.sample.spread).evaluate(*fit.body.split(x)[:2])
 
@@ -147,7 +148,7 @@ def from_nothing(fit: ScanFit) -> np.ndarray:
     with what it shows and with what its camera must have seen.
     """
     x, _ = placements(fit)
-    return x[distinct(places_of(fit, x), BLIND, APART)]
+    return x[distinct_bodies(sample_vertices(fit, x), BLIND, APART)]
 
 
 def starting_poses(fit: ScanFit) -> np.ndarray:
@@ -180,7 +181,7 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body = fit.body
     poses, (turns, lift, up) = starting_poses(fit), candidate_rotations(fit)
-    scan, ids = fit.cloud.thin(POINTS), spread(body.template.vertices[fit.ids], VERTICES)
+    scan, ids = fit.cloud.thin(POINTS), spread_points(body.template.vertices[fit.ids], VERTICES)
     places, normals = fit.pose_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.data.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)

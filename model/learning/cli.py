@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from scanprep.arguments import UsageError
 from scanprep.batch.opening import FileWorkspace
-from scanprep.batch.room import Step, inside
+from scanprep.batch.room import Step, substeps
 from scanprep.batch.workspace import KeptSteps
 from scanprep.cli import Output, Person, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar, details
@@ -112,7 +112,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
             raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
         with bar("finding the skeleton") as progress:
             tree = step("skeleton", (body, posed, shown),
-                        lambda: choose_skeleton(body, posed, progress, inside(step, "skeleton"), shown).skeleton)
+                        lambda: choose_skeleton(body, posed, progress, substeps(step, "skeleton"), shown).skeleton)
     with bar("learning the model") as progress:
         how = progress, step
         models: Mapping[str, BodyModel] = (

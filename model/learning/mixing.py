@@ -13,7 +13,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from scanprep.batch.room import Step, once
+from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -26,7 +26,7 @@ from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from .config import LearnConfig
 from .regression import Design, compress, make_design
-from .scape import Progress, Work, check_skeleton, fit_poses, pose_examples, pose_prior
+from .scape import Progress, ProgressShares, check_skeleton, estimate_pose_prior, fit_poses, pose_examples
 
 # What `learn_scape_mix` takes by default. `refinements` is the number of rounds: of up to six, held-out bodies were met
 # best after two. Of a mix products of twists say more than of one person: 1.46 against 1.68 mm on new people.
@@ -46,7 +46,7 @@ class Mix:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class MixingState:
     """What a round hands to the next: poses (M, J, 3), the pose space, S (P, F, 3, 3) of every person, the design."""
 
     poses: np.ndarray
@@ -57,7 +57,7 @@ class State:
 
 @one_thread()
 def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hashable], skeleton: Skeleton,
-                    config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once
+                    config: LearnConfig | None = None, progress: Progress | None = None, step: Step = run_uncached
                     ) -> ScapeModel:
     """Learn a body model from any people in any poses.
 
@@ -101,10 +101,11 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     who, parts = number_people(subjects, len(bodies)), BlendedTemplate(template, skeleton, rigid_weights(skeleton))
     mix, inputs = Mix(parts, bodies, who, config), (parts, bodies, who, config)
 
-    def in_turns(work: Work) -> tuple[State, ShapeSpace]:
+    def in_turns(work: ProgressShares) -> tuple[MixingState, ShapeSpace]:
         # rigid parts, as Procrustes places them, and everybody of the template's shape
-        state = State(skeleton.pose_of(skeleton.fit_rotations(template, bodies)), PoseSpace.identity(skeleton),
-                      np.broadcast_to(np.eye(3, dtype=np.float32), (who.max() + 1, len(template.faces), 3, 3)), None)
+        state = MixingState(skeleton.pose_of(skeleton.fit_rotations(template, bodies)), PoseSpace.identity(skeleton),
+                            np.broadcast_to(np.eye(3, dtype=np.float32), (who.max() + 1, len(template.faces), 3, 3)),
+                            None)
         for number in range(config.refinements):
             state = work.step(f"round {number}", (*inputs, number), 1 / config.refinements,
                               partial(_next_round, mix, state, number))
@@ -112,17 +113,17 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
         volumes = np.bincount(who, body_volumes(template, bodies)) / np.bincount(who)
         return replace(state, S=state.S[:0]), learn_shape_space(state.S, config.components, volumes)
 
-    state, shapes = Work(progress, step).step("poses and shapes in turns", inputs, 1.0, in_turns)
+    state, shapes = ProgressShares(progress, step).step("poses and shapes in turns", inputs, 1.0, in_turns)
     assert state.design is not None
     examples = pose_examples(template, skeleton, state.poses)
-    prior = pose_prior(template, skeleton, examples, len(examples))
+    prior = estimate_pose_prior(template, skeleton, examples, len(examples))
     return ScapeModel(template, skeleton, state.space, shapes, *prior, {
         "settings": asdict(config), "bodies": len(bodies), "people": int(who.max()) + 1, "rounds": config.refinements,
         "pruning": state.design.pruning, "ridge": state.design.ridge, "features": state.space.features.count,
         "digest": digest(template, bodies, None), "digests": body_digests(bodies)}, pose_examples=examples)
 
 
-def _next_round(mix: Mix, state: State, number: int, work: Work) -> State:
+def _next_round(mix: Mix, state: MixingState, number: int, work: ProgressShares) -> MixingState:
     """Part rotations with the model held, then the pose model with the shapes held, then the shapes."""
     S, poses = state.S, state.poses.copy()
     # shape components that tell people apart: in each round twice as many as in the one before
@@ -131,13 +132,14 @@ def _next_round(mix: Mix, state: State, number: int, work: Work) -> State:
         S = (few.mean + np.tensordot(few.betas_of(S), few.components, axes=1)).astype(np.float32)
     for person in range(len(S) if number else 0):
         mine = mix.who == person
-        poses[mine] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[mine], poses[mine], Work(None))
+        poses[mine] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[mine], poses[mine],
+                                ProgressShares(None))
         work.tick(float(mine.mean()))
-    space, design = _learn_pose(mix, State(poses, state.space, S, state.design))         # [SCAPE] Eq. 4, Eq. 5
-    return State(poses, space, _learn_people(mix, poses, space), design)                # [SCAPE] Eq. 8
+    space, design = _learn_pose(mix, MixingState(poses, state.space, S, state.design))         # [SCAPE] Eq. 4, Eq. 5
+    return MixingState(poses, space, _learn_people(mix, poses, space), design)                # [SCAPE] Eq. 8
 
 
-def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
+def _learn_pose(mix: Mix, state: MixingState) -> tuple[PoseSpace, Design]:
     """The pose space with the shapes held, first as in the paper, then corrected on the stitched surface, as in
     `learn_pose`. [SCAPE] Eq. 4, Eq. 5
     """

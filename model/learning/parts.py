@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.batch.room import Step, once
+from scanprep.batch.room import Step, run_uncached
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.parts import SkeletonConfig
@@ -17,7 +17,7 @@ from scanprep.threads import one_thread
 from ..blending import BlendedTemplate, rigid_weights
 from ..human_poses import is_person
 from .config import LearnConfig
-from .scape import Progress, Work, learn_pose
+from .scape import Progress, ProgressShares, learn_pose
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
 MORE, TRIES = 4, 3                   # parts more each time, and the largest number of times
@@ -33,7 +33,7 @@ class ChosenSkeleton:
 
 
 @one_thread()
-def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None = None, step: Step = once,
+def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None = None, step: Step = run_uncached,
                     known: np.ndarray | None = None) -> ChosenSkeleton:
     """A skeleton with as many parts as help to predict poses that were left out.
 
@@ -141,7 +141,7 @@ def _leave_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, known:
     """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
     parts, prior = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton)), None
     if known is not None:
-        prior = learn_pose(parts, np.concatenate([coarse.vertices[None], known]), QUICK, Work(None))
+        prior = learn_pose(parts, np.concatenate([coarse.vertices[None], known]), QUICK, ProgressShares(None))
         if len(poses) == 1:
             return prior.design.left_out_error
-    return learn_pose(parts, poses, QUICK, Work(None), prior=prior).design.left_out_error
+    return learn_pose(parts, poses, QUICK, ProgressShares(None), prior=prior).design.left_out_error

@@ -22,7 +22,7 @@ from ..body import BodyModel
 from ..fitting.search import lay_model
 from ..posing.transfer import own_body
 from ..priors import sample_poses
-from ..resolution.transfer import Follower, transfer_skeleton
+from ..resolution.transfer import SurfaceCarrier, transfer_skeleton
 
 # Example poses of the model that are used, evenly over all. With 50 the skeleton of 8 poses had parts that nobody can
 # name; held-out poses were 8.5 mm off with 50, and 9.1 mm with 25.
@@ -81,7 +81,7 @@ def bring_prior(model: BodyModel, template: Mesh, progress: Callable[[int, int],
     """
     laid = lay_model(model, template, progress)
     own = own_body(model, laid.vertices)
-    ride = Follower(laid.with_vertices(own.vertices), template)
+    ride = SurfaceCarrier(laid.with_vertices(own.vertices), template)
     # the person as the model moves it, in poses that it was learned from, of which some models keep none
     known = model.pose_examples if len(model.pose_examples) else sample_poses(model, EXAMPLES, np.random.default_rng(0))
     examples = known[np.unique(np.linspace(0, len(known) - 1, EXAMPLES).astype(int))]

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from scanprep.batch.pool import SideBySide
-from scanprep.batch.room import Step, inside, once
+from scanprep.batch.room import Step, run_uncached, substeps
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
 from scanprep.skeleton.names import skeleton_doubts
@@ -47,10 +47,10 @@ ONE_POSE = 0.016                     # metres by which the built-in people's mov
 STRANGE = 0.02
 
 
-class Work:
+class ProgressShares:
     """Steps of some work, each a share of the whole, of which progress is told in thousandths."""
 
-    def __init__(self, progress: Progress | None, step: Step = once) -> None:
+    def __init__(self, progress: Progress | None, step: Step = run_uncached) -> None:
         self._progress, self._step, self._part, self._done = progress, step, 1.0, [0.0]
 
     def tick(self, share: float) -> None:
@@ -59,13 +59,13 @@ class Work:
         if self._progress:
             self._progress(round(1000 * self._done[0]), 1000)
 
-    def step(self, name: str, inputs: Any, share: float, make: Callable[[Work], T]) -> T:
+    def step(self, name: str, inputs: Any, share: float, make: Callable[[ProgressShares], T]) -> T:
         """What `make` returns, or returned before for the same inputs; it is a share of this work either way.
 
         `make` gets the work of its own steps, which are forgotten once it is done.
         """
         inner, end = copy(self), self._done[0] + share * self._part
-        inner._step, inner._part = inside(self._step, name), share * self._part
+        inner._step, inner._part = substeps(self._step, name), share * self._part
         value = self._step(name, inputs, lambda: make(inner))
         self.tick((end - self._done[0]) / self._part)
         return value
@@ -73,7 +73,7 @@ class Work:
 
 @one_thread()
 def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once,
+                config: LearnConfig | None = None, progress: Progress | None = None, step: Step = run_uncached,
                 prior: TemplatePrior | None = None) -> ScapeModel:
     """Learn a body model from one person in many poses and many people in about one pose.
 
@@ -110,12 +110,13 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
-    return ScapeModel(template, skeleton, **_learn_spaces(parts, poses, shapes, config, Work(progress, step), prior))
+    return ScapeModel(template, skeleton,
+                      **_learn_spaces(parts, poses, shapes, config, ProgressShares(progress, step), prior))
 
 
 @one_thread()
 def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                     config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once,
+                     config: LearnConfig | None = None, progress: Progress | None = None, step: Step = run_uncached,
                      prior: TemplatePrior | None = None) -> BlendScapeModel:
     """Learn a body model whose rotations blend across the borders of parts.
 
@@ -138,12 +139,12 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
     # a share of the template's diagonal: so far a rotation blends over the border of its part
     blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
-    learned = _learn_spaces(parts, poses, shapes, config, Work(progress, step), prior)
+    learned = _learn_spaces(parts, poses, shapes, config, ProgressShares(progress, step), prior)
     return BlendScapeModel(template, skeleton, **learned, blend=blend)
 
 
 def _learn_spaces(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig | None,
-                  work: Work, prior: TemplatePrior | None) -> dict[str, Any]:
+                  work: ProgressShares, prior: TemplatePrior | None) -> dict[str, Any]:
     """Pose space, shape space, pose prior and info of a SCAPE model of either kind."""
     config = config or LearnConfig()
     poses, shapes = check_training(parts.template, parts.skeleton, poses, shapes, prior)
@@ -154,7 +155,7 @@ def _learn_spaces(parts: BlendedTemplate, poses: np.ndarray, shapes: np.ndarray 
 
 
 def learn_pose_with(prior: TemplatePrior | None, parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig,
-                    work: Work) -> LearnedPose:
+                    work: ProgressShares) -> LearnedPose:
     """The pose space of bodies (M, N, 3), which leans on a prior where there is one; two thirds of the work."""
     if prior is None:
         return learn_pose(parts, bodies, config, work, POSES)
@@ -173,7 +174,8 @@ class LearnedPose:
     design: Design
 
 
-def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: Work, share: float = 1.0,
+def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: ProgressShares,
+               share: float = 1.0,
                prior: LearnedPose | None = None) -> LearnedPose:
     """The pose space, first as in the paper, then refined on the stitched surface; a share of the work.
 
@@ -184,7 +186,7 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
     inputs = (parts, bodies, replace(config, components=0), prior and (prior.space, prior.poses))
     system = GradientSystem(template, config.smoothness, skeleton.part_of_face)
 
-    def first(_: Work) -> LearnedPose:
+    def first(_: ProgressShares) -> LearnedPose:
         """Q of every body from the rotations of Procrustes, regressed on the joint twists."""
         poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))                      # R, then Δr
         Q = pose_gradients(system, parts.local_edges(bodies, poses))                            # [SCAPE] Eq. 5
@@ -195,7 +197,7 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
         design = min(designs, key=attrgetter("left_out_error"))         # of equals, as of one pose, that with the prior
         return LearnedPose(design.fit(poses, Q), poses, design)                                 # [SCAPE] Eq. 4
 
-    def learn(inner: Work) -> LearnedPose:
+    def learn(inner: ProgressShares) -> LearnedPose:
         share = 1 / (1 + config.refinements)
         learned = inner.step("first fit", inputs, share, first)
         for k in range(config.refinements):
@@ -211,7 +213,7 @@ def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, 
 
 
 def _refine(parts: BlendedTemplate, system: GradientSystem, bodies: np.ndarray, config: LearnConfig,
-            learned: LearnedPose, choosing: bool, work: Work) -> LearnedPose:
+            learned: LearnedPose, choosing: bool, work: ProgressShares) -> LearnedPose:
     """The part rotations fitted anew, and Q regressed again on what the stitched model leaves.
 
     Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So what the stitched model
@@ -245,7 +247,8 @@ def _correction(parts: BlendedTemplate, system: GradientSystem, left: np.ndarray
     return pose_gradients(system, parts.v_hat + left) - np.eye(3)
 
 
-def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Work, config: FitConfig | None = None
+def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: ProgressShares,
+              config: FitConfig | None = None
               ) -> np.ndarray:
     """Poses (M, J, 3), radians, with which the subject comes nearest to the bodies, from poses nearby."""
     fitter = PoseFitter(subject, config or FitConfig(polish=0))
@@ -256,7 +259,8 @@ def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Wor
     return np.stack(fitted)
 
 
-def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig, work: Work,
+def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig,
+                 work: ProgressShares,
                  prior: TemplatePrior | None = None) -> ShapeSpace:
     """The space of body shapes of people (P, N, 3), who may be none, and of the prior's. [SCAPE] Eq. 7, Eq. 8"""
     if shapes is None and prior is None:
@@ -264,7 +268,7 @@ def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | 
         return ShapeSpace.empty(len(parts.template.faces))
     people = np.zeros((0, *parts.template.vertices.shape)) if shapes is None else shapes
 
-    def learn(inner: Work) -> ShapeSpace:
+    def learn(inner: ProgressShares) -> ShapeSpace:
         S, volumes = shape_deformations(parts, space, people, config, inner), body_volumes(parts.template, people)
         if prior is None:
             return learn_shape_space(S, config.components, volumes)
@@ -286,7 +290,8 @@ def prior_deformations(parts: BlendedTemplate, space: PoseSpace, people: np.ndar
     return np.stack([solve(parts.local_edges(person, pose)).astype(np.float32) for person in people])
 
 
-def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig, work: Work
+def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig,
+                       work: ProgressShares
                        ) -> np.ndarray:
     """S (P, F, 3, 3) of every person, in float32 to halve the memory.
 
@@ -316,7 +321,7 @@ def training_metadata(template: Mesh, skeleton: Skeleton, learned: LearnedPose, 
                       ) -> dict[str, Any]:
     """What a model keeps of its making: the pose prior, its examples, and settings, choices, sizes and digests."""
     design, examples = learned.design, pose_examples(template, skeleton, learned.poses, shapes)
-    mean, covariance = pose_prior(template, skeleton, examples, len(poses))
+    mean, covariance = estimate_pose_prior(template, skeleton, examples, len(poses))
     if prior is not None:                   # what joints do that no scan bends
         examples = np.concatenate([examples, pose_examples(
             template, skeleton, skeleton.pose_of(skeleton.fit_rotations(template, prior.poses)))])
@@ -353,8 +358,8 @@ def joint_evidence(learned: LearnedPose) -> list[float]:
     return [1.0, *share[1:].tolist()]
 
 
-def pose_prior(template: Mesh, skeleton: Skeleton, examples: np.ndarray, count: int
-               ) -> tuple[np.ndarray, np.ndarray]:
+def estimate_pose_prior(template: Mesh, skeleton: Skeleton, examples: np.ndarray, count: int
+                        ) -> tuple[np.ndarray, np.ndarray]:
     """Mean (J, 3) and covariance (3J, 3J) of poses, radians, zero for the root, from `pose_examples` (M, J, 3).
 
     The first `count`, which one person took for the sake of the pose, are mixed with what people do. They and the

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.batch.room import Step, once
+from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -20,12 +20,20 @@ from ..shape_space import ShapeSpace, body_volumes, learn_shape_space
 from ..shape_statistics import PLANE, SEXES
 from .config import LearnConfig
 from .prior import TemplatePrior
-from .scape import POSES, Progress, Work, check_training, learn_pose_with, shape_deformations, training_metadata
+from .scape import (
+    POSES,
+    Progress,
+    ProgressShares,
+    check_training,
+    learn_pose_with,
+    shape_deformations,
+    training_metadata,
+)
 
 
 @one_thread()
 def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: Sequence[str], skeleton: Skeleton,
-                 config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once,
+                 config: LearnConfig | None = None, progress: Progress | None = None, step: Step = run_uncached,
                  prior: TemplatePrior | None = None) -> dict[str, ScapeModel]:
     """Learn a model of everybody and one of each sex: one pose space, and a space of shapes a group.
 
@@ -57,10 +65,10 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     assert people is not None
     sex, groups = np.array(list(sexes), dtype=object), _groups(sexes, len(people))
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))
-    work = Work(progress, step)
+    work = ProgressShares(progress, step)
     learned = learn_pose_with(prior, parts, poses, config, work)
 
-    def learn(inner: Work) -> tuple[dict[str, ShapeSpace], dict[str, object] | None]:
+    def learn(inner: ProgressShares) -> tuple[dict[str, ShapeSpace], dict[str, object] | None]:
         S = shape_deformations(parts, learned.space, people, config, inner)
         volumes = body_volumes(template, people)
         spaces = {name: learn_shape_space(S[chosen], config.components, volumes[chosen])

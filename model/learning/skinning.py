@@ -7,7 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from scanprep.batch.room import Step, once
+from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
@@ -21,7 +21,7 @@ from ..pose_space import principal_directions
 from ..shape_space import body_volumes, learn_shape_space
 from ..skinning import SkinningModel, invert_blended
 from .regression import ridge_operator
-from .scape import POSES, Progress, Work, check_training, fit_poses, pose_examples, pose_prior
+from .scape import POSES, Progress, ProgressShares, check_training, estimate_pose_prior, fit_poses, pose_examples
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
 PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
@@ -56,7 +56,7 @@ class SkinConfig(Settings):
 
 @one_thread()
 def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                   config: SkinConfig | None = None, progress: Progress | None = None, step: Step = once
+                   config: SkinConfig | None = None, progress: Progress | None = None, step: Step = run_uncached
                    ) -> SkinningModel:
     """Learn a skinning model from one person in many poses and many people in about one pose.
 
@@ -73,9 +73,9 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     """
     config = config or SkinConfig()
     poses, shapes = check_training(template, skeleton, poses, shapes)
-    kinds, work = (False, True) if config.correctives else (False,), Work(progress, step)
+    kinds, work = (False, True) if config.correctives else (False,), ProgressShares(progress, step)
 
-    def learn(inner: Work) -> tuple[SkinningModel, np.ndarray]:
+    def learn(inner: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
         at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
         model = _start(template, skeleton, config)
         for correctives in kinds:
@@ -89,7 +89,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
         model = work.step("shape components", (model, shapes, config.components), 1 - POSES,
                           partial(_learn_people, model, shapes, config.components))
     examples = pose_examples(template, skeleton, at, shapes)
-    mean, covariance = pose_prior(template, skeleton, examples, len(at))
+    mean, covariance = estimate_pose_prior(template, skeleton, examples, len(at))
     info = {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
             **model.info, "digest": digest(template, poses, shapes)}
     return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)
@@ -106,7 +106,7 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
 
 
 def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, share: float,
-                work: Work) -> tuple[SkinningModel, np.ndarray]:
+                work: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
     allowed = diffuse_weights(model.template, model.skeleton, 2 * config.width) > 0
     model = replace(model, info={"left_out_error": np.inf})
@@ -123,7 +123,7 @@ def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, con
 
 
 def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray, config: SkinConfig,
-                work: Work) -> tuple[SkinningModel, np.ndarray]:
+                work: ProgressShares) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives, each fitted to the others once."""
     fitted = fit_poses(model.subject(), bodies, poses, work, QUICK)
     tried = _with_weights(model, fitted, bodies, allowed, config)
@@ -245,7 +245,7 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
     return rest, correctives, float(np.sqrt(total / (M * len(rest))))
 
 
-def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, work: Work) -> SkinningModel:
+def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, work: ProgressShares) -> SkinningModel:
     """The model with the shape components of people (P, N, 3) whose poses are fitted and undone in turn."""
     share = 1 / (PEOPLE_ROUNDS * len(shapes))
     for k in range(PEOPLE_ROUNDS):
@@ -259,6 +259,7 @@ def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, wor
     return model
 
 
-def _unpose_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray, _: Work) -> np.ndarray:
+def _unpose_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray,
+                   _: ProgressShares) -> np.ndarray:
     """(N, 3) rest vertices of a person whose pose is fitted."""
     return model.unpose(body, fitter.fit(body).pose)

@@ -11,8 +11,8 @@ import numpy as np
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 
-from .marks import Places, places_of
-from .section import Carried, Curve, direction, mean_of, section, tape
+from .marks import BodyLandmarks, body_landmarks
+from .section import Carried, SectionCurve, direction, mean_of, section, tape
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
 BAND = 0.10                          # how far from its place on the template a tape may run, along the surface
@@ -40,7 +40,7 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
     ValueError
         A landmark that is needed is missing.
     """
-    finder = _Finder(places_of(template, landmarks))
+    finder = _Finder(body_landmarks(template, landmarks))
     found, missing = dict[str, Found](), dict[str, str]()
     for name, find in finder.recipes():
         try:
@@ -55,7 +55,7 @@ def find_tapes(template: Mesh, landmarks: Mapping[str, int]) -> Tapes:
 class _Finder:
     """The recipe of each measurement, on one template."""
 
-    def __init__(self, places: Places) -> None:
+    def __init__(self, places: BodyLandmarks) -> None:
         self.places, self.mesh = places, places.mesh
         self.graph = SurfaceGraph(self.mesh)
         height = self.mesh.vertices @ places.up
@@ -128,7 +128,7 @@ class _Finder:
             self.places.at(name)
         return mean_of(*(self.places.of[name] for name in names))
 
-    def loop(self, origin: np.ndarray, normal: np.ndarray) -> Curve:
+    def loop(self, origin: np.ndarray, normal: np.ndarray) -> SectionCurve:
         """The closed section by a plane that is nearest to a point (3,) of it, at most 12 cm away."""
         curves = section(self.mesh.vertices, self.mesh.faces, origin, normal)
         far = [np.linalg.norm(curve.at(self.mesh.vertices).mean(axis=0) - origin) for curve in curves]
@@ -198,7 +198,7 @@ class _Finder:
         lengths = [sign * self.around(self.loop(*at), at[1]) for at in planes]
         return self.keep(name, planes[int(np.argmax(lengths))], axis, band)
 
-    def around(self, ring: Curve, normal: np.ndarray) -> float:
+    def around(self, ring: SectionCurve, normal: np.ndarray) -> float:
         """Metres of a tape around a section."""
         points = ring.at(self.mesh.vertices)
         hull = points[tape(points, normal)]

@@ -19,7 +19,7 @@ ABOVE = ("top of head", "neck front", "neck back", "left ear", "right ear")
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class BodyLandmarks:
     """Named vertices of a template, and which way is up, left and ahead: the rows of `axes` (3, 3)."""
 
     mesh: Mesh
@@ -42,7 +42,7 @@ class Places:
         return float(self.at(*names) @ self.up)
 
 
-def places_of(mesh: Mesh, landmarks: Mapping[str, int]) -> Places:
+def body_landmarks(mesh: Mesh, landmarks: Mapping[str, int]) -> BodyLandmarks:
     """The landmarks of a template, by our names, and its axes.
 
     Up is the axis of coordinates along which head or neck are above the feet, where the body stands along one.
@@ -66,4 +66,4 @@ def places_of(mesh: Mesh, landmarks: Mapping[str, int]) -> Places:
     ahead = at["left toe"] - at["left heel"] + at["right toe"] - at["right heel"]
     ahead -= (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)
-    return Places(mesh, known, np.stack([up, np.cross(up, ahead), ahead]))
+    return BodyLandmarks(mesh, known, np.stack([up, np.cross(up, ahead), ahead]))

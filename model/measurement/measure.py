@@ -9,7 +9,7 @@ import numpy as np
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 
-from .reading import NotMeasured, Reading, Standing, read
+from .reading import NotMeasured, Reading, Standing, read_measurement
 from .tapes import Tapes
 
 TURNED = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}       # degrees from the standard pose that change little
@@ -93,7 +93,7 @@ def measure(body: Mesh | np.ndarray, tapes: Tapes, axes: np.ndarray | None = Non
     readings, missing = dict[str, Reading](), dict(tapes.missing)
     for name in tapes.found if only is None else [n for n in only if n in tapes.found]:
         try:
-            readings[name] = read(tapes.found[name], standing, tapes)
+            readings[name] = read_measurement(tapes.found[name], standing, tapes)
         except NotMeasured as problem:
             missing[name] = str(problem)
     errors = {name: reading.unknown if expected_error is None else measurement_error(reading, vertices, expected_error)

@@ -5,10 +5,10 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 
-from .section import Curve, chain_length
+from .section import SectionCurve, chain_length
 
 
-def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> tuple[float, Curve]:
+def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> tuple[float, SectionCurve]:
     """Exact length, metres, of the shortest way along triangles from one vertex to another, and the way itself.
 
     Parameters
@@ -44,7 +44,7 @@ def shortest_path(body: np.ndarray, faces: np.ndarray, start: int, end: int) -> 
 
     best = minimize(length, share, jac=True, method="L-BFGS-B", bounds=[(0, 1)] * len(share),
                     options={"maxiter": 200, "ftol": 1e-14})
-    return float(far[places[1]]), Curve(used[edges], np.asarray(best.x), False)
+    return float(far[places[1]]), SectionCurve(used[edges], np.asarray(best.x), False)
 
 
 def _descent(mesh: Mesh, far: np.ndarray, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 
 from .path import shortest_path
-from .section import Carried, Curve, around, bulge, chain_length, direction, section, tape
+from .section import Carried, SectionCurve, bulge, chain_length, direction, section, tape, tape_length
 from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Weight
 
 # Kilograms of a person per cubic metre inside the skin. Tissue has 1,030 to 1,080, by the share of fat; lungs that are
@@ -59,7 +59,7 @@ class Reading:
 
 
 @singledispatch
-def read(found: Found, body: Standing, tapes: Tapes) -> Reading:
+def read_measurement(found: Found, body: Standing, tapes: Tapes) -> Reading:
     """One measurement of a body.
 
     Raises
@@ -70,12 +70,12 @@ def read(found: Found, body: Standing, tapes: Tapes) -> Reading:
     raise TypeError(f"expected a measurement, got {type(found).__name__}")
 
 
-@read.register
+@read_measurement.register
 def _girth(found: Girth, body: Standing, tapes: Tapes) -> Reading:
     cut = _cut_girth(found, body, tapes)
     points = cut.points[cut.hull]
     apart = np.abs(cut.hull - np.roll(cut.hull, 1))
-    value, pull = around(points, (apart == 1) | (apart == len(cut.points) - 1))       # next to each other on the skin
+    value, pull = tape_length(points, (apart == 1) | (apart == len(cut.points) - 1))    # next to each other on the skin
     return Reading(value, np.concatenate([points, points[:1]]), *_section_derivative(found, cut, cut.hull, pull, body))
 
 
@@ -86,7 +86,7 @@ class _Cut:
     `change` (m, 3): how the bulge at a point changes as it goes along its edge, by the share of the edge.
     """
 
-    curve: Curve
+    curve: SectionCurve
     origin: np.ndarray
     normal: np.ndarray
     points: np.ndarray
@@ -119,7 +119,8 @@ def _cut_girth(found: Girth, body: Standing, tapes: Tapes) -> _Cut:
         curve = curves[int(np.argmin(far))]
         if found.under_arms and not curve.closed:
             pieces = [c for c in curves if not c.closed]
-            curve = Curve(np.concatenate([c.edges for c in pieces]), np.concatenate([c.share for c in pieces]), True)
+            curve = SectionCurve(np.concatenate([c.edges for c in pieces]), np.concatenate([c.share for c in pieces]),
+                                 True)
         if curve.closed:
             off, change = bulge(vertices, body.mesh.vertex_normals, curve)
             points = curve.at(vertices) + off
@@ -160,7 +161,7 @@ def _plane_pull(found: Girth, out: np.ndarray, apart: np.ndarray, normal: np.nda
     return np.concatenate(ids), np.concatenate(force)
 
 
-@read.register
+@read_measurement.register
 def _span(found: Span, body: Standing, tapes: Tapes) -> Reading:
     girth = tapes.found[found.girth]
     assert isinstance(girth, Girth)
@@ -176,7 +177,7 @@ def _through(middle: np.ndarray, points: np.ndarray, way: np.ndarray) -> np.ndar
     return middle + np.outer((points - middle) @ way, way)
 
 
-@read.register
+@read_measurement.register
 def _height(found: Height, body: Standing, tapes: Tapes) -> Reading:
     up, height = body.axes[0], body.vertices @ body.axes[0]
     floor = int(height.argmin())
@@ -188,7 +189,7 @@ def _height(found: Height, body: Standing, tapes: Tapes) -> Reading:
                    0.0 if found.top is None else float(np.linalg.norm(top.weights)))
 
 
-@read.register
+@read_measurement.register
 def _straight(found: Straight, body: Standing, tapes: Tapes) -> Reading:
     ends = np.stack([found.first.at(body.vertices), found.second.at(body.vertices)])
     way = ends[1] - ends[0]
@@ -198,7 +199,7 @@ def _straight(found: Straight, body: Standing, tapes: Tapes) -> Reading:
     return Reading(value, ends, ids, weights[:, None] * (way / value), ENDS)
 
 
-@read.register
+@read_measurement.register
 def _extent(found: Extent, body: Standing, tapes: Tapes) -> Reading:
     vertices, up = body.vertices, body.axes[0]
     way = found.second.at(vertices) - found.first.at(vertices)
@@ -215,7 +216,7 @@ def _extent(found: Extent, body: Standing, tapes: Tapes) -> Reading:
                    np.concatenate([-way[None], way[None], weights[:, None] * turned / length]))
 
 
-@read.register
+@read_measurement.register
 def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
     total, drawn, ids, force = 0.0, list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     last = len(found.faces) - 1
@@ -240,7 +241,7 @@ def _way(found: Way, body: Standing, tapes: Tapes) -> Reading:
     return Reading(total, np.concatenate(drawn), np.concatenate(ids), np.concatenate(force), ENDS)
 
 
-def _until(girth: Girth, way: Curve, body: Standing) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+def _until(girth: Girth, way: SectionCurve, body: Standing) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """What a way, its last point first, lacks as far as the plane of a girth, straight on; or has too much.
 
     Metres; the points that it then has; vertices (k,) and their force (k, 3).
@@ -265,7 +266,7 @@ def _until(girth: Girth, way: Curve, body: Standing) -> tuple[float, np.ndarray,
             (np.r_[last, before, ids], np.vstack([by_ahead - reach / rise * normal, -by_ahead, force])))
 
 
-@read.register
+@read_measurement.register
 def _weight(found: Weight, body: Standing, tapes: Tapes) -> Reading:
     a, b, c = np.moveaxis(body.mesh.corners, 1, 0)
     by_corner = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1) / 6      # of the volume

@@ -30,7 +30,7 @@ def direction(axis: tuple[Carried, Carried], body: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class SectionCurve:
     """Points on edges of a mesh, one after the other: `edges` (m, 2) vertices and the place `share` (m,) between them.
 
     `closed`: it ends where it begins.
@@ -53,7 +53,7 @@ class Curve:
         return Carried(self.edges.T.ravel(), np.concatenate([weights * (1 - self.share), weights * self.share]))
 
 
-def section(body: np.ndarray, faces: np.ndarray, origin: np.ndarray, normal: np.ndarray) -> list[Curve]:
+def section(body: np.ndarray, faces: np.ndarray, origin: np.ndarray, normal: np.ndarray) -> list[SectionCurve]:
     """The curves in which a plane cuts triangles, longest first.
 
     Parameters
@@ -79,7 +79,7 @@ def section(body: np.ndarray, faces: np.ndarray, origin: np.ndarray, normal: np.
     edges = np.stack(np.divmod(keys, len(body)), axis=1)
     first, second = height[edges].T
     share = first / (first - second)
-    found = [Curve(edges[chain], share[chain], closed) for chain, closed in _chains(links.reshape(-1, 2))]
+    found = [SectionCurve(edges[chain], share[chain], closed) for chain, closed in _chains(links.reshape(-1, 2))]
     return sorted(found, key=lambda curve: -len(curve.share))
 
 
@@ -114,7 +114,7 @@ def tape(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return ConvexHull(points @ across.T).vertices
 
 
-def around(points: np.ndarray, near: np.ndarray | None = None) -> tuple[float, np.ndarray]:
+def tape_length(points: np.ndarray, near: np.ndarray | None = None) -> tuple[float, np.ndarray]:
     """Length of a closed tape over points (m, 3), metres, and its gradient (m, 3) by them.
 
     `near` (m,) bool: between a point and the one before the tape lies on the skin, which bends as the tape does at the
@@ -139,7 +139,7 @@ def chain_length(points: np.ndarray) -> tuple[float, np.ndarray]:
     return float(lengths.sum()), ways[:-1] - ways[1:]
 
 
-def bulge(body: np.ndarray, normals: np.ndarray, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
+def bulge(body: np.ndarray, normals: np.ndarray, curve: SectionCurve) -> tuple[np.ndarray, np.ndarray]:
     """How far (m, 3), metres, the smooth surface lies from a curve's points on edges: coarse triangles cut corners.
     And how that changes (m, 3) along the edges, of which each is 1 long.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 
-from .section import Carried, Curve
+from .section import Carried, SectionCurve
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Girth:
     centre: Carried
     axis: tuple[Carried, Carried] | None
     faces: np.ndarray
-    ring: Curve                          # on the template
+    ring: SectionCurve                          # on the template
     under_arms: bool = False
     aside: int = 0
 

@@ -19,7 +19,7 @@ MOST, LEAN = 10.0, 20.0              # degrees that segments may be off on avera
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class RetargetingError:
     """How well a body follows a motion."""
 
     names: tuple[str, ...]           # of the ends of the S segments
@@ -39,7 +39,7 @@ class Followed:
         return float(self.distances.mean())
 
 
-def measure_error(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Followed:
+def measure_error(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> RetargetingError:
     """The error of a body in poses (T, J, 3), with its joints at centres (T, J, 3), against the motion of the pair.
 
     Bones differ in length, so the joints of the motion are set out anew from the middle of the hips: in the directions
@@ -65,7 +65,7 @@ def measure_error(pair: Pairing, poses: np.ndarray, centres: np.ndarray) -> Foll
         angles.append(np.degrees(np.arctan2(np.linalg.norm(np.cross(theirs, own), axis=1), (theirs * own).sum(axis=1))))
     places = np.stack([wanted[b] for _, b in ends], axis=1)
     off = np.linalg.norm(np.stack([here[b] for _, b in ends], axis=1) - places, axis=2)
-    return Followed(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places, lean)
+    return RetargetingError(tuple(b for _, b in ends), np.stack(angles, axis=1), off, places, lean)
 
 
 def _nodes(joints: np.ndarray, roles: dict[str, int]) -> dict[str, np.ndarray]:

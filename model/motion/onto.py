@@ -16,7 +16,7 @@ from ..body import BodyModel
 from ..linear import Subject
 from .amass import BODY, UNCERTAIN, moving_body, with_joints
 from .bvh import read_bvh
-from .error import Followed, measure_error
+from .error import RetargetingError, measure_error
 from .files import betas_for, check_ours, read_motion_file
 from .moving import MovingSkeleton
 from .retarget import Pairing, Retargeted, retarget_pair
@@ -35,7 +35,7 @@ class BodyMotion:
     how: str = "as it is"            # how it came onto the body
     rest: str = ""                   # what is not certain about the rest of its own skeleton
     brought: Retargeted | None = None    # what followed what, and how well, of a motion of another skeleton
-    fit: Followed | None = None
+    fit: RetargetingError | None = None
 
     def at_rate(self, rate: float) -> BodyMotion:
         """The motion with so many frames a second: joints turn the shortest way between frames, places go straight."""

@@ -19,7 +19,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..rig import check_motion, joint_places
 from .moving import MovingSkeleton
-from .trunks import group_trunk, heights, nearest_starts, spread
+from .trunks import group_trunk, heights, nearest_starts, spread_rotations
 
 Vertices = Callable[[np.ndarray, np.ndarray], np.ndarray]   # poses (T, J, 3), trans (T, 3) -> (T, N, 3), metres
 
@@ -130,7 +130,7 @@ class Pairing:
             joints = way(moving.parents, pelvis, top)[1:]
         necks = way(moving.parents, top, self.theirs.get("skullbase", top))
         if len(joints) < len(parts):
-            out, told = spread(moving, [pelvis, *joints] if joints[0] != pelvis else joints, parts)
+            out, told = spread_rotations(moving, [pelvis, *joints] if joints[0] != pelvis else joints, parts)
         elif parts:
             links = [b if self.skeleton.parents[b] == a else a for a, b in pairwise(below)]
             starts = nearest_starts(heights(self.joints, links, self.ours), heights(moving.rest, joints, self.theirs))
@@ -138,7 +138,7 @@ class Pairing:
             out, told = group_trunk(moving, joints, starts, parts, carried)
         else:
             out, told = {}, {}
-        more = spread(moving, necks, beyond[1:])
+        more = spread_rotations(moving, necks, beyond[1:])
         for part in beyond[1:-1]:
             out[part], told[part] = more[0][part], more[1][part]
         return {part: np.broadcast_to(M, R[:, 0].shape) for part, M in out.items()}, told

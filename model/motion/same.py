@@ -5,7 +5,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 from scanprep.skeleton.tree import Skeleton
 
 from ..rig import joint_places, turn_up
@@ -30,7 +30,7 @@ def copy_motion(skeleton: Skeleton, rest: Mesh, vertices: Vertices, moving: Movi
         return None
     ours, theirs = skeleton.joints[bones] - skeleton.joints[skeleton.parents[bones]], moving.offsets[order][bones]
     # the rotation that swaps axes and brings our bones nearest to theirs, the usual one where it is as near
-    turns = np.concatenate([turn_up(upright(rest)[0])[None], Rotation.create_group("O").as_matrix().round()])
+    turns = np.concatenate([turn_up(guess_upright(rest)[0])[None], Rotation.create_group("O").as_matrix().round()])
     sizes = np.linalg.norm(ours, axis=1) * np.linalg.norm(theirs, axis=1)
     kept = sizes > 1e-9
     if not kept.any():

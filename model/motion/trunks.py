@@ -52,8 +52,8 @@ def heights(joints: np.ndarray, some: Sequence[int], roles: Mapping[str, int]) -
     return np.asarray((joints[some] - hips) @ along / (along @ along))
 
 
-def spread(moving: MovingSkeleton, steps: Sequence[int], parts: Sequence[int]
-           ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
+def spread_rotations(moving: MovingSkeleton, steps: Sequence[int], parts: Sequence[int]
+                     ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
     """Rotations (T, 3, 3) for parts that follow some joints, spread evenly over them; the last follows the last."""
     out, told = {}, {}
     for i, part in enumerate(parts, start=1):

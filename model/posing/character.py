@@ -137,7 +137,7 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
     pose = character_pose(model, body.vertices, config.character)
     found = character_model(model, body.vertices, config.character, pose)
     joints = model.joint_regressor @ body.vertices
-    return Character(found, body, pose, joints, inside(body, joints), fit)
+    return Character(found, body, pose, joints, points_inside(body, joints), fit)
 
 
 def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.ndarray,
@@ -161,7 +161,7 @@ def _spread(points: np.ndarray) -> float:
     return float(np.sqrt(((points - points.mean(axis=0))**2).sum(axis=1).mean()))
 
 
-def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+def points_inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     """Which points (n, 3) lie inside a closed mesh; ValueError for one that is not finite."""
     import igl
 

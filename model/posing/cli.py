@@ -19,7 +19,7 @@ from scanprep.ranges import BETAS, TURNS, Beta
 from ..body import BodyModel
 from ..cli import ModelArg, read_body
 from ..export.cli import write_frames
-from ..export.conventions import standing
+from ..export.conventions import stand_mesh
 from ..files import load_model
 from ..linear import Subject
 from ..motion.files import betas_for
@@ -140,7 +140,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         np.array(betas if betas else (0.0,)))
     vertices = person.vertices(turns)
     body = loaded.template.with_vertices(vertices)
-    write_mesh(output, standing(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
+    write_mesh(output, stand_mesh(body, loaded.template, None, ground, front, rotations.exp(turns[0])))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")],
                    judgement=Judgement() if person.betas is None else person_judgement(loaded, person.betas, ASKED))

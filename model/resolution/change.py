@@ -12,7 +12,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.ranges import Settings
 
 from ..body import BodyModel, Progress
-from .transfer import Follower, transfer_skeleton
+from .transfer import SurfaceCarrier, transfer_skeleton
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, beta
 
     With betas (B, k), or of the template's own body.
     """
-    follow, gaps = Follower(model.template, changed.template), []
+    follow, gaps = SurfaceCarrier(model.template, changed.template), []
     for b, pose in enumerate(poses):
         mine = None if betas is None else betas[b]
         off = follow.positions(model.vertices(pose, mine)) - changed.vertices(pose, mine)
@@ -85,7 +85,7 @@ def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, beta
     return np.array(gaps)
 
 
-def subdivide(mesh: Mesh, times: int = 1) -> Mesh:
+def subdivide_at_middles(mesh: Mesh, times: int = 1) -> Mesh:
     """Every triangle cut into four by the middles of its sides, so that the surface stays."""
     import igl
 
@@ -96,7 +96,7 @@ def resample(mesh: Mesh, vertices: int) -> Mesh:
     """About so many vertices on the same surface: subdivided until there are enough, then decimated."""
     times = 0
     while len(mesh.vertices) < vertices:
-        mesh, times = subdivide(mesh), times + 1
+        mesh, times = subdivide_at_middles(mesh), times + 1
     faces = len(mesh.faces) - 2 * (len(mesh.vertices) - vertices)
     return decimate(mesh, faces, DecimateConfig(method="even" if times else "quadric"))
 

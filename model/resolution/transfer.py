@@ -118,7 +118,7 @@ def _cuts(old: Mesh, new: Mesh) -> int:
     return int(np.clip(np.ceil(2 * np.sqrt(len(old.faces) / len(new.faces))), 2, 12))
 
 
-class Follower:
+class SurfaceCarrier:
     """The vertices of one triangulation as points that ride on another one, both at rest."""
 
     def __init__(self, ridden: Mesh, rider: Mesh) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from scanprep.arguments import UsageError
 from scanprep.batch.pool import Workers
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cleaning.clean_scan import clean_scan, cleaning_doubts
 from scanprep.cli import MM, Output, ScanArg, Unit
@@ -19,7 +19,7 @@ from scanprep.folders import FolderCommand, do_one, figure
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import NAMED, Judgement, beyond_people
+from scanprep.judgement import NAMED, Judgement, implausible_body
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
@@ -27,7 +27,7 @@ from scanprep.pipeline.scans import ScanTask, find_scans
 from scanprep.ranges import Positive
 from scanprep.registration.nonrigid import share_uncovered
 from scanprep.skeleton.roles import in_words
-from scanprep.surfaces.cloud import read_surface
+from scanprep.surfaces.cloud import read_sound_surface
 
 from ..cli import read_body
 from ..files import load_model
@@ -46,12 +46,12 @@ from .detail.reconstruction import (
     measure_levels,
     remaining_error,
 )
-from .detail.subdivision import subdivide, subdivide_adaptive
+from .detail.subdivision import subdivide_adaptive, subdivide_uniform
 from .detail.texels import bake_texture, scan_look
 from .files import load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, fit_statue
-from .motion.motions import follower_of, read_statue_motion, write_motion
-from .registration.automatic import likely_unit
+from .motion.motions import follower_of, read_statue_motion, write_body_motion
+from .registration.automatic import guess_person_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
 
@@ -107,7 +107,7 @@ class Work:
     unit: Unit | None = None                                      # of scans and features, where files cannot tell
     command: str = field(default="", metadata={"digest": False})  # for the report of each scan of a folder
 
-    def __call__(self, inputs: ScanTask, room: Room) -> list[Metric]:
+    def __call__(self, inputs: ScanTask, room: TaskContext) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
         start = time.perf_counter()
         scan, texture, rows, doubts = read_scan(inputs, self.unit)
@@ -213,7 +213,7 @@ def judge_statue(statue: FittedStatue, scan: Mesh, finest: Level, left_out: Sequ
     found = Judgement.of(failed, check)
     if names != humanoid().skeleton.names:
         return found
-    return found.merge(beyond_people(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
+    return found.merge(implausible_body(float(np.ptp(scan.vertices[:, statue.upright_axis]))))
 
 
 def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric], list[str]]:
@@ -223,14 +223,14 @@ def read_scan(inputs: ScanTask, unit: Unit | None) -> tuple[Mesh, Texture | None
     """
     sought = unit is None and inputs.landmarks is None
     unit = "m" if sought else unit
-    scan, texture = read_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
+    scan, texture = read_sound_surface(inputs.scan, unit), read_texture(inputs.scan, unit)
     rows = [Metric("scan, triangles", len(scan.faces))]
-    metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
+    metre = UNITS[guess_person_unit(scan.vertices)] if sought else 1.0
     cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
     doubts = cleaning_doubts(cleaned)
     body = cleaned.mesh
     if sought:                               # once more of the body alone: a floor may be of any size
-        likely = likely_unit(body.vertices / metre)
+        likely = guess_person_unit(body.vertices / metre)
         body, metre = body.with_vertices(UNITS[likely] / metre * body.vertices), UNITS[likely]
         rows.append(Metric("unit of the scan", f"{likely}, from the height of the body"))
     left = 1 - float(cleaned.kept.mean())
@@ -254,7 +254,7 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
     """
     loaded = load_statue(statue, image)
     control = loaded.control
-    fine = subdivide(control.mesh, control.chart, level) if tolerance is None else subdivide_adaptive(
+    fine = subdivide_uniform(control.mesh, control.chart, level) if tolerance is None else subdivide_adaptive(
         control.mesh, control.chart, displace_surface(control, loaded.map), tolerance / MM, level)
     mesh = Reconstruction(control, loaded.map, fine).mesh()
     if output.suffix.lower() == ".glb":
@@ -294,7 +294,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     """
     loaded = load_statue(statue)
     control, up = loaded.control, loaded.upright_axis
-    fine = subdivide(control.mesh, control.chart, level)
+    fine = subdivide_uniform(control.mesh, control.chart, level)
     detailed = Reconstruction(control, loaded.map, fine)
     if model is None:
         if registered is not None:
@@ -304,7 +304,7 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
         output.mkdir(parents=True, exist_ok=True)
         write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, loaded.texture,
                          motion=moved, up=up)
-        write_motion(output / "motion.npz", control, moved)
+        write_body_motion(output / "motion.npz", control, moved)
         rows = [Metric("joints that follow the motion", len(moved.matched)),
                 *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
     else:

@@ -24,7 +24,7 @@ from .control.chart import Chart
 from .control.files import humanoid, humanoid_markers, read_control, write_control
 from .control.model import ControlModel, Statue
 from .detail.maps import read_map, write_map
-from .detail.subdivision import Subdivision, subdivide
+from .detail.subdivision import Subdivision, subdivide_uniform
 from .detail.texels import chart_tangents, normal_image, vertex_of_row
 from .motion.motions import people_motion
 
@@ -137,7 +137,7 @@ def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarr
     if (vertices is None) != (subdivision is None):
         raise ValueError("vertices, subdivision: expected both or none")
     if subdivision is None or vertices is None:
-        subdivision, vertices = subdivide(control.mesh, control.chart, 0), control.mesh.vertices
+        subdivision, vertices = subdivide_uniform(control.mesh, control.chart, 0), control.mesh.vertices
     if np.shape(vertices) != (len(subdivision.parent), 3):
         raise ValueError(f"vertices: expected shape ({len(subdivision.parent)}, 3), got {np.shape(vertices)}")
     mesh, chart = Mesh(vertices, subdivision.faces), subdivision.chart

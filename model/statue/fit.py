@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from scanprep.batch.room import Step, once
+from scanprep.batch.room import Step, run_uncached
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sanitise import sanitise
 from scanprep.ranges import Settings
@@ -15,7 +15,7 @@ from scanprep.ranges import Settings
 from ..body import Progress
 from .control.files import humanoid
 from .control.model import ControlModel, Statue
-from .detail.displacement import DisplacementConfig, bake, unfold_control
+from .detail.displacement import DisplacementConfig, bake_displacement, unfold_control
 from .registration.automatic import Features, find_features
 from .registration.features import FeatureFit, fit_features, head_share, warp
 from .registration.surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
@@ -76,7 +76,7 @@ class FittedStatue(Statue):
 
 def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
                points: Mapping[str, np.ndarray] | None = None, control: ControlModel | None = None,
-               config: StatueConfig | None = None, progress: Progress | None = None, step: Step = once
+               config: StatueConfig | None = None, progress: Progress | None = None, step: Step = run_uncached
                ) -> FittedStatue:
     """One scan of one person as a character that moves, with all its detail.
 
@@ -114,7 +114,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
         control.mesh, posed.start, scan, config.surface, progress, posed.hidden))                # [Statues] Eq. 6-18
     fitted = step("control", (given, config), lambda: fit_control(
         control, posed.features, surface, scan, config.displacement))
-    map = step("map", (given, config), lambda: bake(
+    map = step("map", (given, config), lambda: bake_displacement(
         fitted, scan, config.displacement, progress))                                            # [Statues] Eq. 19-21
     return FittedStatue(fitted, posed.features.pose, map, posed=posed, surface=surface)
 

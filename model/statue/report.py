@@ -13,15 +13,15 @@ from scanprep.geometry.surface import Surface
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
-from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, part_colors, render, side_by_side
+from scanprep.pictures.shading import CLAY, Bones, Dots, Heat, Solid, contact_sheet, part_colors, render
 from scanprep.pictures.sheets import webp_bytes
 from scanprep.pictures.thinning import MOST, thin_solid
-from scanprep.synthetic.people import find_pose, walk
+from scanprep.synthetic.people import find_pose, synthesise_walk
 
 from .control.files import humanoid
 from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, Statue
 from .detail.reconstruction import Level, Reconstruction, coverage_at
-from .detail.subdivision import subdivide
+from .detail.subdivision import subdivide_uniform
 from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
@@ -84,7 +84,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
     grey = np.where(covered, 127.5 + 127.5 * np.clip(heights / max(most, 1e-9), -1, 1), 255).astype(np.uint8)
     colors = np.zeros((256, 3))
     colors[list(KINDS)] = list(KINDS.values())
-    page.picture(webp_bytes(side_by_side(
+    page.picture(webp_bytes(contact_sheet(
         (np.repeat(grey[..., None], 3, axis=-1), (255 * colors[coverage]).astype(np.uint8)),
         ("displacement", "coverage"))))
     page.section("Levels of detail, and their distance to the scan", "The same map on ever fewer triangles, and on "
@@ -109,7 +109,7 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
 
 def coverage_of_vertices(statue: Statue) -> np.ndarray:
     """(N,) what the map says at each vertex of the control mesh: MEASURED, FOLDED or HOLE."""
-    whole = subdivide(statue.control.mesh, statue.control.chart, 0)
+    whole = subdivide_uniform(statue.control.mesh, statue.control.chart, 0)
     return coverage_at(statue.control, statue.map, whole.parent, whole.bary)
 
 
@@ -125,9 +125,10 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
     """The statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
     if statue.control.skeleton.names != humanoid().skeleton.names:
         return []
-    poses = np.stack([walk(80)[0][20], find_pose("squat"), find_pose("arms_up")])
+    poses = np.stack([synthesise_walk(80)[0][20], find_pose("squat"), find_pose("arms_up")])
     moved = people_motion(statue.control, statue.pose, poses)
-    detailed = Reconstruction(statue.control, statue.map, subdivide(statue.control.mesh, statue.control.chart, 3))
+    detailed = Reconstruction(statue.control, statue.map,
+                              subdivide_uniform(statue.control.mesh, statue.control.chart, 3))
     bodies = statue.control.rig.vertices(moved.poses, moved.trans)
     return [(name, detailed.mesh(body)) for name, body in zip(("walking", "squatting", "arms overhead"), bodies,
                                                               strict=True)]

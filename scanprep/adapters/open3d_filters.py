@@ -16,7 +16,7 @@ class MissingLibrary(ImportError):
     """A library that a setting asks for is not there, or not the system's libraries it stands on."""
 
 
-def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
+def open3d_decimation(mesh: Mesh, faces: int) -> Mesh:
     """Fewer triangles by open3d's quadric error collapses."""
     o3d = library("open3d")
     whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),      # it wants its own
@@ -25,7 +25,7 @@ def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
     return Mesh(np.asarray(smaller.vertices), np.asarray(smaller.triangles))
 
 
-def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
+def open3d_poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     """A closed surface near the mesh by screened Poisson reconstruction from its vertices and normals."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(mesh.vertices)))

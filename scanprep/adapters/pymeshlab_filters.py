@@ -15,7 +15,7 @@ from ..threads import threads_asked
 from .open3d_filters import library, recolor
 
 
-def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
+def meshlab_decimation(mesh: Mesh, faces: int) -> Mesh:
     """Fewer triangles by MeshLab's quadric edge collapses, keeping the topology."""
     meshes = _meshes(mesh)
     meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True,
@@ -23,7 +23,7 @@ def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
     return _result(meshes)
 
 
-def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
+def meshlab_poisson(mesh: Mesh, depth: int = 8) -> Mesh:
     """A closed surface near the mesh by screened Poisson reconstruction."""
     meshes = _meshes(mesh)
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=threads_asked() or 1)

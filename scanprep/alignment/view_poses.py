@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from ..geometry import rotations
 from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
-from ..geometry.remeshing import smooth
+from ..geometry.remeshing import smooth_taubin
 from ..geometry.surface import OrientedPoints, SeenSpace
 from .icp import landmark_motion, transform
 
@@ -106,7 +106,7 @@ def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Gener
 
 def _describe(mesh: Mesh, extent: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 3) spread over a view, their normals, and a histogram (n, 33) for each."""
-    even = smooth(mesh, 10)
+    even = smooth_taubin(mesh, 10)
     rows = thin(even.vertices, extent / 120)
     p, n = even.vertices[rows], even.vertex_normals[rows]
     a, b = cKDTree(p).query_pairs(REACH * extent, output_type="ndarray").T

@@ -10,7 +10,7 @@ import numpy as np
 from ..fusion.tsdf import border_distance
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
-from ..geometry.remeshing import smooth
+from ..geometry.remeshing import smooth_taubin
 from ..geometry.surface import OrientedPoints, mesh_and_camera
 from ..ranges import Count, Positive, Settings, Share
 from .view_poses import fit_of_views, place_by_features, place_by_landmarks
@@ -105,7 +105,7 @@ def _move(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarra
 def _sample(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a view, their normals, and which of them lie well inside."""
-    even = smooth(mesh, 10)
+    even = smooth_taubin(mesh, 10)
     inner = border_distance(mesh, config.border) >= config.border
     chosen = rng.permutation(len(mesh.vertices))[:16_000]
     return even.vertices[chosen], even.vertex_normals[chosen], inner[chosen]

@@ -35,7 +35,7 @@ class KeptCall:
         given: dict[str, Any] = {f.name: with_paths(getattr(self, f.name), Path.absolute) for f in fields(self)}
         given |= {name: str(Path(given[name]).absolute()) for name in self.may_be_files
                   if given[name] is not None and Path(given[name]).exists()}
-        given["config"] = config_files.write({"config": given["config"]})
+        given["config"] = config_files.write_settings({"config": given["config"]})
         storage.write_json(folder / RUN, {"kind": _kind(self), "version": VERSION, **given})
 
     @classmethod

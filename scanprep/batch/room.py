@@ -15,7 +15,7 @@ from ..geometry import storage
 from ..threads import one_thread
 from ..words import OUR_MODULES
 from .digests import Digests, paths_of
-from .values import load_header, load_value, save_value
+from .values import load_step_header, load_value, save_value
 
 Progress = Callable[[int, int], None]
 T = TypeVar("T")
@@ -40,7 +40,7 @@ class Failure:
     reason: str
 
 
-class Room:
+class TaskContext:
     """Where one task is worked on.
 
     `folder` takes its files, `step` keeps results that are found again when the task was interrupted,
@@ -57,7 +57,7 @@ class Room:
         if self._steps is None:
             return make()
         path, key = self._step_file(name), self._digests.key(inputs)
-        if (not self._force or name in self._made) and (load_header(path) or {}).get("digest") == key:
+        if (not self._force or name in self._made) and (load_step_header(path) or {}).get("digest") == key:
             with contextlib.suppress(storage.StorageError):
                 return load_value(path)
         save_value(path, make(), {"digest": key})
@@ -98,7 +98,7 @@ def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with one_thread():              # so that bytes do not depend on where it is done
-            return work(job.given, Room(folder, job.steps, tell, job.force))
+            return work(job.given, TaskContext(folder, job.steps, tell, job.force))
     except Exception as error:
         text = " ".join(str(error).split())
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
@@ -117,17 +117,17 @@ def attempt_elsewhere(work: Any, job: Job) -> tuple[Any, list[str]]:
 
 
 class Step(Protocol):
-    """What `make` returns, or returned when it was last called for the same inputs: `Room.step`, or `KeptSteps`."""
+    """A result that is made once for the same inputs: `TaskContext.step`, or `KeptSteps`."""
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T: ...
 
 
-def once(name: str, inputs: Any, make: Callable[[], T]) -> T:
+def run_uncached(name: str, inputs: Any, make: Callable[[], T]) -> T:
     """A step that is not kept."""
     return make()
 
 
-def inside(step: Step, outer: str) -> Step:
+def substeps(step: Step, outer: str) -> Step:
     """Steps of which a larger one consists."""
     def inner(name: str, inputs: Any, make: Callable[[], T]) -> T:
         return step(f"{outer}/{name}", inputs, make)

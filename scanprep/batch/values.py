@@ -24,7 +24,7 @@ def save_value(path: Path, value: Any, header: dict[str, Any]) -> None:
     storage.save(path, KIND, VERSION, {f"a{i}": array for i, array in enumerate(arrays)}, told, compress=False)
 
 
-def load_header(path: Path) -> dict[str, Any] | None:
+def load_step_header(path: Path) -> dict[str, Any] | None:
     """The header of a file of `save_value`, or None where there is no such file that can be read."""
     try:
         header = storage.load_header(path, KIND)

@@ -27,7 +27,7 @@ from ..geometry import storage
 from .digests import Digests
 from .ownership import HOME, ForeignFileError, add_written, digests_in_report, refusal, report_path
 from .pool import Failure, Job, Progress, Workers, run_jobs
-from .values import load_header, load_value, save_value
+from .values import load_step_header, load_value, save_value
 
 RECORD = ".record.npz"
 NOTHING: Any = object()                   # no result; None may be one
@@ -320,7 +320,7 @@ def _read_record(path: Path, folder: Path) -> dict[str, Any] | None:
 
     StorageError where it names a file that is not in its folder: such a record was not written here.
     """
-    header = load_header(path)
+    header = load_step_header(path)
     if header is None or not isinstance(header.get("files"), dict) or not {"digest", "work"} <= set(header):
         return None
     for file in header["files"]:

@@ -138,7 +138,7 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     rest = np.flatnonzero(label < 0)
     if not len(rest):
         raise ValueError("scan: nothing is left when planes are taken off; expected a body in front of them")
-    piece = pieces(mesh, rest, link)
+    piece = label_pieces(mesh, rest, link)
     main, why = _body_of(points[rest], piece, config, landmarks)
     # All specks together are one row: a scanned floor leaves hundreds.
     size = np.bincount(piece)
@@ -177,14 +177,14 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
         if plane is None:
             break
         standing = rest[plane.height(points[rest]) > plane.thickness]
-        piece = pieces(mesh, standing, link)
+        piece = label_pieces(mesh, standing, link)
         body = standing[piece == _body_of(points[standing], piece, config, landmarks)[0]] if len(standing) else standing
         label[rest[floor_points(points[rest], plane, points[body])]] = len(planes)
         planes.append(plane)
     return label, planes
 
 
-def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
+def label_pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
     """Number of the piece that each of the chosen vertices (n,) belongs to, largest piece 0.
 
     Vertices hang together when a side of a triangle joins them or when they are closer than about `link` metres.

@@ -23,7 +23,7 @@ from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences, check_pairs
-from .search import BeliefLevel, CorrelatedConfig, Seeds, result, search, surfaces_of
+from .search import BeliefLevel, CorrelatedConfig, Seeds, propagate_beliefs, result, surfaces_of
 from .sheet import Sheet
 
 # Of the trial of a hypothesis: fewer points, and one coarse level
@@ -71,7 +71,7 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
     surfaces, images = surfaces_of(template, sheet, known, config), None
     tell(2, total)
     for number, level in enumerate(config.levels):
-        surfaces, images = search(surfaces, images, level, config)
+        surfaces, images = propagate_beliefs(surfaces, images, level, config)
         tell(4 + 2 * number, total)
     assert images is not None, "levels: expected at least one"
     return result(surfaces, images, config)
@@ -102,7 +102,7 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypothese
         there = image >= 0
         at = image[there]
         seeds = Seeds(own[there], sheet.points[seen[at]], seen[at], ways[there], seen_ways[at])
-        surfaces, images = search(surfaces_of(template, sheet, seeds, TRIAL), None, TRIAL.levels[0], TRIAL)
+        surfaces, images = propagate_beliefs(surfaces_of(template, sheet, seeds, TRIAL), None, TRIAL.levels[0], TRIAL)
         trials.append(images.energy / len(surfaces.scan) + 2.0 * float((~there).sum()))
     order = np.argsort(trials)
     best = matches[order[0]]

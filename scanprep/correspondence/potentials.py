@@ -14,7 +14,7 @@ MOST_EDGE = 9.0 * 2.5 + 4.0    # no edge can cost more: length, two leans and a 
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class SurfaceFeatures:
     """Points and normals (n, 3) of a surface seen from the seeds, in metres of the scan for the template too.
 
     `angles` are, for every pair of seeds, the sine of the angle from the direction away from the first to that away
@@ -27,16 +27,16 @@ class Places:
     angles: np.ndarray           # (n, S(S-1)/2)
     sure: np.ndarray             # (n, S) how sure the way to each seed is, 1 where it needs no bridge between pieces
 
-    def __getitem__(self, index: np.ndarray) -> Places:
-        return Places(self.points[index], self.normals[index], self.to_seeds[index], self.angles[index],
-                      self.sure[index])
+    def __getitem__(self, index: np.ndarray) -> SurfaceFeatures:
+        return SurfaceFeatures(self.points[index], self.normals[index], self.to_seeds[index], self.angles[index],
+                               self.sure[index])
 
     def __len__(self) -> int:
         return len(self.points)
 
 
 def distance_profile(points: np.ndarray, normals: np.ndarray, distances: np.ndarray, at: np.ndarray, radius: float,
-                     sure: np.ndarray) -> Places:
+                     sure: np.ndarray) -> SurfaceFeatures:
     """Some points `at` (n,) of a surface (m, 3) as seen from the seeds, from which `distances` (S, m) are.
 
     Directions are averaged over neighbourhoods of `radius` metres.
@@ -45,7 +45,7 @@ def distance_profile(points: np.ndarray, normals: np.ndarray, distances: np.ndar
     gradient = gradients(points, normals, distances, at, radius)
     a, b = np.triu_indices(len(distances), 1)
     angles = np.einsum("pnd,nd->np", np.cross(gradient[a], gradient[b]), normals[at])
-    return Places(points[at], normals[at], to_seeds, angles, sure)
+    return SurfaceFeatures(points[at], normals[at], to_seeds, angles, sure)
 
 
 def gradients(points: np.ndarray, normals: np.ndarray, values: np.ndarray, at: np.ndarray, radius: float,
@@ -75,7 +75,7 @@ def robust(r: np.ndarray, limit: float) -> np.ndarray:
     return squared / (1 + squared / limit**2)
 
 
-def place_energy(scan: Places, template: Places, size: float) -> np.ndarray:
+def place_energy(scan: SurfaceFeatures, template: SurfaceFeatures, size: float) -> np.ndarray:
     """Energy (n, m) of every place of the template as the image of every place of the scan.
 
     [CC] geodesic potentials, as evidence for single places
@@ -101,7 +101,8 @@ def most_place_energy(seeds: int) -> float:
     return 4.0 * (seeds + ANGLES)
 
 
-def edge_energy(scan: Places, template: Places, edges: np.ndarray, domains: np.ndarray, size: float) -> np.ndarray:
+def edge_energy(scan: SurfaceFeatures, template: SurfaceFeatures, edges: np.ndarray, domains: np.ndarray,
+                size: float) -> np.ndarray:
     """Energy (E, K, K) of the images of the two ends of every edge (E, 2) of the scan, within domains (n, K).
 
     The edge between two points of the scan against the edge between their images: its length, its angles to the

@@ -13,7 +13,7 @@ from ..geometry.mesh import Mesh
 from ..ranges import Cell, Count, Settings
 from .belief_propagation import Beliefs, PairField, propagate
 from .correspondences import Correspondences
-from .potentials import MOST_EDGE, Places, distance_profile, edge_energy, most_place_energy, place_energy
+from .potentials import MOST_EDGE, SurfaceFeatures, distance_profile, edge_energy, most_place_energy, place_energy
 from .sheet import Sheet
 
 
@@ -66,9 +66,9 @@ class Surfaces:
     """
 
     size: float
-    scan: Places
+    scan: SurfaceFeatures
     edges: np.ndarray
-    places: Places
+    places: SurfaceFeatures
     vertices: np.ndarray
     scale: float
 
@@ -93,8 +93,8 @@ class Images:
         return self.domains[np.arange(len(state)), state]
 
 
-def search(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config: CorrelatedConfig
-           ) -> tuple[Surfaces, Images]:
+def propagate_beliefs(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config: CorrelatedConfig
+                      ) -> tuple[Surfaces, Images]:
     """Belief propagation over the places of one level, in domains pruned by what is known; the template rescaled."""
     spread = np.arange(min(level.places, len(surfaces.places)))
     unary = place_energy(surfaces.scan, surfaces.places[spread], surfaces.size)

@@ -13,7 +13,7 @@ from ..geometry.remeshing import improve_triangles
 from ..geometry.surface import Surface
 from ..ranges import FLAG, Settings
 from .edge_collapse import FIXED, HOLD, Rounds, final_owner
-from .quadrics import lowest, sum_at, surface_quadrics
+from .quadrics import minimise_quadrics, sum_at, surface_quadrics
 
 Method = Literal["quadric", "even", "fast", "open3d", "pymeshlab"]
 
@@ -151,10 +151,10 @@ def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
         mended = fast_collapses(mesh, faces)
         return mended if len(mended.faces) <= faces else collapse(mended, faces).mesh
     if method == "open3d":
-        from ..adapters.open3d_filters import quadric_decimation
+        pass
     else:
-        from ..adapters.pymeshlab_filters import quadric_decimation
-    return quadric_decimation(mesh, faces)
+        from ..adapters.pymeshlab_filters import meshlab_decimation
+    return meshlab_decimation(mesh, faces)
 
 
 def fast_collapses(mesh: Mesh, faces: int) -> Mesh:
@@ -178,7 +178,7 @@ def fast_collapses(mesh: Mesh, faces: int) -> Mesh:
         kept, number = np.unique(final_owner(owner), return_inverse=True)
         corners = number[mesh.faces]
         whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-        left = Mesh(lowest(sum_at(number[:, None], quadrics, len(kept))) + centre, corners[whole])
+        left = Mesh(minimise_quadrics(sum_at(number[:, None], quadrics, len(kept))) + centre, corners[whole])
         bad = _broken(left, sum_at(number[:, None], areas, len(kept)))
         last = np.full(len(kept), -1)
         rows = np.flatnonzero(~undone)

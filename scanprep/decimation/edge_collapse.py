@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..geometry.mesh import Mesh
-from .quadrics import curve_quadrics, lowest, surface_quadrics, value
+from .quadrics import curve_quadrics, minimise_quadrics, surface_quadrics, value
 
 FREE, CURVE, FIXED = 0, 1, 2
 THINNEST = 0.1                       # triangles of less quality (1: equilateral) are not made of better ones
@@ -89,7 +89,7 @@ class Rounds:
         if self.onto_vertices:
             return Q, self.points[a]
         anchored = (self.kinds[a] != self.kinds[b]) | (self.kinds[a] == FIXED)
-        goal = lowest(Q)
+        goal = minimise_quadrics(Q)
         goal[anchored] = self.points[a[anchored]]
         return Q, goal
 

@@ -75,7 +75,7 @@ def value(Q: np.ndarray, x: np.ndarray) -> np.ndarray:
             + x2 * (Q[..., 5] * x2 + 2 * Q[..., 8]) + Q[..., 9])
 
 
-def lowest(Q: np.ndarray) -> np.ndarray:
+def minimise_quadrics(Q: np.ndarray) -> np.ndarray:
     """The points (..., 3) where quadrics (..., 10) are least, which must be unique.
 
     [QEM] optimal placement

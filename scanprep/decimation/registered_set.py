@@ -18,7 +18,7 @@ from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
 from ..skeleton.tree import Skeleton
 from .edge_collapse import FIXED, Rounds, check_vertices, curves_to_keep, wall_quadrics
-from .quadrics import lowest, sum_at, surface_quadrics
+from .quadrics import minimise_quadrics, sum_at, surface_quadrics
 
 Progress = Callable[[int, int], None]
 KIND, VERSION = "decimation", 1
@@ -84,7 +84,7 @@ class DecimatedSet:
         points = (vertices - centre)[:, None]
         quadrics, areas = surface_quadrics(points, self.source.faces, self.config.anchor)
         quadrics += wall_quadrics(self.source, points, areas, curves)
-        solved = lowest(sum_at(self.owner[:, None], quadrics, len(self.vertex_map)))[:, 0] + centre
+        solved = minimise_quadrics(sum_at(self.owner[:, None], quadrics, len(self.vertex_map)))[:, 0] + centre
         solved[self.fixed] = vertices[self.vertex_map[self.fixed]]
         return solved
 

@@ -18,7 +18,7 @@ THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, 
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class PicturedPerson:
     """Somebody in a picture.
 
     Attributes
@@ -49,7 +49,7 @@ class Person:
         return points[found], normals[found], edge[found]
 
 
-def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = None) -> Person:
+def segment_person(picture: DepthPicture, size: float, marks: np.ndarray | None = None) -> PicturedPerson:
     """The one person in a picture of half the resolution; ValueError with the reason where there is not one.
 
     `size`, metres, of the body, the root of its surface area; `marks` (L, 3), metres, points that are on the person.
@@ -77,7 +77,7 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     if area > 0.5:
         raise ValueError(f"picture: what stands in it shows {area * size**2:.1f} m², more than a person does: two "
                          "people who touch, or a wall that was not recognised; set the depth of all else to 0")
-    return Person(small, mask)
+    return PicturedPerson(small, mask)
 
 
 def room_planes(picture: DepthPicture, size: float) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from ..geometry.mesh import Mesh
-from ..geometry.remeshing import smooth
-from ..geometry.sparse import distinct
+from ..geometry.remeshing import smooth_taubin
+from ..geometry.sparse import unique_integers
 from ..geometry.surface import Rays, barycentric, mesh_and_camera
 from ..ranges import Cell, Cosine, Range, Settings, Share
 from ..repair.manifold import drop_small_components, split_vertices
@@ -103,7 +103,7 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     ends = [end for view in prepared for end in (view.mesh.vertices.min(axis=0), view.mesh.vertices.max(axis=0))]
     grid = _Grid.around(np.min(ends, axis=0), np.max(ends, axis=0), config.voxel)
     near = [grid.near(view.mesh) for view in prepared]
-    keys = distinct(np.concatenate(near))
+    keys = unique_integers(np.concatenate(near))
     points = grid.points(keys)
     total, weight = np.zeros(len(keys)), np.zeros(len(keys))
     for number, view in enumerate(prepared):
@@ -135,7 +135,7 @@ def border_distance(mesh: Mesh, limit: float) -> np.ndarray:
 def _prepare(mesh: Mesh, camera: np.ndarray, config: MergeConfig) -> _View:
     towards = camera - mesh.vertices
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    normals = smooth(mesh, 5).vertex_normals                  # noise tilts the single triangles
+    normals = smooth_taubin(mesh, 5).vertex_normals                  # noise tilts the single triangles
     cosine = np.einsum("nd,nd->n", normals, towards)
     angle = np.clip((cosine - config.min_cosine) / (1 - config.min_cosine), 0, 1)
     border = border_distance(mesh, TAPER) / TAPER
@@ -168,10 +168,10 @@ class _Grid:
         """Sorted numbers of the voxels in the blocks that hold a surface, and in those around them."""
         side = BLOCK * self.voxel
         blocks = np.floor((_dense_points(mesh, side / 2) - self.origin) / side).astype(np.int64)
-        flat = distinct(np.ravel_multi_index(tuple(blocks.T), self.blocks))
+        flat = unique_integers(np.ravel_multi_index(tuple(blocks.T), self.blocks))
         for axis in range(3):                       # one axis after the other is cheap
             step = int(np.prod(self.blocks[axis + 1:]))
-            flat = distinct(np.concatenate([flat - step, flat, flat + step]))
+            flat = unique_integers(np.concatenate([flat - step, flat, flat + step]))
         blocks = np.stack(np.unravel_index(flat, self.blocks), axis=1)
         inside = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         voxels = (BLOCK * blocks[:, None] + inside).reshape(-1, 3)
@@ -180,7 +180,7 @@ class _Grid:
 
 def _dense_points(mesh: Mesh, spacing: float) -> np.ndarray:
     """Points that leave no triangle further than about `spacing` from one of them."""
-    points = [mesh.vertices[distinct(mesh.faces)]]
+    points = [mesh.vertices[unique_integers(mesh.faces)]]
     corners = mesh.corners
     while len(corners):
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -222,7 +222,7 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     cells = cells[(inside > 0) & (inside < 8)]
     if not len(cells):
         return Mesh(np.empty((0, 3)), np.empty((0, 3), int))
-    used = distinct(cells.ravel())
+    used = unique_integers(cells.ravel())
     local = np.searchsorted(used, cells)
     values = distance[used]
     values[np.abs(values) < 1e-4 * voxel] = 1e-4 * voxel   # a surface through a corner would make flat triangles

@@ -388,4 +388,4 @@ def _write(path: Path, contents: Contents, precision: Precision, formats: dict[s
     data = writers[ending_of(path)](contents, precision == "double")
     if path.suffix.lower() == ".gz":
         data = gzip.compress(data, compresslevel=6, mtime=0)
-    storage.write(path, data)
+    storage.write_file(path, data)

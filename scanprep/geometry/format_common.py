@@ -103,7 +103,7 @@ def metres_of(unit: str | None) -> float:
     return UNITS[unit]
 
 
-def likely_unit(extent: float) -> str | None:
+def guess_unit(extent: float) -> str | None:
     """The unit in which `extent` is that of a person, other than metres; None where none is or several may be."""
     likely = [unit for unit in ("mm", "cm", "in") if PERSON[0] <= extent * UNITS[unit] <= PERSON[1]]
     return likely[0] if len(likely) == 1 else None
@@ -131,7 +131,7 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
             warnings.warn(f"{path}: a few points lie far off the rest, which spans {inner:.3g} m and alone tells the "
                           "unit; scape prep clean drops them", stacklevel=3)
             extent = inner
-    likely = likely_unit(extent)
+    likely = guess_unit(extent)
     if likely is not None:
         warnings.warn(f"{path}: read with unit='{likely}', in which it is {extent * UNITS[likely]:.2f} m from end to "
                       f"end; if these are metres, say unit='m'", stacklevel=3)
@@ -323,7 +323,7 @@ def as_light(color: np.ndarray) -> np.ndarray:
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
-def as_bytes(colors: np.ndarray) -> np.ndarray:
+def quantise_colors(colors: np.ndarray) -> np.ndarray:
     """Colours in [0, 1] as integers 0..255."""
     return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)
 

@@ -12,7 +12,7 @@ from .format_common import Contents, MeshFileError, as_colors, polygons
 
 def read(path: Path, data: bytes) -> Contents:
     """The points, and the triangles, normals and colours if any, of a `.drc` file."""
-    mesh = decode(path, data)
+    mesh = decode_draco(path, data)
     with storage.taking_apart(path, "a whole Draco file", MeshFileError):
         vertices = np.asarray(mesh.points, dtype=np.float64).reshape(-1, 3)
         faces = getattr(mesh, "faces", None)
@@ -24,7 +24,7 @@ def read(path: Path, data: bytes) -> Contents:
         return Contents(vertices, faces, None if normals is None or not len(normals) else np.asarray(normals), colors)
 
 
-def decode(path: Path, data: bytes) -> Any:
+def decode_draco(path: Path, data: bytes) -> Any:
     """What DracoPy makes of a piece of data; MeshFileError where it is damaged or the library is not there."""
     try:
         import DracoPy

@@ -123,7 +123,8 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
                         vertices.append(local @ instance[:3, :3].T + instance[:3, 3])
                     colors.append(_colors(own, data, primitive, len(local)))
                     start += len(local)
-                corners = triangles_of(own, data, primitive, len(local)) if 0 not in shown else np.zeros((0, 3), int)
+                corners = primitive_triangles(own, data, primitive, len(local)) if 0 not in shown else np.zeros((0, 3),
+                                                                                                                int)
                 if np.linalg.det((instance if joints is None else joints[0])[:3, :3]) < 0:
                     corners = corners[:, ::-1]
                 faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), len(local)) + placed[points])
@@ -159,7 +160,7 @@ def _unpack(path: Path, tree: dict[str, Any], binary: bytes, primitive: dict[str
         return primitive, tree, binary           # not compressed, or also as it is for who does not know Draco
     view = item(tree["bufferViews"], packed["bufferView"])
     start = view.get("byteOffset", 0)
-    mesh = format_draco.decode(path, binary[start:start + view["byteLength"]])
+    mesh = format_draco.decode_draco(path, binary[start:start + view["byteLength"]])
     glb = Glb()
     glb.add_indices(np.asarray(mesh.faces))
     attributes = {}
@@ -346,7 +347,7 @@ def _values(tree: dict[str, Any], binary: bytes, what: str, entry: dict[str, Any
     return np.ndarray((count, width), kind, binary, start, (stride, kind.itemsize)).copy()
 
 
-def triangles_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
+def primitive_triangles(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
     """(F, 3) the corners of the triangles, strips or fans of a primitive of `count` vertices."""
     line = (accessor(tree, binary, primitive["indices"], "SCALAR")[:, 0].astype(np.int64) if "indices" in primitive
             else np.arange(count))

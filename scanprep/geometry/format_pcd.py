@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from . import storage
-from .format_common import Contents, Lines, MeshFileError, as_bytes, as_rows, fields_of, quote
+from .format_common import Contents, Lines, MeshFileError, as_rows, fields_of, quantise_colors, quote
 
 _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
 
@@ -146,7 +146,7 @@ def encode(contents: Contents, double: bool) -> bytes:
     """A binary PCD file."""
     packed = None
     if contents.colors is not None:
-        packed = as_bytes(contents.colors).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+        packed = quantise_colors(contents.colors).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     rows = as_rows([(("x", "y", "z"), "f8" if double else "f4", contents.vertices),
                        (("normal_x", "normal_y", "normal_z"), "f4", contents.normals),
                        (("rgb",), "u4", None if packed is None else packed[:, None])])

@@ -11,10 +11,10 @@ from .format_common import (
     Contents,
     Lines,
     MeshFileError,
-    as_bytes,
     as_colors,
     as_utf8,
     polygons,
+    quantise_colors,
     quote,
     text_rows,
     three_numbers,
@@ -158,7 +158,7 @@ def encode_off(contents: Contents, double: bool) -> bytes:
     kind, form, columns = "OFF", three_numbers(double), [contents.vertices]
     if contents.colors is not None:
         kind, form = "COFF", form + " %d %d %d 255"
-        columns.append(as_bytes(contents.colors))
+        columns.append(quantise_colors(contents.colors))
     return (f"{kind}\n{len(contents.vertices)} {len(contents.faces)} 0\n" + text_rows(form, *columns)
             + text_rows("3 %d %d %d", contents.faces)).encode()
 

@@ -17,7 +17,7 @@ Entry = np.ndarray | int | dict[str, Any]        # point, vertex, or face with b
 _Points = list[tuple[str, np.ndarray]]
 
 
-class Found(NamedTuple):
+class LandmarkFile(NamedTuple):
     """What a file says, in its order."""
 
     pairs: list[tuple[str, Entry]]
@@ -25,7 +25,7 @@ class Found(NamedTuple):
     flipped: bool = False                        # may be: 3D Slicer has LPS and RAS, and scans of either
 
 
-def entries_of(path: Path, data: bytes, unit: str | None) -> Found:
+def entries_of(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
     """The landmarks of a file by its ending; `unit` is that which was told.
 
     MeshFileError with the line or the element that is wrong.
@@ -39,28 +39,28 @@ def entries_of(path: Path, data: bytes, unit: str | None) -> Found:
         if suffix == ".fcsv":
             return _fiducials(path, data)
         if suffix == ".pp":
-            return Found([*_meshlab(path, data)])
+            return LandmarkFile([*_meshlab(path, data)])
         if suffix == ".xml":
-            return Found([*_marker_set(path, data)], "m")
+            return LandmarkFile([*_marker_set(path, data)], "m")
         if suffix == ".csv":
-            return Found([*_table(Lines(path, data, comment=b"#"))])
+            return LandmarkFile([*_table(Lines(path, data, comment=b"#"))])
         if suffix == ".lnd":
             # number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`
             expected = "a line of a CAESAR .lnd file, seven numbers and a name"
-            return Found(_rows_with_names(Lines(path, data), 7, expected, "latin-1", b"="), "mm")
-        return Found(_rows_with_names(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8"))
+            return LandmarkFile(_rows_with_names(Lines(path, data), 7, expected, "latin-1", b"="), "mm")
+        return LandmarkFile(_rows_with_names(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8"))
 
 
-def _json(path: Path, data: bytes, unit: str | None) -> Found:
+def _json(path: Path, data: bytes, unit: str | None) -> LandmarkFile:
     """Ours, scalismo's, or a markups file of 3D Slicer."""
     tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused later, by name
     if isinstance(tree, list) and tree and all(isinstance(one, dict) and "id" in one for one in tree):
-        return Found([(str(one["id"]), _point(path, str(one["id"]), one.get("coordinates"))) for one in tree])
+        return LandmarkFile([(str(one["id"]), _point(path, str(one["id"]), one.get("coordinates"))) for one in tree])
     if not isinstance(tree, dict):
         raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, found a {type(tree).__name__}")
     if isinstance(tree.get("markups"), list):
         return _slicer(path, tree["markups"], unit)
-    return Found([(name, _json_entry(path, name, value)) for name, value in tree.items()])
+    return LandmarkFile([(name, _json_entry(path, name, value)) for name, value in tree.items()])
 
 
 def _json_entry(path: Path, name: str, value: Any) -> Entry:
@@ -90,7 +90,7 @@ def _numbers(value: Any) -> np.ndarray | None:
     return point if point.shape == (3,) else None
 
 
-def _slicer(path: Path, markups: list[Any], unit: str | None) -> Found:
+def _slicer(path: Path, markups: list[Any], unit: str | None) -> LandmarkFile:
     """The points of a markups file, in LPS."""
     pairs: list[tuple[str, Entry]] = []
     own_unit: Any = "mm"
@@ -110,14 +110,14 @@ def _slicer(path: Path, markups: list[Any], unit: str | None) -> Found:
                     pairs.append((str(name), position * signs))
     if str(own_unit) not in UNITS and unit is None:
         raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
-    return Found(pairs, own_unit, flipped=True)
+    return LandmarkFile(pairs, own_unit, flipped=True)
 
 
 _FIDUCIALS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID".split(",")
 _FIDUCIALS_OLD = "label,x,y,z,sel,vis".split(",")            # of 3D Slicer 3
 
 
-def _fiducials(path: Path, data: bytes) -> Found:
+def _fiducials(path: Path, data: bytes) -> LandmarkFile:
     """The points of an .fcsv file of 3D Slicer, in LPS: without a word of the axes they are RAS."""
     heading = [line.lstrip(b"# ").strip() for line in data.splitlines() if line.startswith(b"#")]
     told = [line.split(b"=")[1].strip() for line in heading if re.match(rb"(?i)coordinatesystem *=", line)]
@@ -134,7 +134,7 @@ def _fiducials(path: Path, data: bytes) -> Found:
         if len(words) > len(columns) == len(_FIDUCIALS) and words[len(columns)] != "2":
             continue
         pairs.append(_point_of_row(lines, row, dict(zip(columns, words, strict=False)), "label", ",".join(columns)))
-    return Found([(name, point * signs) for name, point in pairs], "mm", flipped=True)
+    return LandmarkFile([(name, point * signs) for name, point in pairs], "mm", flipped=True)
 
 
 def _meshlab(path: Path, data: bytes) -> _Points:

@@ -27,7 +27,7 @@ def landmark_ending(format: Format) -> str:
     return (".landmarks." if format in ("json", "csv", "txt") else ".") + format
 
 
-def as_bytes(name: str, points: Points, unit: str | None) -> bytes | None:
+def encode_landmarks(name: str, points: Points, unit: str | None) -> bytes | None:
     """The contents of a file of this name with points (3,), metres; None for JSON of ours.
 
     `unit` is that of the coordinates in the file; without one it is that which `read_landmarks` expects. ValueError for

@@ -15,7 +15,7 @@ from .files import name_of
 from .format_common import FARTHEST, UNITS, MeshFileError, load_bytes, metres_of, metres_per_unit
 from .landmark_names import pair_names
 from .landmark_reading import Entry, entries_of
-from .landmark_writing import as_bytes
+from .landmark_writing import encode_landmarks
 from .mesh import Mesh
 from .surface import Surface
 
@@ -153,14 +153,14 @@ def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int |
             raise ValueError(f"landmarks: '{name}' expected three finite numbers or a vertex, got {value}")
         out[name] = point
     points = {name: value for name, value in out.items() if isinstance(value, np.ndarray)}
-    data = as_bytes(Path(path).name, points, unit)
+    data = encode_landmarks(Path(path).name, points, unit)
     if data is None:
         storage.write_json(path, {name: (value / metres_of(unit)).tolist() if name in points else value
                                   for name, value in out.items()})
     elif len(points) < len(out):
         raise ValueError(f"{path}: expected points; vertices and faces of a mesh can be written as JSON only")
     else:
-        storage.write(path, data)
+        storage.write_file(path, data)
 
 
 def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mapping[str, Any], minimum: int = 3

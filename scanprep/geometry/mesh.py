@@ -9,7 +9,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ..words import number_of
-from .sparse import distinct, label_components
+from .sparse import label_components, unique_integers
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,19 +177,19 @@ class Mesh:
     @cached_property
     def is_vertex_manifold(self) -> bool:
         """The triangles around every vertex form one fan."""
-        return int(self.corner_fans.max(initial=-1)) + 1 == len(distinct(self.faces))
+        return int(self.corner_fans.max(initial=-1)) + 1 == len(unique_integers(self.faces))
 
     @cached_property
     def non_manifold_vertices(self) -> np.ndarray:
         """(n,) vertices on an edge that has more than two triangles, or at which separate fans touch, ascending."""
         fan = np.unique(np.stack([self.faces.ravel(), self.corner_fans.ravel()]), axis=1)[0]
         touching = np.flatnonzero(np.bincount(fan, minlength=len(self.vertices)) > 1)
-        return distinct(np.r_[self.edges[self.edge_use > 2].ravel(), touching])
+        return unique_integers(np.r_[self.edges[self.edge_use > 2].ravel(), touching])
 
     @cached_property
     def boundary_vertices(self) -> np.ndarray:
         """(B,) vertices on an edge that has one triangle, ascending."""
-        return distinct(self.edges[self.edge_use == 1])
+        return unique_integers(self.edges[self.edge_use == 1])
 
     @cached_property
     def boundary_loops(self) -> list[np.ndarray]:
@@ -244,7 +244,7 @@ def template_problem(mesh: Mesh) -> str | None:
     """
     if not len(mesh.faces):
         return "it has no triangles"
-    unused = len(mesh.vertices) - len(distinct(mesh.faces))
+    unused = len(mesh.vertices) - len(unique_integers(mesh.faces))
     if unused:
         return f"{number_of(unused, 'vertex belongs', 'vertices belong')} to no triangle"
     components = mesh.vertex_component.max() + 1

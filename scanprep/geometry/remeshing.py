@@ -5,7 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from .mesh import Mesh
-from .sparse import distinct
+from .sparse import unique_integers
 from .surface import Surface
 
 
@@ -30,7 +30,7 @@ def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine
     across = np.roll(faces, 1, axis=1).ravel()
     face = np.repeat(np.arange(len(faces)), 3)
     key = np.minimum(start, end) * count + np.maximum(start, end)
-    known = distinct(key)
+    known = unique_integers(key)
     order = np.argsort(key, kind="stable")
     order = order[allowed[face[order]]]
     twin = np.flatnonzero(key[order][1:] == key[order][:-1])
@@ -105,7 +105,7 @@ def relax(mesh: Mesh, surface: Surface, rounds: int) -> Mesh:
     return mesh
 
 
-def smooth(mesh: Mesh, rounds: int) -> Mesh:
+def smooth_taubin(mesh: Mesh, rounds: int) -> Mesh:
     """Noise taken off without shrinking, by steps forward and back [Taubin].
 
     A border is smoothed as the curve it is.

@@ -22,7 +22,7 @@ def sum_groups(gather: csr_array, values: np.ndarray) -> np.ndarray:
     return (gather @ values.reshape(len(values), math.prod(values.shape[1:]))).reshape(-1, *values.shape[1:])
 
 
-def distinct(numbers: np.ndarray) -> np.ndarray:
+def unique_integers(numbers: np.ndarray) -> np.ndarray:
     """The different integers (k,) among some, ascending.
 
     Sorted; NumPy's `unique` hashes integers since 2.3, which takes 25 times as long for a million of them.

@@ -119,7 +119,7 @@ def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError]
         return Path(path).read_bytes()
 
 
-def write(path: str | Path, data: bytes | str) -> None:
+def write_file(path: str | Path, data: bytes | str) -> None:
     """Write a file, whole or not at all; text as UTF-8, and as `\\udce9` what is none of it in the name of a file."""
     with writing(path) as beside:
         beside.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
@@ -153,7 +153,7 @@ def as_json(value: Any) -> Any:
 
 def write_json(path: str | Path, value: Any) -> None:
     """Write JSON, whole or not at all: dataclasses as tables, arrays as lists, null for what is not finite."""
-    write(path, _json(value, 1) + "\n")
+    write_file(path, _json(value, 1) + "\n")
 
 
 def _json(value: Any, indent: int | None = None) -> str:
@@ -240,7 +240,7 @@ def load_array(path: str | Path) -> np.ndarray:
         return _array(stream, os.fstat(stream.fileno()).st_size, "")
 
 
-def kind_of(path: str | Path) -> str:
+def stored_kind(path: str | Path) -> str:
     """The kind of a file of `save`, read from its header alone, or StorageError."""
     return str(load_header(path, "scapekit").get("kind"))
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart, write
+from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart, write_file
 
 
 def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
@@ -57,7 +57,7 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     table = csv.writer(text, lineterminator="\n")
     table.writerow(header)
     table.writerows(map(_as_cell, row) for row in rows)
-    write(path, text.getvalue())
+    write_file(path, text.getvalue())
 
 
 def number_lines(rows: np.ndarray, number: str = "%.6g", separator: str = ",") -> list[str]:

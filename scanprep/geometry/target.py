@@ -11,7 +11,7 @@ from .farthest_points import thin
 from .mesh import Mesh
 from .places import distinct_places
 from .sanitise import sanitise
-from .sparse import distinct
+from .sparse import unique_integers
 from .surface import OrientedPoints, check_points
 
 
@@ -43,7 +43,7 @@ def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
     index, normals = distinct_places(points), None
     if isinstance(scan, Mesh) and len(scan.faces):
         scan = sanitise(scan, name)
-        index = distinct(scan.faces)
+        index = unique_integers(scan.faces)
         index = index[distinct_places(points[index])]
         normals = scan.vertex_normals[index]
     if len(index) < 4:
@@ -86,7 +86,7 @@ def _one_sided(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     return np.linalg.norm(offset.mean(axis=1), axis=1) > 0.3 * reach
 
 
-def orient(target: Target, deformed: Mesh, scale: float) -> Target:
+def orient_by_mesh(target: Target, deformed: Mesh, scale: float) -> Target:
     """The same target with the sign of its normals from the nearest part of a mesh on it; `scale` as `OrientedPoints`.
     """
     if target.oriented:

@@ -103,7 +103,7 @@ def _points(subject: Any) -> np.ndarray:
     return points
 
 
-def upright(mesh: Mesh) -> tuple[int, float]:
+def guess_upright(mesh: Mesh) -> tuple[int, float]:
     """The axis that is probably up and the azimuth, degrees, of a camera that probably sees the front; for pictures.
 
     Up is the axis of the largest extent, but for arms that are spread wider (`tallest`). The front is where the toes
@@ -157,7 +157,7 @@ def stance(body: Mesh, turned: np.ndarray | None = None, vertical: np.ndarray | 
     Up is the body's own axis unless the turns, on average, lay it over: then it is the axis nearest to its head. One
     frame of a motion is told what is `vertical` in all of it.
     """
-    up, front = upright(body)
+    up, front = guess_upright(body)
     own, first, second = np.eye(3)[[up, (up + 1) % 3, (up + 2) % 3]]
     ahead = np.cos(np.radians(front)) * first + np.sin(np.radians(front)) * second
     turned = np.eye(3)[None] if turned is None else np.asarray(turned).reshape(-1, 3, 3)

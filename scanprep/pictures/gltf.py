@@ -9,7 +9,7 @@ import numpy as np
 
 from ..geometry.format_glb import Glb, one_mesh, turn_up
 from ..geometry.mesh import Mesh
-from ..geometry.storage import write
+from ..geometry.storage import write_file
 
 
 def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, 
     Every frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
     core of glTF is used. The axis `up` is turned to y. What has a skeleton is smaller as `write_moving_glb` writes it.
     """
-    write(path, encode_animated_glb(faces, frames, rate, colors, up))
+    write_file(path, encode_animated_glb(faces, frames, rate, colors, up))
 
 
 def encode_animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from ..geometry.format_common import as_seen
-from ..geometry.sparse import distinct
+from ..geometry.sparse import unique_integers
 
 # Directions of the lights in the camera's frame (right, up, back) and their linear strengths.
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
@@ -18,7 +18,7 @@ SKY_RAYS = 48                                 # from each vertex in sight; 80 lo
 
 
 @dataclass(frozen=True, eq=False)
-class Triangles:
+class LitTriangles:
     """Corners (F, 3, 3) with their unit normals and linear colours, both (F, 3, 3).
 
     Shapes whose visibility is to be computed also bring the vertex numbers (F, 3) of the corners and the normals
@@ -45,7 +45,7 @@ class Seen:
 class Scene:
     """Triangles in one search tree, with the camera's frame `axes` (3, 3) and the direction off the ground."""
 
-    def __init__(self, shapes: Sequence[Triangles], axes: np.ndarray, vertical: np.ndarray) -> None:
+    def __init__(self, shapes: Sequence[LitTriangles], axes: np.ndarray, vertical: np.ndarray) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
@@ -74,7 +74,7 @@ class Scene:
         rays = np.flatnonzero(hit["primID"] >= 0)
         face = hit["primID"][rays]
         # fill in the visibility at the corners of the triangles in sight
-        faces = distinct(face)
+        faces = unique_integers(face)
         sky = sphere_directions(SKY_RAYS)
         key = cone_directions(_unit(np.array(KEY[0])) @ self.axes, 0.16, 14)
         for shape, start, end in zip(self._shapes, self._starts[:-1], self._starts[1:], strict=True):
@@ -156,7 +156,7 @@ class Scene:
         return sky + 0.40 * (1 - self._open(points, normals, cone_directions(key, 0.22, 32), 4 * self.size))
 
 
-def _merge_shapes(shapes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
+def _merge_shapes(shapes: Sequence[LitTriangles]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float32 and triangles (F, 3) int32 of all shapes: a tree of these is made faster."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     for shape in shapes:

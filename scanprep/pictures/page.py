@@ -15,7 +15,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ..console import JUDGEMENT, Metric, judgement_of, split_figures
-from ..geometry.storage import write
+from ..geometry.storage import write_file
 from ..judgement import Judgement
 from .scene import Pane, match_camera_scales, pack_scene, picture_panes
 from .sheets import png_bytes, webp_bytes
@@ -144,7 +144,7 @@ class Page:
 
     def write(self, path: str | Path) -> None:
         """Write the page, whole or not at all."""
-        write(path, self.html())
+        write_file(path, self.html())
 
 
 def link_to(name: str) -> str:

@@ -18,7 +18,7 @@ def depth(data: bytes) -> tuple[int, int]:
     return data[24], CHANNELS.get(data[25], 0)
 
 
-def decode(data: bytes) -> np.ndarray:
+def decode_png16(data: bytes) -> np.ndarray:
     """(H, W, C) uint16 of a PNG file with 16 bits a channel."""
     bits, channels = depth(data)
     width, height = struct.unpack(">II", data[16:24])

@@ -20,7 +20,7 @@ from .camera import Camera
 from .colors import Heat, heat
 from .low_rank import low_rank
 from .shading import Bones, Dots, Moving, Shape, Solid, own_color, render
-from .sheets import side_by_side
+from .sheets import contact_sheet
 from .thinning import of_vertices, thin_solid
 
 FORMAT = 1
@@ -57,7 +57,7 @@ def picture_panes(panes: Sequence[Pane], height: int, columns: int | None = None
     images = [picture_pane(pane, max(110, int(height * pane.camera.width / pane.camera.height) + 10), height)
               for pane in panes]
     labels = [pane.label for pane in panes]
-    return side_by_side(images, labels if any(labels) else None, columns=columns)
+    return contact_sheet(images, labels if any(labels) else None, columns=columns)
 
 
 def pack_scene(panes: Sequence[Pane], whole: bool = False) -> bytes:

@@ -14,11 +14,25 @@ from ..geometry.format_common import as_light
 from ..geometry.mesh import Mesh
 from .camera import Camera
 from .colors import Heat, color_bar, heat, part_colors, part_palette
-from .lighting import Canvas, Scene, Triangles
-from .sheets import png_bytes, save_png, side_by_side
+from .lighting import Canvas, LitTriangles, Scene
+from .sheets import contact_sheet, png_bytes, save_png
 
-__all__ = ["Bones", "Camera", "Dots", "Heat", "Moving", "Solid", "color_bar", "heat", "part_colors", "part_palette",
-           "png_bytes", "render", "save_png", "side_by_side"]
+__all__ = [
+    "Bones",
+    "Camera",
+    "Dots",
+    "Heat",
+    "Moving",
+    "Solid",
+    "color_bar",
+    "contact_sheet",
+    "heat",
+    "part_colors",
+    "part_palette",
+    "png_bytes",
+    "render",
+    "save_png",
+]
 
 CLAY = (0.79, 0.76, 0.725)
 
@@ -112,7 +126,7 @@ def _scene(shapes: Sequence[Shape], camera: Camera) -> Scene:
     return Scene([_triangles(shape, camera.target) for shape in shapes], camera.axes, camera.vertical)
 
 
-def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
+def _triangles(shape: Shape, origin: np.ndarray) -> LitTriangles:
     """The triangles of a shape, moved so that `origin` is at 0."""
     if isinstance(shape, Mesh):
         shape = Solid(shape)
@@ -121,8 +135,8 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         flat = np.broadcast_to(mesh.face_normals[:, None], mesh.corners.shape)
         normals = mesh.vertex_normals[mesh.faces] if shape.smooth else flat
         color = own_color(shape)
-        return Triangles(mesh.corners - origin, normals, _corner_colors(np.asarray(color, dtype=float), mesh),
-                         mesh.faces, mesh.vertex_normals)
+        return LitTriangles(mesh.corners - origin, normals, _corner_colors(np.asarray(color, dtype=float), mesh),
+                            mesh.faces, mesh.vertex_normals)
     if isinstance(shape, Dots):
         points = np.atleast_2d(np.asarray(shape.points, dtype=float))
         use = np.isfinite(points).all(axis=1)
@@ -135,7 +149,7 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         count = len(starts)
     given = shape.color.colors() if isinstance(shape.color, Heat) else shape.color
     color = as_light(np.broadcast_to(np.asarray(given, dtype=float), (count, 3)))[use][owner]
-    return Triangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
+    return LitTriangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
 
 
 def own_color(solid: Solid) -> np.ndarray | Sequence[float]:

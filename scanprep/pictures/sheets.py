@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.storage import read_bytes, write
+from ..geometry.storage import read_bytes, write_file
 
 INK = (58, 62, 68)
 
@@ -19,8 +19,8 @@ def font(size: int):
     return ImageFont.load_default(size=size)
 
 
-def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
-                 columns: int | None = None) -> np.ndarray:
+def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
+                  columns: int | None = None) -> np.ndarray:
     """A contact sheet (H, W, 3) uint8 of pictures of any sizes with a line of text below each.
 
     All stand in one row unless `columns` says otherwise; each is centred in its cell.
@@ -77,7 +77,7 @@ def small_picture(path: Path, width: int = 700) -> bytes:
 
 def save_png(path: str | Path, image: np.ndarray) -> None:
     """Write a picture (H, W, 3) uint8, whole or not at all."""
-    write(path, png_bytes(image))
+    write_file(path, png_bytes(image))
 
 
 def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
@@ -104,4 +104,4 @@ def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
 
 def write_gif(path: str | Path, images: Sequence[np.ndarray], rate: float) -> None:
     """Write `gif_bytes`, whole or not at all."""
-    write(path, gif_bytes(images, rate))
+    write_file(path, gif_bytes(images, rate))

@@ -14,7 +14,7 @@ import numpy as np
 from ..geometry.format_common import load_bytes, metres_per_unit
 from ..geometry.format_glb import Glb, chunks_of, file_beside, one_mesh, some_normal, tallest, turn_up, up_of
 from ..geometry.mesh import Mesh
-from ..geometry.storage import write
+from ..geometry.storage import write_file
 from ..geometry.surface import Rays, barycentric
 from .gltf import skin_material
 from .sheets import png_bytes
@@ -143,7 +143,7 @@ def _names_a_picture(path: Path) -> bool:
     return b"mtllib" in data if ending == ".obj" else b'"images"' in data
 
 
-def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:
+def bake_texture(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:
     """A texture of a body: what `look` says of its pixels, where its weight is zero `unseen` (N, 3) of the vertices."""
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
@@ -191,7 +191,7 @@ def write_textured(path: str | Path, texture: Texture) -> None:
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
     document = one_mesh({"primitives": [surface]}, material, {"name": "body"})
-    write(path, glb.pack({**document, "images": [image], "textures": [{"source": 0}]}, up))
+    write_file(path, glb.pack({**document, "images": [image], "textures": [{"source": 0}]}, up))
 
 
 def _normals(mesh: Mesh) -> np.ndarray:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..batch.pool import Workers
-from ..batch.room import Room
+from ..batch.room import TaskContext
 from ..batch.workspace import Task, Workspace
 from ..geometry.farthest_points import farthest_points
 from ..geometry.files import read_mesh
@@ -52,7 +52,7 @@ class RegisterAgain:
     first: RegisterScan
     number: int                     # of the round, from 1
 
-    def __call__(self, given: DoubtedScan, room: Room) -> ScanFigures | None:
+    def __call__(self, given: DoubtedScan, room: TaskContext) -> ScanFigures | None:
         try:
             found = self.first.register(given.scan, room)
         except ValueError:              # the model does not find it either: the first registration stays, or its reason

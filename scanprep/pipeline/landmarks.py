@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..batch.opening import workspace
-from ..batch.room import Progress, Room
+from ..batch.room import Progress, TaskContext
 from ..batch.workspace import NothingMadeError, Task, Workspace
 from ..cli import MM, Output, Unit
 from ..console import Metric, Outcome, bar
@@ -26,7 +26,7 @@ from ..geometry.landmark_writing import Format, landmark_ending
 from ..geometry.landmarks import landmarks_beside, read_template_landmarks, write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.surface import OrientedPoints, Surface
-from ..geometry.target import orient, target_of
+from ..geometry.target import orient_by_mesh, target_of
 from ..judgement import size
 from ..registration.matches import NORMALS
 from ..registration.person import average_person, find_landmarks
@@ -184,7 +184,7 @@ class FindPoints:
 
     landmarks: Mapping[str, int]
 
-    def __call__(self, given: ScanAndBody, room: Room) -> ScanLandmarks:
+    def __call__(self, given: ScanAndBody, room: TaskContext) -> ScanLandmarks:
         scan, body = read_scan(given.scan, given.unit), read_mesh(given.mesh, unit="m")
         points, gaps = points_on_scan(scan, body, np.array(list(self.landmarks.values())))
         found = ScanLandmarks(tuple(self.landmarks), points, gaps, size(body))
@@ -222,7 +222,7 @@ def points_on_scan(scan: Mesh | np.ndarray, body: Mesh, vertices: np.ndarray) ->
     """
     # the other side of a thin limb is near too: points count that face as the body does
     scale = size(body)
-    target = orient(target_of(scan), body, NORMALS * scale)
+    target = orient_by_mesh(target_of(scan), body, NORMALS * scale)
     match = OrientedPoints(target.points, target.normals, NORMALS * scale).match(
         body.vertices, body.vertex_normals, NEAR * scale)
     seen, points = match.valid[vertices], body.vertices[vertices]

@@ -7,15 +7,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from ..batch.values import load_header, load_value, save_value
+from ..batch.values import load_step_header, load_value, save_value
 from ..registration.figures import ScanFigures, Verdict
-from ..registration.limbs import Doubt
+from ..registration.limbs import PlausibilityIssue
 from ..registration.unmarked import RIVAL
 
 RIVALS = "rivals"
 CHOSEN = "chosen"
 # 1 is where a doubt begins: both bodies lie on the scan, and neither is wrong for having a rival
-TWO_BODIES = Doubt(1.0, f"{RIVAL}: choose between the two with scape pick SET")
+TWO_BODIES = PlausibilityIssue(1.0, f"{RIVAL}: choose between the two with scape pick SET")
 
 
 def rival_file(name: str) -> str:
@@ -42,7 +42,7 @@ def has_rival(folder: Path, name: str) -> bool:
 
 def is_chosen(folder: Path, name: str) -> bool:
     """Whether somebody chose between the two bodies of a scan in a folder."""
-    header = load_header(folder / RIVALS / f"{name}.npz")
+    header = load_step_header(folder / RIVALS / f"{name}.npz")
     return header is not None and bool(header.get(CHOSEN))
 
 

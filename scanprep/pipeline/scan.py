@@ -9,18 +9,18 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..batch.room import Progress, Room
+from ..batch.room import Progress, TaskContext
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan, take_clutter
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan, write_mesh
 from ..geometry.landmarks import check_on_surface, read_landmarks, try_match_landmarks
 from ..geometry.mesh import Mesh
-from ..judgement import beyond_people, extent
+from ..judgement import extent, implausible_body
 from ..ranges import FLAG, Settings
 from ..registration.figures import ScanFigures, figures_of
 from ..registration.ground import with_soles
 from ..registration.lead import Lead
-from ..registration.limbs import Doubt, find_exchanged_sides, limb_doubts
+from ..registration.limbs import PlausibilityIssue, find_exchanged_sides, limb_doubts
 from ..registration.nonrigid import LedRegistration, register, registration_problem
 from ..registration.person import PersonParts, stature
 from ..registration.repair import repair_limbs
@@ -144,12 +144,12 @@ class RegisterScan:
     # what finds bodies on scans, where some have few landmarks or none: it follows from template and settings
     lead: Lead | None = field(default=None, metadata={"digest": False})
 
-    def __call__(self, task: ScanTask, room: Room) -> ScanFigures:
+    def __call__(self, task: ScanTask, room: TaskContext) -> ScanFigures:
         found = self.register(task, room)
         self.write(room.folder, task.name, found)
         return found.figures
 
-    def register(self, task: ScanTask, room: Room) -> RegisteredScan:
+    def register(self, task: ScanTask, room: TaskContext) -> RegisteredScan:
         """Bring the template onto a scan."""
         return register_scan(task, self.template, dict(self.landmarks), self.settings, self.parts, room.tell, self.lead)
 
@@ -178,10 +178,10 @@ def mesh_file(name: str) -> str:
     return f"meshes/{name}.ply"
 
 
-def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:
+def size_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[PlausibilityIssue, ...]:
     """What is unlikely in the size of a person on whom the template's vertices (N, 3), metres, lie."""
-    sized = beyond_people(stature(template, parts, vertices))
-    return tuple(Doubt(2.0 if sized.problems else 1.0, reason) for reason in sized.reasons)
+    sized = implausible_body(stature(template, parts, vertices))
+    return tuple(PlausibilityIssue(2.0 if sized.problems else 1.0, reason) for reason in sized.reasons)
 
 
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings

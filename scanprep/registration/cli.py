@@ -28,7 +28,7 @@ from ..geometry.landmarks import (
     try_match_landmarks,
 )
 from ..geometry.mesh import Mesh
-from ..judgement import Judgement, beyond_people, size
+from ..judgement import Judgement, implausible_body, size
 from .figures import UNSEEN, figures_of, review
 from .ground import soles_row, with_soles
 from .lead import lead_of
@@ -194,4 +194,4 @@ def judge_registration(name: str, template: Mesh, scan: Mesh | np.ndarray, fit: 
     if parts is None or problem is not None:
         return verdict.judgement.merge(rival)
     # of a body that is too large or too small the size is the cause, limbs out of shape are what comes of it
-    return beyond_people(stature(template, parts, fit.mesh.vertices)).merge(verdict.judgement, rival)
+    return implausible_body(stature(template, parts, fit.mesh.vertices)).merge(verdict.judgement, rival)

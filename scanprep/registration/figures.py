@@ -13,7 +13,7 @@ from ..geometry.mesh import Mesh
 from ..judgement import Judgement
 from ..ranges import Settings
 from ..words import number_of
-from .limbs import Doubt
+from .limbs import PlausibilityIssue
 from .nonrigid import Registration, share_stretched
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
@@ -46,7 +46,7 @@ class ScanFigures:
     removed: float = 0.0    # share of the scan's points that were cleaned off before
     seconds: float = np.nan         # in `times.csv`, as it is the one figure that differs from run to run
     rolled: bool = False    # limbs are rolled otherwise than they were found first, as no person's lie so
-    doubts: tuple[Doubt, ...] = ()  # in `limbs.csv`: what no person can do, the gravest first
+    doubts: tuple[PlausibilityIssue, ...] = ()  # in `limbs.csv`: what no person can do, the gravest first
 
 
 def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanFigures:
@@ -99,17 +99,17 @@ def write_failures(folder: Path, failures: Mapping[str, str]) -> None:
         (folder / FAILURES).unlink(missing_ok=True)
 
 
-def read_doubts(folder: Path) -> dict[str, list[Doubt]] | None:
+def read_doubts(folder: Path) -> dict[str, list[PlausibilityIssue]] | None:
     """What in each scan no person can do, the gravest first; None for a template that is no person."""
     if not (folder / LIMBS).exists():
         return None
-    found: dict[str, list[Doubt]] = {}
+    found: dict[str, list[PlausibilityIssue]] = {}
     for row in _read(folder / LIMBS):
-        found.setdefault(row["name"], []).append(Doubt(float(row["excess"]), row["reason"]))
+        found.setdefault(row["name"], []).append(PlausibilityIssue(float(row["excess"]), row["reason"]))
     return found
 
 
-def write_doubts(folder: Path, doubts: Mapping[str, Iterable[Doubt]]) -> None:
+def write_doubts(folder: Path, doubts: Mapping[str, Iterable[PlausibilityIssue]]) -> None:
     """Write the table of what no person can do, sorted by name."""
     tables.write_table(folder / LIMBS, ["name", "excess", "reason"],
                        [(name, f"{doubt.excess:.3f}", doubt.words) for name in sorted(doubts)
@@ -192,7 +192,7 @@ class Verdict:
 
 
 def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: float, faces: int,
-           limits: Limits | None = None, doubts: Mapping[str, Sequence[Doubt]] | None = None,
+           limits: Limits | None = None, doubts: Mapping[str, Sequence[PlausibilityIssue]] | None = None,
            usual: float | None = None) -> list[Verdict]:
     """Verdicts on all scans, worst first; `size` of the template in metres, the number of its `faces`.
 
@@ -210,7 +210,8 @@ def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: fl
     return verdicts + sorted(judged, key=lambda verdict: (-verdict.badness, verdict.name))
 
 
-def evidence_of(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt]
+def evidence_of(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits,
+                doubts: Sequence[PlausibilityIssue]
                 ) -> dict[str, float]:
     """The evidence against a registration: each figure as a multiple of its limit, by the names of the limits.
 
@@ -239,7 +240,8 @@ def probability_right(evidence: Mapping[str, float]) -> float:
     return float(1 / (1 + np.exp(against - WEIGHTS["certain"])))
 
 
-def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt] | None
+def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits,
+           doubts: Sequence[PlausibilityIssue] | None
            ) -> Verdict:
     found = evidence_of(f, size, faces, usual, limits, doubts or ())
     right = np.nan if doubts is None else probability_right(found) if f.seen else 0.0

@@ -16,11 +16,11 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import Factored, conjugate_gradients
 from ..geometry.surface import OrientedPoints
-from ..geometry.target import Target, orient
+from ..geometry.target import Target, orient_by_mesh
 from ..threads import search_threads
-from .matches import NORMALS, Pull, pull, tukey
+from .matches import NORMALS, QuadraticTargets, pull, tukey
 from .schedule import FinalFitConfig, FinalFitRound
-from .stretches import Field, triangles_of
+from .stretches import Field, gradient_operator
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +125,9 @@ class _SurfaceFit:
                  landmarks: tuple[np.ndarray, np.ndarray] | None, config: FinalFitConfig) -> None:
         size, N = float(np.sqrt(template.face_areas.sum())), len(start)
         self.template, self.start, self.config, self.size = template, start, config, size
-        self.triangles = triangles_of(template)
+        self.triangles = gradient_operator(template)
         self.areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
-        target = orient(target, template.with_vertices(start), NORMALS * size)
+        target = orient_by_mesh(target, template.with_vertices(start), NORMALS * size)
         self.scan = smooth_scan(target, config.noise_width * size)
         self.held = pull(N, np.arange(N), start, 1e-9 * self.areas)
         if landmarks is not None:
@@ -143,7 +143,7 @@ class _SurfaceFit:
             weights = 1 / (1 + (off / 0.5) ** 2) ** 2
         return measured, smooth
 
-    def data(self, x: np.ndarray, reach: float) -> tuple[Pull, np.ndarray]:
+    def data(self, x: np.ndarray, reach: float) -> tuple[QuadraticTargets, np.ndarray]:
         """Vertices drawn to the tangent planes of the nearest smoothed points with like normals, and which (N,) are."""
         reach, scan, body = reach * self.size, self.scan, self.template.with_vertices(x)
         found = OrientedPoints(scan.points, scan.normals, NORMALS * self.size).match(x, body.vertex_normals, reach)

@@ -12,12 +12,12 @@ from ..geometry.sparse import factor
 def without_inverted(template: Mesh, x: np.ndarray) -> np.ndarray:
     """Vertices (N, 3) where patches around inverted triangles were laid anew, wider ones while that leaves fewer."""
     x = unfold(template, x)
-    left = int(inverted_triangles(template, x).sum())
+    left = int(find_inverted_triangles(template, x).sum())
     for rings in ((2,), (2, 3), (3, 4)):
         if not left:
             break
         trial = unfold(template, x, rings=rings)
-        count = int(inverted_triangles(template, trial).sum())
+        count = int(find_inverted_triangles(template, trial).sum())
         if count < left:
             x, left = trial, count
     return x
@@ -40,7 +40,7 @@ def vertex_rotations(template: Mesh, x: np.ndarray, rings: int = 4) -> np.ndarra
     return rotations.project(M.reshape(-1, 3, 3))
 
 
-def inverted_triangles(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None) -> np.ndarray:
+def find_inverted_triangles(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None) -> np.ndarray:
     """(F,) bool: triangles of vertices (N, 3) that face away from where their surroundings were rotated to.
 
     `linear` (N, 3, 3) is the rotation around every vertex, by default that of its surroundings.
@@ -62,7 +62,7 @@ def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None, ring
     rest = template.vertices[b] - template.vertices[a]
     wanted = np.matmul(0.5 * (linear[a] + linear[b]), rest[..., None])[..., 0]
     for reach in rings:
-        bad = inverted_triangles(template, x, linear)
+        bad = find_inverted_triangles(template, x, linear)
         if not bad.any():
             break
         patch = np.zeros(len(x))

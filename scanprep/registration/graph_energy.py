@@ -15,7 +15,7 @@ from scipy.sparse import bsr_array, csc_array
 from ..geometry import rotations
 from ..geometry.sparse import gatherer, sum_groups
 from .deformation_graph import DeformationGraph, NodeMotion, arms
-from .matches import Pull
+from .matches import QuadraticTargets
 from .schedule import GraphStage
 
 UNKNOWNS = 7
@@ -84,7 +84,7 @@ def _edge_term(r: np.ndarray, w: np.ndarray, jacobians: Callable[[], tuple[np.nd
     return Term(float(np.sum(w[:, None] * r**2)), normal)
 
 
-def data_term(graph: DeformationGraph, motion: NodeMotion, wanted: Pull) -> Term:
+def match_term(graph: DeformationGraph, motion: NodeMotion, wanted: QuadraticTargets) -> Term:
     """What matches and landmarks ask of the nodes that carry the vertices."""
     active = np.flatnonzero(np.einsum("nii->n", wanted.A) > 0)
     A, b = wanted.A[active], wanted.b[active]
@@ -156,10 +156,10 @@ def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -
     return _edge_term((motion.log_scale[j] - motion.log_scale[i])[:, None], stiffness**2 * graph.link_area, jacobians)
 
 
-def terms(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stage: GraphStage, size: float
+def terms(graph: DeformationGraph, motion: NodeMotion, wanted: QuadraticTargets, stage: GraphStage, size: float
           ) -> dict[str, Term]:
     """All terms of the energy at one state, on a template of some size, metres."""
-    return {"data": data_term(graph, motion, wanted),
+    return {"data": match_term(graph, motion, wanted),
             "stretch": stretch_term(graph, motion, stage.stretch * size),
             "bend": bend_term(graph, motion, stage.bend * size),
             "growth": growth_term(graph, motion, stage.growth * size)}

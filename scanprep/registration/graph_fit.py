@@ -17,11 +17,11 @@ from scipy.spatial import cKDTree
 from ..geometry.farthest_points import thin
 from ..geometry.least_squares import Sparse, levenberg_marquardt
 from ..geometry.mesh import Mesh
-from ..geometry.target import orient
+from ..geometry.target import orient_by_mesh
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, motion_of, refine_motion
 from .graph_energy import UNKNOWNS, node_pattern, terms
 from .limb_ends import End, RigidFit, bending, find_ends, rotate_ends
-from .matches import NORMALS, Fit, Inputs, Pull, landmark_pull, pull, pull_of_stage
+from .matches import NORMALS, Fit, QuadraticTargets, RegistrationProblem, landmark_pull, pull, pull_of_stage
 from .schedule import GraphStage, RegistrationConfig
 
 
@@ -39,7 +39,7 @@ class GraphFit(Fit):
         finer = build_graph(template, nodes)
         return replace(self, graph=finer, motion=refine_motion(self.graph, self.motion, finer))
 
-    def minimise(self, wanted: Pull, stage: GraphStage, size: float, steps: int) -> GraphFit:
+    def minimise(self, wanted: QuadraticTargets, stage: GraphStage, size: float, steps: int) -> GraphFit:
         """The fit nearer to what matches and landmarks want, against the resistance of the nodes of a stage."""
         if not wanted.A.any():
             return self
@@ -64,7 +64,7 @@ class GraphFit(Fit):
                        iterations=self.iterations + found.iterations)
 
 
-def register_graph(inputs: Inputs, start: np.ndarray, config: RegistrationConfig,
+def register_graph(inputs: RegistrationProblem, start: np.ndarray, config: RegistrationConfig,
                    progress: Callable[[int, int], None]) -> GraphFit:
     """The template bent onto the scan by the stages of the schedule, from vertices by those near; see `Method`."""
     near = start.shape == inputs.template.vertices.shape
@@ -90,7 +90,7 @@ def start_fit(template: Mesh, T: np.ndarray, nodes: int) -> GraphFit:
     return GraphFit(template.vertices @ R.T + t, graph=graph, motion=motion)
 
 
-def fit_stages(inputs: Inputs, fit: GraphFit, stages: list[GraphStage],
+def fit_stages(inputs: RegistrationProblem, fit: GraphFit, stages: list[GraphStage],
                progress: Callable[[int, int], None] = lambda done, total: None) -> GraphFit:
     """The fit after some stages, and after ends of the body were tried in other rotations where a stage says so."""
     done, total = 0, sum(stage.rounds for stage in stages)
@@ -104,7 +104,7 @@ def fit_stages(inputs: Inputs, fit: GraphFit, stages: list[GraphStage],
     return fit
 
 
-def fit_stage(inputs: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
+def fit_stage(inputs: RegistrationProblem, fit: GraphFit, stage: GraphStage) -> GraphFit:
     """The fit after matches were sought and followed, as often as the stage says."""
     cell, template = stage.detail * inputs.size, inputs.template
     target, sample = inputs.target.thin(cell), thin(template.vertices, cell)
@@ -114,7 +114,7 @@ def fit_stage(inputs: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
     return fit
 
 
-def rotate_end(inputs: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> GraphFit:
+def rotate_end(inputs: RegistrationProblem, fit: GraphFit, stage: GraphStage, end: End) -> GraphFit:
     """The fit with an end of the body rotated about itself, where that lies nearer to the scan and needs less bending.
 
     A head or a hand that is rolled wrongly lies on the scan as well, but must change its shape for it. The joint above
@@ -122,7 +122,7 @@ def rotate_end(inputs: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> Gr
     """
     size, template = inputs.size, inputs.template
     target = inputs.target.thin(0.5 * stage.detail * size)
-    scan = RigidFit(orient(target, template.with_vertices(fit.x), NORMALS * size), size)
+    scan = RigidFit(orient_by_mesh(target, template.with_vertices(fit.x), NORMALS * size), size)
     held = landmark_pull(len(fit.x), inputs.landmarks, stage.landmarks * size**2)
     areas = template.vertex_areas
 

@@ -13,11 +13,11 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from ..cleaning.floor import Plane
 from ..console import Metric
 from ..geometry.mesh import Mesh
-from ..geometry.target import orient, target_of
+from ..geometry.target import orient_by_mesh, target_of
 from ..judgement import size
 from ..skeleton.roles import above, limb_parts
 from ..skeleton.tree import Skeleton
-from .folds import inverted_triangles, without_inverted
+from .folds import find_inverted_triangles, without_inverted
 from .limb_ends import bending
 from .matches import NORMALS, tukey
 from .nonrigid import Registration
@@ -62,13 +62,13 @@ def with_soles(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, parts
     """A registration whose soles rest on the floor at which its scan ends; else as it is, and for no person."""
     if parts is None:
         return fit
-    target = orient(target_of(scan), fit.mesh, NORMALS * size(template))
+    target = orient_by_mesh(target_of(scan), fit.mesh, NORMALS * size(template))
     found = put_on_floor(template, fit.mesh, foot_of_vertex(template, parts.skeleton), target.points, target.normals)
     if found is None:
         return fit
     vertices = without_inverted(template, found.vertices)          # narrow ones at rims of soles may turn over
     return replace(fit, mesh=template.with_vertices(vertices), soles=found.beyond,
-                   inverted=int(inverted_triangles(template, vertices).sum()))
+                   inverted=int(find_inverted_triangles(template, vertices).sum()))
 
 
 def soles_row(beyond: tuple[float, float] | None) -> list[Metric]:

@@ -40,7 +40,7 @@ GRAVE = 30                             # degrees beyond what people do that doub
 
 
 @dataclass(frozen=True)
-class Doubt:
+class PlausibilityIssue:
     """Something that no person can do: how grave, 1 where it begins, in words, and with which part."""
 
     excess: float
@@ -64,29 +64,36 @@ class LimbMeasures:
     most: np.ndarray
     growth: np.ndarray
 
-    def doubts(self, skeleton: Skeleton) -> tuple[Doubt, ...]:
+    def doubts(self, skeleton: Skeleton) -> tuple[PlausibilityIssue, ...]:
         """What is unlikely, the gravest first."""
-        found: list[Doubt] = []
+        found: list[PlausibilityIssue] = []
         for part in range(1, len(PARTS)):
             name, parent = (in_words(skeleton.names[k]) for k in (part, skeleton.parents[part]))
+
+            # a joint that is beyond what people do; 30 degrees beyond it double the severity
             kind = int(self.beyond[part].argmax())
             if self.beyond[part, kind] > 0:
-                # 30 degrees beyond what people do double a doubt
-                found.append(Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
-                                   f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
-                                   f"against the {parent}", part))
+                angle = abs(self.angles[part, kind])
+                found.append(PlausibilityIssue(
+                    1 + float(self.beyond[part, kind]) / GRAVE,
+                    f"the {name} is {MOVED[kind]} by {angle:.0f} degrees against the {parent}", part))
+
+            # skin that is no enlarged copy of the template's
             if part in LIMBS and self.bending[part] > self.most[part]:
-                found.append(Doubt(float(self.bending[part] / self.most[part]),
-                                   f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
-                                   "rolled, or slid", part))
+                off = 1e3 * self.bending[part]
+                found.append(PlausibilityIssue(
+                    float(self.bending[part] / self.most[part]),
+                    f"the skin of the {name} is {off:.0f} mm out of shape: it is rolled, or slid", part))
+
+            # a limb that is much larger or smaller than the body
             if part in LIMBS and abs(self.growth[part]) > SCALE:
-                found.append(Doubt(abs(float(self.growth[part])) / SCALE,
-                                   f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
-                                   f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template", part))
+                share, way = 100 * abs(np.expm1(self.growth[part])), "smaller" if self.growth[part] < 0 else "larger"
+                found.append(PlausibilityIssue(
+                    abs(float(self.growth[part])) / SCALE, f"the {name} is {share:.0f}% {way} than on the template", part))
         return tuple(sorted(found, key=lambda doubt: -doubt.excess))
 
 
-def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:
+def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[PlausibilityIssue, ...]:
     """What in a registration, vertices (N, 3), metres, no person can do, the gravest first."""
     return limb_measures(template, parts, vertices).doubts(parts.skeleton)
 
@@ -109,14 +116,14 @@ def find_exchanged_sides(template: Mesh, parts: PersonParts, vertices: np.ndarra
 
 def limb_measures(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> LimbMeasures:
     """How the parts of a template came to lie on its new vertices (N, 3), metres, against what people do."""
-    angles = joint_angles(parts.skeleton.fit_rotations(template, vertices) @ parts.R_template_rest)
+    angles = anatomical_angles(parts.skeleton.fit_rotations(template, vertices) @ parts.R_template_rest)
     bending, growth = part_bending(template, parts.skeleton, vertices)
     shape = np.array([SHAPE[part_kind(part)] for part in PARTS])
     most = (people_do()[2] + shape) * size(template.with_vertices(vertices))
-    return LimbMeasures(angles, beyond_people(angles), bending, most, growth - np.median(growth))
+    return LimbMeasures(angles, angle_excess(angles), bending, most, growth - np.median(growth))
 
 
-def beyond_people(angles: np.ndarray) -> np.ndarray:
+def angle_excess(angles: np.ndarray) -> np.ndarray:
     """By how much joint angles (..., 16, 3), degrees, are beyond what any person does."""
     low, high = angle_limits()
     return np.maximum(np.maximum(low - angles, angles - high), 0)
@@ -129,7 +136,7 @@ def angle_limits() -> tuple[np.ndarray, np.ndarray]:
     return low - slack, high + slack
 
 
-def joint_angles(R: np.ndarray) -> np.ndarray:
+def anatomical_angles(R: np.ndarray) -> np.ndarray:
     """Roll, bend and sideways bend (..., 16, 3), degrees, of every part against its parent; 0 for the root.
 
     From world rotations R (..., 16, 3, 3) against the rest of the synthetic people. The relative rotation is a roll
@@ -198,7 +205,7 @@ def people_do() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # random poses beside the named ones that show what people do
     poses = [*map(find_pose, NAMED_POSES), *(random_pose(rng) for _ in range(60))]
     bodies = np.stack([person.in_pose(pose) for pose in poses])
-    angles = joint_angles(person.skeleton.fit_rotations(person.mesh, bodies))
+    angles = anatomical_angles(person.skeleton.fit_rotations(person.mesh, bodies))
     bent = np.stack([part_bending(person.mesh, person.skeleton, body)[0] for body in bodies])
     angles = np.concatenate([angles, angles[:, MIRROR_PART] * [-1, 1, -1]])
     bent = np.concatenate([bent, bent[:, MIRROR_PART]])

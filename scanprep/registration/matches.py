@@ -14,7 +14,7 @@ from ..correspondence.correspondences import Correspondences, check_pairs
 from ..geometry.farthest_points import farthest_points, thin
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.sparse import gatherer, sum_groups
-from ..geometry.target import Target, orient, target_of
+from ..geometry.target import Target, orient_by_mesh, target_of
 from ..threads import search_threads
 from .paths import descriptors, path_lengths
 from .schedule import GraphStage
@@ -24,7 +24,7 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Inputs:
+class RegistrationProblem:
     """A template, a scan, and what is known of how they belong together; descriptors (N, q) where there are anchors.
 
     Landmarks are vertices (L,) and where they are on the scan (L, 3), metres; of the hints some are wrong.
@@ -48,8 +48,8 @@ class Fit:
     moved: float = np.inf
 
 
-def prepare(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
-            hints: Correspondences | None = None) -> Inputs:
+def prepare_problem(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
+                    hints: Correspondences | None = None) -> RegistrationProblem:
     """Everything checked, and the surfaces described by their paths to landmarks, or else to the surest hints."""
     check_template(template)
     if landmarks is not None:
@@ -64,12 +64,12 @@ def prepare(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None
     cell = 0.012 * size                                     # spacing of the points that paths run over
     anchors = path_anchors(landmarks, hints, target, 3 * cell)
     if anchors is None:
-        return Inputs(template, target, size, landmarks, hints)
+        return RegistrationProblem(template, target, size, landmarks, hints)
     # both thinned to the same spacing and linked by the same rule: a path is longer than the true one alike on both
     mine = path_lengths(template.vertices, template.vertex_normals, template.vertices[anchors[0]], cell)
     theirs = path_lengths(target.points, target.normals, anchors[1], cell, target.oriented)
-    return Inputs(template, replace(target, descriptors=descriptors(theirs, size)), size, landmarks, hints,
-                  descriptors(mine, size))
+    return RegistrationProblem(template, replace(target, descriptors=descriptors(theirs, size)), size, landmarks, hints,
+                               descriptors(mine, size))
 
 
 def path_anchors(landmarks: Landmarks | None, hints: Correspondences | None, target: Target, near: float, most: int = 8
@@ -90,16 +90,16 @@ def path_anchors(landmarks: Landmarks | None, hints: Correspondences | None, tar
     return hints.template_vertices[chosen], hints.scan_points[chosen]
 
 
-def initial_transform(inputs: Inputs) -> np.ndarray:
+def initial_transform(inputs: RegistrationProblem) -> np.ndarray:
     """The rigid transform (4, 4) to begin with: by descriptors, else by landmarks, else by the surfaces as a whole."""
     template, target = inputs.template, inputs.target
     if inputs.descriptors is not None:
         # Front and back of a trunk are described nearly alike. A motion to such points flattens the body, but its
         # rotation is right, since right, left, up and down are told apart.
         sample, few = thin(template.vertices, 0.03 * inputs.size), target.thin(0.03 * inputs.size)
-        mine = Described(template.vertices, template.vertex_normals, inputs.descriptors).of(sample)
-        index, _ = mine.match(Described(few.points, few.normals, few.descriptors), np.inf,
-                              Likeness(positions=0.0, descriptors=1.0, limit=np.inf))
+        mine = FeaturePoints(template.vertices, template.vertex_normals, inputs.descriptors).of(sample)
+        index, _ = mine.match(FeaturePoints(few.points, few.normals, few.descriptors), np.inf,
+                              MatchWeights(positions=0.0, descriptors=1.0, limit=np.inf))
         return landmark_motion(template.vertices[sample[index >= 0]], few.points[index[index >= 0]])
     if inputs.landmarks is not None:
         return landmark_motion(template.vertices[inputs.landmarks[0]], inputs.landmarks[1])
@@ -113,7 +113,7 @@ def initial_transform(inputs: Inputs) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Pull:
+class QuadraticTargets:
     """A quadratic energy of each vertex, `Σ xᵀ A x - 2 b·x + c`: what matches and landmarks want.
 
     A (N, 3, 3), square metres; b (N, 3), cubic metres.
@@ -123,8 +123,8 @@ class Pull:
     b: np.ndarray
     c: float
 
-    def __add__(self, other: Pull) -> Pull:
-        return Pull(self.A + other.A, self.b + other.b, self.c + other.c)
+    def __add__(self, other: QuadraticTargets) -> QuadraticTargets:
+        return QuadraticTargets(self.A + other.A, self.b + other.b, self.c + other.c)
 
     def energy(self, x: np.ndarray) -> float:
         """The energy of vertices (N, 3)."""
@@ -132,7 +132,7 @@ class Pull:
 
 
 def pull(count: int, vertices: np.ndarray, targets: np.ndarray, weights: np.ndarray,
-         normals: np.ndarray | None = None, slide: float = 1.0) -> Pull:
+         normals: np.ndarray | None = None, slide: float = 1.0) -> QuadraticTargets:
     """Some of `count` vertices, (n,), drawn to targets (n, 3) with weights (n,), square metres.
 
     A vertex may have several targets. With their normals the force along the surface is only a share, `slide`, of that
@@ -144,11 +144,11 @@ def pull(count: int, vertices: np.ndarray, targets: np.ndarray, weights: np.ndar
     A = weights[:, None, None] * A
     b = np.einsum("nij,nj->ni", A, targets)
     gather = gatherer(vertices, count)
-    return Pull(sum_groups(gather, A), gather @ b, float(np.sum(b * targets)))
+    return QuadraticTargets(sum_groups(gather, A), gather @ b, float(np.sum(b * targets)))
 
 
 @dataclass(frozen=True)
-class Likeness:
+class MatchWeights:
     """What a match is sought by, each as the distance in metres that a difference of one is worth."""
 
     positions: float = 1.0       # less where the template does not lie near yet; 0 seeks by descriptors alone
@@ -158,26 +158,26 @@ class Likeness:
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
+class FeaturePoints:
     """Points with what they are matched by."""
 
     points: np.ndarray
     normals: np.ndarray
     descriptors: np.ndarray | None = None
 
-    def of(self, sample: np.ndarray) -> Described:
+    def of(self, sample: np.ndarray) -> FeaturePoints:
         """Some of the points."""
-        return Described(self.points[sample], self.normals[sample],
-                         None if self.descriptors is None else self.descriptors[sample])
+        return FeaturePoints(self.points[sample], self.normals[sample],
+                             None if self.descriptors is None else self.descriptors[sample])
 
-    def columns(self, like: Likeness) -> np.ndarray:
+    def columns(self, like: MatchWeights) -> np.ndarray:
         """Points whose straight distances are how much they differ."""
         parts = [like.positions * self.points, like.normals * self.normals] if like.positions else []
         if like.descriptors and self.descriptors is not None:
             parts.append(like.descriptors * self.descriptors)
         return np.hstack(parts)
 
-    def match(self, others: Described, reach: float, like: Likeness) -> tuple[np.ndarray, np.ndarray]:
+    def match(self, others: FeaturePoints, reach: float, like: MatchWeights) -> tuple[np.ndarray, np.ndarray]:
         """For each point the best of others, -1 where it is beyond the limits; and how far apart they are."""
         mine, theirs = self.columns(like), others.columns(like)
         _, index = cKDTree(theirs).query(mine, workers=search_threads(len(mine)))
@@ -191,17 +191,17 @@ class Described:
 
 
 def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Target, reach: float, slide: float,
-                    like: Likeness, descriptors: np.ndarray | None = None) -> Pull:
+                    like: MatchWeights, descriptors: np.ndarray | None = None) -> QuadraticTargets:
     """What matches want of some vertices, `sample` (n,), of a deformed template: of them to the scan, and back.
 
     Either direction weighs as much as an area, square metres.
     The weight of a match falls to zero at a distance of `reach`, metres; its force along the surface is a share,
     `slide`, of that across it. `descriptors` (N, q) are those of the vertices.
     """
-    target = orient(target, deformed, max(like.normals, 1e-6))
+    target = orient_by_mesh(target, deformed, max(like.normals, 1e-6))
     x, N = deformed.vertices, len(deformed.vertices)
-    mine = Described(x, deformed.vertex_normals, descriptors).of(sample)
-    theirs = Described(target.points, target.normals, target.descriptors)
+    mine = FeaturePoints(x, deformed.vertex_normals, descriptors).of(sample)
+    theirs = FeaturePoints(target.points, target.normals, target.descriptors)
     p, apart = mine.match(theirs, reach, like)
     good = (p >= 0) & ~target.border[p]
     v, p = sample[good], p[good]
@@ -219,15 +219,15 @@ def tukey(distances: np.ndarray, reach: float) -> np.ndarray:
     return np.maximum(1 - (distances / reach) ** 2, 0) ** 2
 
 
-def landmark_pull(count: int, landmarks: Landmarks | None, weight: float) -> Pull:
+def landmark_pull(count: int, landmarks: Landmarks | None, weight: float) -> QuadraticTargets:
     """What landmarks want of so many vertices, each with a weight in square metres."""
     if landmarks is None:
-        return Pull(np.zeros((count, 3, 3)), np.zeros((count, 3)), 0.0)
+        return QuadraticTargets(np.zeros((count, 3, 3)), np.zeros((count, 3)), 0.0)
     vertices, points = landmarks
     return pull(count, vertices, points, np.full(len(vertices), weight))
 
 
-def hint_pull(hints: Correspondences, x: np.ndarray, reach: float, area: float) -> Pull:
+def hint_pull(hints: Correspondences, x: np.ndarray, reach: float, area: float) -> QuadraticTargets:
     """What hints, some of them wrong, want of vertices (N, 3): the farther from where it should be, the less.
 
     From `reach`, metres, on they count little. All of them together weigh as much as an area (square metres) of the
@@ -238,12 +238,13 @@ def hint_pull(hints: Correspondences, x: np.ndarray, reach: float, area: float) 
     return pull(len(x), hints.template_vertices, hints.scan_points, area * weights)
 
 
-def pull_of_stage(inputs: Inputs, stage: GraphStage, x: np.ndarray, target: Target, sample: np.ndarray) -> Pull:
+def pull_of_stage(inputs: RegistrationProblem, stage: GraphStage, x: np.ndarray, target: Target,
+                  sample: np.ndarray) -> QuadraticTargets:
     """What landmarks, matches and hints want of vertices (N, 3); those in the sample (n,) look for a match."""
     size, template = inputs.size, inputs.template
     wanted = landmark_pull(len(x), inputs.landmarks, stage.landmarks * size**2)
     if stage.reach:
-        like = Likeness(stage.positions, NORMALS * size, stage.paths * size)
+        like = MatchWeights(stage.positions, NORMALS * size, stage.paths * size)
         wanted += match_both_ways(template.with_vertices(x), sample, size**2, target, stage.reach * size, stage.slide,
                                   like, inputs.descriptors)
     if inputs.hints is not None and stage.hints:

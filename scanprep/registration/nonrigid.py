@@ -20,13 +20,13 @@ from scipy.spatial import cKDTree
 from ..correspondence.correspondences import Correspondences
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints, Surface, check_points
-from ..geometry.target import Target, orient
+from ..geometry.target import Target, orient_by_mesh
 from ..judgement import HAND, extent, size, unit_problem
 from ..threads import one_thread
 from .final_fit import final_fit
-from .folds import inverted_triangles, without_inverted
+from .folds import find_inverted_triangles, without_inverted
 from .graph_fit import register_graph
-from .matches import NORMALS, Fit, Inputs, initial_transform, prepare
+from .matches import NORMALS, Fit, RegistrationProblem, initial_transform, prepare_problem
 from .schedule import RegistrationConfig
 
 
@@ -70,7 +70,7 @@ class Method(Protocol):
     are the same for all.
     """
 
-    def __call__(self, inputs: Inputs, start: np.ndarray, config: RegistrationConfig,
+    def __call__(self, inputs: RegistrationProblem, start: np.ndarray, config: RegistrationConfig,
                  progress: Callable[[int, int], None]) -> Fit: ...
 
 
@@ -158,11 +158,11 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     if config.method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {config.method!r}")
     # what is known of both, and how every point is told from others: by place, normal, and paths to landmarks
-    inputs = prepare(template, scan, landmarks, correspondences)
+    inputs = prepare_problem(template, scan, landmarks, correspondences)
     begin = initial_transform(inputs) if start is None else _check_start(template, start)
     # near the scan, from stiff to soft; then onto it, below its noise
     fit = METHODS[config.method](inputs, begin, config, lambda done, total: tell(90 * done // total, 100))
-    fit = fit_surface(inputs, fit, config)
+    fit = snap_to_surface(inputs, fit, config)
     tell(100, 100)
     return measure_fit(inputs, fit, scan)
 
@@ -176,7 +176,7 @@ def _check_start(template: Mesh, start: np.ndarray) -> np.ndarray:
     return found
 
 
-def fit_surface(inputs: Inputs, fit: Fit, config: RegistrationConfig) -> Fit:
+def snap_to_surface(inputs: RegistrationProblem, fit: Fit, config: RegistrationConfig) -> Fit:
     """The surface at last: laid on the scan below its noise, without inverted triangles."""
     if config.final_fit is not None:
         final = final_fit(inputs.template, fit.x, inputs.target, inputs.landmarks, config.final_fit)
@@ -209,7 +209,7 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
             f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")
 
 
-def measure_fit(inputs: Inputs, fit: Fit, scan: Mesh | np.ndarray) -> Registration:
+def measure_fit(inputs: RegistrationProblem, fit: Fit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
     body, size = inputs.template.with_vertices(fit.x), inputs.size
     found = evidence(body, inputs.target, 0.015 * size, NORMALS * size)
@@ -222,7 +222,7 @@ def measure_fit(inputs: Inputs, fit: Fit, scan: Mesh | np.ndarray) -> Registrati
         mesh=body, distances=np.where(seen, found.distances, np.nan), seen=seen,
         rms=float(np.sqrt(np.mean(found.distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms=landmark_rms,
         converged=bool(fit.moved <= 0.001 * size and seen.any()), iterations=fit.iterations, energies=fit.energies,
-        inverted=int(inverted_triangles(inputs.template, fit.x).sum()), confidence=found.confidence,
+        inverted=int(find_inverted_triangles(inputs.template, fit.x).sum()), confidence=found.confidence,
         uncovered=share_uncovered(scan, body, 0.01 * size))
 
 
@@ -247,7 +247,7 @@ def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evid
     def ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
         return np.clip((value - low) / (high - low), 0, 1)
 
-    target = orient(target, deformed, scale)
+    target = orient_by_mesh(target, deformed, scale)
     x, normals = deformed.vertices, deformed.vertex_normals
     found = OrientedPoints(target.points, target.normals, scale).match(x, normals, reach)
     back = OrientedPoints(x, normals, scale).match(target.points, target.normals, reach)

@@ -21,7 +21,7 @@ from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 from ..skeleton.tree import Skeleton
 from ..synthetic.landmarks import landmarks
-from ..synthetic.people import PARENTS, PARTS, Person
+from ..synthetic.people import PARENTS, PARTS, SyntheticPerson
 from .nonrigid import Registration, register, share_stretched
 from .schedule import RegistrationConfig
 
@@ -148,6 +148,6 @@ def find_landmarks(template: Mesh, known: Mapping[str, int],
 
 
 @lru_cache(maxsize=1)
-def average_person() -> Person:
+def average_person() -> SyntheticPerson:
     """The synthetic person that templates are compared with."""
-    return Person()
+    return SyntheticPerson()

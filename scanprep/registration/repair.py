@@ -18,9 +18,9 @@ from ..judgement import size
 from ..threads import one_thread
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, motion_of
 from .graph_fit import GraphFit, fit_stages
-from .limbs import Doubt, frames, limb_doubts
-from .matches import Landmarks, prepare
-from .nonrigid import Registration, fit_surface, measure_fit, near_origin, principal_stretches, share_uncovered
+from .limbs import PlausibilityIssue, frames, limb_doubts
+from .matches import Landmarks, prepare_problem
+from .nonrigid import Registration, measure_fit, near_origin, principal_stretches, share_uncovered, snap_to_surface
 from .person import PersonParts
 from .rolls import other_rolls
 from .schedule import RegistrationConfig
@@ -60,7 +60,7 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
     if not doubted:
         return fit
     # the last stages match by positions alone: no path to landmarks or hints is needed
-    inputs = replace(prepare(template, scan), landmarks=landmarks, hints=correspondences)
+    inputs = replace(prepare_problem(template, scan), landmarks=landmarks, hints=correspondences)
     coarse = [stage for stage in stages if stage.nodes == stages[0].nodes]
     graph, tell = build_graph(template, coarse[0].nodes), progress or (lambda done, total: None)
     tries = other_rolls(parts, parts.skeleton.fit_rotations(template, x), doubted, config.rolls)
@@ -68,17 +68,17 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
     # what becomes of each in the coarse stages, cut short to three rounds: how much is to be doubted, and the share of
     # the scan off it; with as little detail as the rolls are looked at with
     short = [replace(stage, rounds=min(stage.rounds, 3), ends=0) for stage in coarse]
-    now = gravity(limb_doubts(template, parts, deform(graph, start)))
+    now = severity(limb_doubts(template, parts, deform(graph, start)))
     for number, angles in enumerate(tries):
         motion = roll_parts(graph, start, template, parts, x, angles)
         begun = GraphFit(deform(graph, motion), graph=graph, motion=motion, iterations=fit.iterations)
         trial = fit_stages(inputs, begun, short)
-        looks.append((gravity(limb_doubts(template, parts, trial.x)),
+        looks.append((severity(limb_doubts(template, parts, trial.x)),
                       share_uncovered(scan, template.with_vertices(trial.x), 0.01 * inputs.size), trial))
         tell(number + 1, len(tries) + 1)
     best = min(looks, key=lambda look: look[:2], default=None)
     if best is not None and best[0] + LESS_DOUBTED < now:
-        end = fit_surface(inputs, fit_stages(inputs, best[2], stages[len(coarse) - 1:]), config)
+        end = snap_to_surface(inputs, fit_stages(inputs, best[2], stages[len(coarse) - 1:]), config)
         found = measure_fit(inputs, end, scan)
         if better(template, parts, found, fit):
             fit = replace(found, rolled=True)
@@ -88,14 +88,14 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
 
 def better(template: Mesh, parts: PersonParts, trial: Registration, fit: Registration) -> bool:
     """Whether less is to be doubted in a registration than in another, on the scan as well and no more stretched."""
-    return (gravity(limb_doubts(template, parts, trial.mesh.vertices)) + LESS_DOUBTED
-            < gravity(limb_doubts(template, parts, fit.mesh.vertices))
+    return (severity(limb_doubts(template, parts, trial.mesh.vertices)) + LESS_DOUBTED
+            < severity(limb_doubts(template, parts, fit.mesh.vertices))
             and trial.uncovered <= fit.uncovered + LESS_COVERED
             and not trial.landmark_rms > fit.landmark_rms + LESS_COVERED * size(template)
             and strain(template, trial.mesh) <= strain(template, fit.mesh))
 
 
-def gravity(doubts: tuple[Doubt, ...]) -> float:
+def severity(doubts: tuple[PlausibilityIssue, ...]) -> float:
     """How much is to be doubted in all."""
     return sum(doubt.excess for doubt in doubts)
 

@@ -30,12 +30,12 @@ class Field:
 
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
-def triangles_of(template: Mesh) -> Triangles:
+def gradient_operator(template: Mesh) -> GradientOperator:
     """The triangles of a template, made ready once."""
-    return Triangles(template)
+    return GradientOperator(template)
 
 
-class Triangles:
+class GradientOperator:
     """The triangles of a template at rest, ready to measure gradients and to lay wanted ones out."""
 
     def __init__(self, template: Mesh) -> None:

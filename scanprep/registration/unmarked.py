@@ -23,7 +23,7 @@ from .limbs import find_exchanged_sides, limb_doubts
 from .matches import Landmarks
 from .nonrigid import LedRegistration, Registration, near_origin, register, registration_problem
 from .person import PersonParts
-from .repair import gravity, repair_limbs
+from .repair import repair_limbs, severity
 from .schedule import RegistrationConfig
 
 FEW = 7                              # landmarks from which on they lead a template alone
@@ -127,7 +127,7 @@ def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -
     Each counts 1 where it begins to be doubted; 0 where nothing does.
     """
     lost = fit.uncovered / UNCOVERED
-    limbs = 0.0 if parts is None else gravity(limb_doubts(template, parts, fit.mesh.vertices)) + EXCHANGED * (
+    limbs = 0.0 if parts is None else severity(limb_doubts(template, parts, fit.mesh.vertices)) + EXCHANGED * (
         find_exchanged_sides(template, parts, fit.mesh.vertices) is not None)
     return limbs + (lost if lost > 1 else 0.0)
 

@@ -109,10 +109,10 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
     if config.method.startswith("poisson"):
         _check(mesh, config)
         if config.method == "poisson-open3d":
-            from ..adapters.open3d_filters import poisson
+            pass
         else:
-            from ..adapters.pymeshlab_filters import poisson
-        return close(poisson(mesh, config.poisson_depth))
+            from ..adapters.pymeshlab_filters import meshlab_poisson
+        return close(meshlab_poisson(mesh, config.poisson_depth))
     return fill_report(mesh, config, progress).mesh
 
 

@@ -32,7 +32,7 @@ def repair(mesh: Mesh, min_component: float = 1.0) -> Mesh:
     ValueError
         No triangle is left.
     """
-    mesh = orient(_drop_flat(weld(mesh, 1e-7)))
+    mesh = orient_triangles(_drop_flat(weld(mesh, 1e-7)))
     for _ in range(20):
         if mesh.is_edge_manifold:
             break
@@ -80,7 +80,7 @@ def _drop_flat(mesh: Mesh) -> Mesh:
     return mesh.submesh(mesh.face_areas >= FLAT)[0]
 
 
-def orient(mesh: Mesh) -> Mesh:
+def orient_triangles(mesh: Mesh) -> Mesh:
     """Triangles inverted so that neighbours face the same way, in every patch the way most of its area does."""
     invert, _ = invert_against_neighbours(mesh)
     return Mesh(mesh.vertices, invert_triangles(mesh.faces, invert), mesh.colors) if invert.any() else mesh

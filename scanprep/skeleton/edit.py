@@ -24,13 +24,13 @@ import numpy as np
 from ..geometry import storage
 from ..geometry.mesh import Mesh
 from .joints import place_joints, ring_centre
-from .labels import keep_connected, pieces
+from .labels import keep_connected, label_patches
 from .motions import PosedSurface
 from .parts import PartSearch, SkeletonConfig
 from .tree import Skeleton
 
 
-def part_number(skeleton: Skeleton, part: int | str) -> int:
+def find_part_number(skeleton: Skeleton, part: int | str) -> int:
     """The number of a part that is given by name or number."""
     names = skeleton.names
     if isinstance(part, str) and part in names:
@@ -57,7 +57,7 @@ def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) 
     ValueError
         A part that is not there, twice the same, or parts whose union would close a loop or lie in two pieces.
     """
-    first, second = part_number(skeleton, a), part_number(skeleton, b)
+    first, second = find_part_number(skeleton, a), find_part_number(skeleton, b)
     if first == second:
         raise ValueError(f"parts: expected two different parts, got '{skeleton.names[first]}' twice")
     parents = skeleton.parents
@@ -100,7 +100,7 @@ def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.nd
     ValueError
         A part that is not there, one that the poses do not bend, or names that are taken.
     """
-    p = part_number(skeleton, part)
+    p = find_part_number(skeleton, part)
     label = skeleton.part_of_face
     cut = (cut_across(template, label == p, skeleton.joints[list(skeleton.joints_of_part[p])]) if poses is None
            else cut_where_it_bends(template, poses, label == p))
@@ -143,7 +143,7 @@ def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
     ValueError
         A part that is not there, or a name that is empty, a number, or taken.
     """
-    p = part_number(skeleton, part)
+    p = find_part_number(skeleton, part)
     if not isinstance(name, str) or not name.strip() or name.isdecimal():
         raise ValueError(f"name: expected a name that is not a number, got {name!r}")
     if name in skeleton.names and skeleton.names[p] != name:
@@ -169,7 +169,7 @@ def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Se
     ValueError
         The root, which has no joint; not one of `position` and `ring`; numbers that are no position or no vertices.
     """
-    p = part_number(skeleton, part)
+    p = find_part_number(skeleton, part)
     if p == 0:
         raise ValueError(f"part: '{skeleton.names[0]}' is the root, its joint is the middle of its vertices")
     if (position is None) == (ring is None):
@@ -281,7 +281,7 @@ def cut_across(template: Mesh, mine: np.ndarray, joints: np.ndarray) -> np.ndarr
         if not 0 < far.sum() < len(far):
             continue
         far = keep_connected(np.zeros((len(far), 2)), pairs, areas, far)      # what lies apart there goes back
-        if pieces(pairs, far).max() == 1:
+        if label_patches(pairs, far).max() == 1:
             cut = np.zeros_like(mine)
             cut[inside[far == 1]] = True
             return cut

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..batch.room import Step, once
+from ..batch.room import Step, run_uncached
 from ..geometry.mesh import Mesh
 from ..threads import one_thread
 from .joints import Loop
@@ -40,7 +40,7 @@ class SkeletonSearch:
 
 
 def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
-                  progress: Callable[[int, int], None] | None = None, step: Step = once) -> Skeleton:
+                  progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> Skeleton:
     """Rigid parts, the tree over them, and the joints, from registered poses of one body.
 
     Parts that never move against each other in the poses cannot be told apart. Of a symmetric body left and right
@@ -74,7 +74,7 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
 
 @one_thread()
 def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
-                    progress: Callable[[int, int], None] | None = None, step: Step = once) -> SkeletonSearch:
+                    progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> SkeletonSearch:
     """The skeleton of `find_skeleton`, with the loops, the symmetry and the restarts it came from.
 
     Arguments and errors are those of `find_skeleton`; `step` keeps every restart.

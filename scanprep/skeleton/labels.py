@@ -107,7 +107,7 @@ def _cut(own: np.ndarray, i: np.ndarray, j: np.ndarray, W: np.ndarray, state: np
     return out
 
 
-def pieces(pairs: np.ndarray, label: np.ndarray) -> np.ndarray:
+def label_patches(pairs: np.ndarray, label: np.ndarray) -> np.ndarray:
     """(F,) number of the connected piece of equal labels that each triangle lies in."""
     a, b = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]].T
     return label_components(a, b, len(label))
@@ -118,7 +118,7 @@ def keep_connected(costs: np.ndarray, pairs: np.ndarray, areas: np.ndarray, labe
     label = label.copy()
     for _ in range(len(label)):
         before = label.copy()
-        piece = pieces(pairs, label)
+        piece = label_patches(pairs, label)
         size = np.bincount(piece, areas)
         of_piece = np.zeros(len(size), dtype=np.int64)
         of_piece[piece] = label

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from ..batch.pool import SideBySide
-from ..batch.room import Step, once
+from ..batch.room import Step, run_uncached
 from ..geometry.mesh import Mesh, check_template
 from .joints import (
     LOOP_SEPARATION,
@@ -42,7 +42,7 @@ class SkeletonFinder:
     """
 
     def __init__(self, template: Mesh, poses: np.ndarray, config: SkeletonConfig,
-                 progress: Callable[[int, int], None] | None = None, step: Step = once) -> None:
+                 progress: Callable[[int, int], None] | None = None, step: Step = run_uncached) -> None:
         check_template(template)
         poses = np.asarray(poses, dtype=np.float64)
         n = len(template.vertices)

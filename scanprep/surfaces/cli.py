@@ -38,7 +38,7 @@ from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report, filling_judgement
 from ..repair.manifold import repair
 from ..words import number_of
-from .cloud import read_surface
+from .cloud import read_sound_surface
 from .template import carry_landmarks, make_template, template_of_scan, views_without_cameras
 
 ScansArg = Annotated[tuple[Path, ...], Place("SCAN ...")]
@@ -231,7 +231,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, unit: Unit | 
         unit: Unit of the mesh, the views and the cameras.
         config: Settings.
     """
-    found = read_surface(mesh, unit)
+    found = read_sound_surface(mesh, unit)
     before = found if found.is_edge_manifold else _manifold(found, mesh)
     seen = _read_views(views, unit) if views else ()
     holes: tuple[FilledHole, ...] = ()

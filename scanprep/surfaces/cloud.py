@@ -56,7 +56,7 @@ def mesh_of_cloud(cloud: PointCloud | np.ndarray) -> Mesh:
     return surface
 
 
-def read_surface(path: Path, unit: str | None = None) -> Mesh:
+def read_sound_surface(path: Path, unit: str | None = None) -> Mesh:
     """The mesh of a scan, made sound; of a file without triangles the surface through its points, with a warning."""
     found = read_scan(path, unit)
     if isinstance(found, Mesh):

@@ -14,7 +14,7 @@ from ..decimation.decimate import DecimateConfig, decimate
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry.files import PointCloud
 from ..geometry.mesh import Mesh, check_template, template_problem
-from ..geometry.remeshing import improve_triangles, smooth
+from ..geometry.remeshing import improve_triangles, smooth_taubin
 from ..geometry.surface import Surface
 from ..ranges import Settings
 from ..repair.hole_filling import FillConfig, close
@@ -160,13 +160,13 @@ def _finish(mesh: Mesh, faces: int, config: TemplateConfig, progress: Callable[[
     mesh = repair(mesh)
     # as wide as on merged views: on coarse scans as many rounds would round off fingers
     rounds = min(config.smoothing, round(config.smoothing * (config.merge.voxel / mesh.mean_edge)**2))
-    scanned = mesh = smooth(mesh, rounds)                        # smooth rims make fair patches
+    scanned = mesh = smooth_taubin(mesh, rounds)                        # smooth rims make fair patches
     holes = len(mesh.boundary_loops)
     if holes:
         notes.append(f"{number_of(holes, 'hole was', 'holes were')} filled")
     tell(2, 4)
     mesh = close(mesh, config.fill)
-    mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), rounds)
+    mesh = smooth_taubin(close(drop_thin(mesh, config.thinnest), config.fill), rounds)
     tell(3, 4)
     surface = Surface(mesh)
     if mesh.volume < 0:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .population import MIRROR_PART, PARENTS, PARTS, population
 
-__all__ = ["MIRROR_PART", "PARENTS", "PARTS", "Anatomy", "BodyShape"]
+__all__ = ["MIRROR_PART", "PARENTS", "PARTS", "BodyShape", "RestFrames"]
 
 Sex = Literal["female", "male"]
 # of arms from the vertical, of forearms further ahead, of legs sideways and to behind, of feet from straight ahead
@@ -77,7 +77,7 @@ class BodyShape:
         return BodyShape(sex, tuple(betas))
 
 
-class Anatomy:
+class RestFrames:
     """Joints and frames of one person at rest.
 
     `joints` (16, 3), metres, are the centres of rotation of the parts, of part 0 the middle between the hips, `ends`

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from ..geometry import storage
 from ..geometry.mesh import Mesh
 from .landmarks import landmarks as landmark_vertices
-from .people import NAMED_POSES, BodyShape, Person, find_pose, mirror_pose, random_pose
+from .people import NAMED_POSES, BodyShape, SyntheticPerson, find_pose, mirror_synthetic_pose, random_pose
 from .scanner import RangeView, Scan, ScannerConfig, scan
 
 VERSION = 2                          # 1 was of people who were made up; their shapes mean nothing here
@@ -55,7 +55,7 @@ class GroundTruth:
                                storage.numbers(a, "joints", J, 3))
 
 
-def stand(person: Person, pose: np.ndarray) -> GroundTruth:
+def stand(person: SyntheticPerson, pose: np.ndarray) -> GroundTruth:
     """A person in a pose with the lowest point on the floor, z = 0."""
     vertices = person.in_pose(pose)
     trans = np.array([0.0, 0.0, -vertices[:, 2].min()])
@@ -163,8 +163,8 @@ def scan_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
 
 
 @lru_cache(maxsize=1)
-def _person(shape: BodyShape) -> Person:
-    return Person(shape)
+def _person(shape: BodyShape) -> SyntheticPerson:
+    return SyntheticPerson(shape)
 
 
 def synthetic_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
@@ -200,7 +200,7 @@ def subject_pose(k: int, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         loose[[6, 9]] = np.clip(4.5 * loose[[6, 9]], -WRIST, WRIST)
         loose[[12, 15]] = np.clip(3.0 * loose[[12, 15]], -ANKLE, ANKLE)
         pose = find_pose(name) + loose
-        return name, mirror_pose(pose) if rng.random() < 0.4 else pose
+        return name, mirror_synthetic_pose(pose) if rng.random() < 0.4 else pose
     return f"random{k}", random_pose(rng)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..geometry import rotations
-from .anatomy import Anatomy
-from .topology import blending, load
+from .anatomy import RestFrames
+from .topology import blending, load_topology
 
 Put = Callable[[str, str, float], None]
 _TABLES = json.loads(Path(__file__).with_name("muscles.json").read_text(encoding="utf-8"))
@@ -29,7 +29,7 @@ COLUMNS = {key: i for i, key in enumerate(_columns())}
 @lru_cache(maxsize=1)
 def masks() -> np.ndarray:
     """(N, muscles) rise in metres of every vertex at full action of every muscle."""
-    template = load()
+    template = load_topology()
     v, a = template.mesh.vertices, template.anatomy
     weights = blending()[0]
     columns = []
@@ -45,7 +45,7 @@ def masks() -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def _limb_mask(v: np.ndarray, a: Anatomy, weights: np.ndarray, part: int, along: float, direction: float,
+def _limb_mask(v: np.ndarray, a: RestFrames, weights: np.ndarray, part: int, along: float, direction: float,
                wide: float, spread: float) -> np.ndarray:
     axis = a.ends[part] - a.joints[part]
     length = np.linalg.norm(axis)
@@ -63,7 +63,7 @@ def _limb_mask(v: np.ndarray, a: Anatomy, weights: np.ndarray, part: int, along:
     return np.exp(-0.5 * (((t - along * length) / wide)**2 + (off / spread)**2)) * np.clip(near, 0, 1)
 
 
-def drivers(anatomy: Anatomy, axes: np.ndarray, relative: np.ndarray) -> np.ndarray:
+def drivers(anatomy: RestFrames, axes: np.ndarray, relative: np.ndarray) -> np.ndarray:
     """How far every muscle acts (muscles,) in a pose given by relative rotations (16, 3, 3); zero at rest."""
     s = anatomy.shape
     # muscles of men swell more, and so does the flesh of who is heavy

@@ -12,17 +12,18 @@ import numpy as np
 
 from ..geometry.mesh import Mesh
 from ..skeleton.tree import Skeleton
-from .anatomy import PARENTS, PARTS, Anatomy, BodyShape
+from .anatomy import PARENTS, PARTS, BodyShape, RestFrames
 from .landmarks import landmarks, markers
-from .poses import NAMED_POSES, compose, find_pose, mirror_pose, random_pose, walk
+from .poses import NAMED_POSES, compose_pose, find_pose, mirror_synthetic_pose, random_pose, synthesise_walk
 from .posing import Poser
-from .topology import load
+from .topology import load_topology
 
-__all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "find_pose", "mirror_pose",
-           "random_pose", "walk"]
+__all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "SyntheticPerson", "compose_pose", "find_pose",
+           "mirror_synthetic_pose",
+           "random_pose", "synthesise_walk"]
 
 
-class Person:
+class SyntheticPerson:
     """One person: the surface at rest, the skeleton, and the surface in any pose.
 
     `mesh` is at rest, with `part_of_face` (F,) and `part_of_vertex` (N,); every part turns in its parent at the
@@ -34,8 +35,8 @@ class Person:
 
     def __init__(self, shape: BodyShape | None = None) -> None:
         self.shape = shape or BodyShape()
-        template = load()
-        self.anatomy = Anatomy(self.shape)
+        template = load_topology()
+        self.anatomy = RestFrames(self.shape)
         self.mesh = Mesh(self.anatomy.vertices, template.mesh.faces)
         self.part_of_face = template.part_of_face
         self.part_of_vertex = template.part_of_vertex

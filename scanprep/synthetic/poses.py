@@ -10,15 +10,15 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
+from .anatomy import MIRROR_PART, PARENTS, BodyShape, RestFrames
 from .landmarks import landmarks
-from .topology import load
+from .topology import load_topology
 
 
 @lru_cache(maxsize=1)
-def average() -> Anatomy:
+def average() -> RestFrames:
     """The skeleton that poses are made for."""
-    return Anatomy(BodyShape())
+    return RestFrames(BodyShape())
 
 
 def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarray:
@@ -75,9 +75,9 @@ def head(nod: float = 0, lean: float = 0, turn: float = 0) -> np.ndarray:
     return Rotation.from_euler("zyx", [turn, lean, nod], degrees=True).as_rotvec()
 
 
-def compose(left_arm: dict | None = None, right_arm: dict | None = None, left_leg: dict | None = None,
-            right_leg: dict | None = None, back: dict | None = None, neck: dict | None = None,
-            root: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
+def compose_pose(left_arm: dict | None = None, right_arm: dict | None = None, left_leg: dict | None = None,
+                 right_leg: dict | None = None, back: dict | None = None, neck: dict | None = None,
+                 root: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
     """A pose (16, 3) from anatomical angles; what is not given stays at rest."""
     down_arm, down_leg = (0.59, 0.0, -0.81), (0.078, 0.0, -1.0)
     pose = np.zeros((16, 3))
@@ -104,7 +104,7 @@ def find_pose(name: str) -> np.ndarray:
 
 @cache
 def _read_pose(name: str) -> np.ndarray:
-    return compose(**_STORED["named"][name])
+    return compose_pose(**_STORED["named"][name])
 
 
 def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
@@ -119,19 +119,19 @@ def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
         name = NAMED_POSES[rng.integers(len(NAMED_POSES))]
         source = find_pose(name)
         if rng.random() < 0.5:
-            source = mirror_pose(source)
+            source = mirror_synthetic_pose(source)
         pose[group] = rng.uniform(0.55, 1.0) * source[group]
     noise = rng.normal(size=(16, 3)) * looseness[:, None] * 0.7
     noise[[5, 8, 11, 14]] = 0.0
     return spread * (pose + noise)
 
 
-def mirror_pose(pose: np.ndarray) -> np.ndarray:
+def mirror_synthetic_pose(pose: np.ndarray) -> np.ndarray:
     """The pose (..., 16, 3) of the mirror image."""
     return pose[..., MIRROR_PART, :] * [1, -1, -1]
 
 
-def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def synthesise_walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """A walk straight ahead: poses (frames, 16, 3), radians, places (frames, 3) of the root against rest, metres.
 
     The lower foot stays on the floor; at speed 1 a gait cycle takes 1.1 seconds.
@@ -158,15 +158,15 @@ def _stride(phase: float) -> np.ndarray:
                                 "foot": float(ankle)}
         limbs[f"{name}_arm"] = {"direction": (0.28, 0.05 - 0.33 * swing, -1.0), "elbow": 10 - 9 * swing,
                                 "twist": 12}
-    pose = compose(limbs["left_arm"], limbs["right_arm"], limbs["left_leg"], limbs["right_leg"],
-                   {"turn": 9 * np.cos(wave), "bend": 2}, {"turn": -5 * np.cos(wave), "nod": 1})
+    pose = compose_pose(limbs["left_arm"], limbs["right_arm"], limbs["left_leg"], limbs["right_leg"],
+                        {"turn": 9 * np.cos(wave), "bend": 2}, {"turn": -5 * np.cos(wave), "nod": 1})
     pose[0] = Rotation.from_euler("zyx", [-4.5 * np.cos(wave), 2.5 * np.sin(wave), 2], degrees=True).as_rotvec()
     return pose
 
 
 def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lift of the root (T,) that puts the lower foot on the floor, and how far it moves ahead (T - 1,)."""
-    a, part = average(), load().part_of_vertex
+    a, part = average(), load_topology().part_of_vertex
     lowest, treads = [], []
     for foot, side in ((12, "left"), (15, "right")):
         sole = a.vertices[(part == foot) & (a.vertices[:, 2] < a.joints[foot, 2])]
@@ -186,7 +186,7 @@ def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return lift, advance
 
 
-def _carry(a: Anatomy, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:
+def _carry(a: RestFrames, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:
     chain = [part]
     while PARENTS[chain[-1]] >= 0:
         chain.append(int(PARENTS[chain[-1]]))

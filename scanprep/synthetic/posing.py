@@ -9,16 +9,16 @@ from scipy.spatial.transform import Rotation
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
-from .anatomy import PARENTS, Anatomy
+from .anatomy import PARENTS, RestFrames
 from .muscles import drivers, masks, twist_about
-from .topology import blending, load, neighbour_mean
+from .topology import blending, load_topology, neighbour_mean
 
 
 class Poser:
     """Everything that posing needs of one person at rest on the shared topology; part 0 turns about `root` (3,)."""
 
-    def __init__(self, anatomy: Anatomy, vertices: np.ndarray, root: np.ndarray) -> None:
-        template = load()
+    def __init__(self, anatomy: RestFrames, vertices: np.ndarray, root: np.ndarray) -> None:
+        template = load_topology()
         self.anatomy, self.rest, self.root = anatomy, vertices, root
         self.weights = blending()[1]
         self.normals = Mesh(vertices, template.mesh.faces).vertex_normals
@@ -82,7 +82,7 @@ class Poser:
         R, place = self.part_motion(pose)
         x = _dual_quaternion_blend(x, self.weights, self.main, R, place - np.einsum("pij,pj->pi", R, self.joints))
         smooth = _smooth(x)
-        mushed = smooth + np.einsum("nij,nj->ni", _detail_frames(smooth, load().mesh.faces), self._coordinates)
+        mushed = smooth + np.einsum("nij,nj->ni", _detail_frames(smooth, load_topology().mesh.faces), self._coordinates)
         blend = mush_mask()[:, None]
         return x + blend * (mushed - x)
 
@@ -94,7 +94,7 @@ def twist_shares() -> list[tuple[int, np.ndarray]]:
     Near the shoulder and the hip the skin lags behind the bone; a turn of the hand is already begun by the
     forearm.
     """
-    template = load()
+    template = load_topology()
     v, a = template.mesh.vertices, template.anatomy
     weights = blending()[1]
     shares = []
@@ -114,7 +114,7 @@ def twist_shares() -> list[tuple[int, np.ndarray]]:
 @lru_cache(maxsize=1)
 def girdle_masks() -> tuple[np.ndarray, np.ndarray]:
     """(N,) for the left and the right shoulder: how far the skin of the chest goes with it."""
-    template = load()
+    template = load_topology()
     v, a = template.mesh.vertices, template.anatomy
     out = []
     for arm, side in ((4, 1), (7, -1)):
@@ -161,7 +161,7 @@ def _detail_frames(x: np.ndarray, faces: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=1)
 def _first_neighbour() -> np.ndarray:
     """(N,) one neighbour of every vertex, mirror images for mirror images, on the middle line for its own."""
-    template = load()
+    template = load_topology()
     twin, adjacency = template.mirror, template.mesh.vertex_adjacency
     owner = np.repeat(np.arange(len(twin)), np.diff(adjacency.indptr))
     middle = twin == np.arange(len(twin))

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array, diags_array
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from ..skeleton.tree import Skeleton
-from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
+from .anatomy import MIRROR_PART, PARENTS, BodyShape, RestFrames
 from .population import population
 
 
@@ -21,7 +21,7 @@ class Template:
     mesh: Mesh
     mirror: np.ndarray  # (N,) int: the vertex at the mirrored place
     part_of_face: np.ndarray  # (F,) int
-    anatomy: Anatomy
+    anatomy: RestFrames
 
     @cached_property
     def part_of_vertex(self) -> np.ndarray:
@@ -30,10 +30,10 @@ class Template:
 
 
 @lru_cache(maxsize=1)
-def load() -> Template:
+def load_topology() -> Template:
     """The template of the built-in people."""
     people = population()
-    anatomy = Anatomy(BodyShape("male", (0.0,)))
+    anatomy = RestFrames(BodyShape("male", (0.0,)))
     mesh = Mesh(anatomy.vertices, people.faces)
     part = label_faces(mesh, anatomy, people.weights)
     # mirror images have mirrored parts, whatever rounding does at a border
@@ -44,7 +44,7 @@ def load() -> Template:
     return Template(mesh, people.mirror, part, anatomy)
 
 
-def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray:
+def label_faces(mesh: Mesh, anatomy: RestFrames, weights: np.ndarray) -> np.ndarray:
     """Part of every triangle (F,) of the left half: cut by a plane through each joint; arms by weights."""
     c, j = mesh.corners.mean(axis=1), anatomy.joints
     arm = weights[mesh.faces][:, :, 4:7].sum(axis=(1, 2)) > 0.75              # a quarter of each corner
@@ -75,7 +75,7 @@ def label_faces(mesh: Mesh, anatomy: Anatomy, weights: np.ndarray) -> np.ndarray
 @lru_cache(maxsize=1)
 def blending() -> tuple[np.ndarray, np.ndarray]:
     """Smooth part weights (N, 16) on the shared topology: for carrying, and for posing."""
-    template = load()
+    template = load_topology()
     mesh = template.mesh
     n = len(mesh.vertices)
     share = np.zeros((n, len(PARENTS)))
@@ -102,5 +102,5 @@ def blending() -> tuple[np.ndarray, np.ndarray]:
 @lru_cache(maxsize=1)
 def neighbour_mean() -> csr_array:
     """(N, N) the mean of a vertex's neighbours."""
-    A = load().mesh.vertex_adjacency
+    A = load_topology().mesh.vertex_adjacency
     return csr_array(diags_array(1 / A.sum(axis=1)) @ A)

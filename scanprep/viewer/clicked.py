@@ -16,7 +16,7 @@ from ..geometry.files import UNITS, name_of, read_scan
 from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
-from ..pictures.camera import Camera, upright
+from ..pictures.camera import Camera, guess_upright
 from ..pictures.scene import Pane
 from ..pictures.shading import CLAY, Dots, Shape, Solid
 from ..pictures.thinning import thin_solid
@@ -62,7 +62,7 @@ class Clicked:
     def body(self) -> Clickable:
         """What is clicked on; read when it is first shown."""
         if self.surface is None:
-            self.surface = Clickable(read_surface(self.path, self.unit))
+            self.surface = Clickable(read_shown_surface(self.path, self.unit))
         return self.surface
 
     def forget(self) -> None:
@@ -96,7 +96,7 @@ class Clicked:
         return self._shown
 
 
-def read_surface(path: Path, unit: str | None = None) -> Mesh | np.ndarray:
+def read_shown_surface(path: Path, unit: str | None = None) -> Mesh | np.ndarray:
     """The mesh, or points (n, 3), metres, of a file; of a depth picture, in millimetres unless told, what it gives."""
     if not is_picture(path):
         return read_scan(path, unit)
@@ -123,7 +123,7 @@ def camera_before(points: np.ndarray) -> Camera:
 def camera_of(shape: Mesh | np.ndarray) -> Camera:
     """A view of a body from its front, as far as that can be seen from its outline."""
     body = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
-    up, front = upright(body)
+    up, front = guess_upright(body)
     return Camera.around(body.vertices, front, up=up)
 
 

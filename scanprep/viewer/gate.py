@@ -71,7 +71,7 @@ def file_name(name: str) -> str:
     return last if len(last) <= LONGEST_NAME else last[-LONGEST_NAME:].lstrip(" ")
 
 
-def inside(folders: Iterable[Path], name: str) -> Path:
+def file_inside(folders: Iterable[Path], name: str) -> Path:
     """The file of this name in one of the folders, links followed; ValueError where there is none inside."""
     if not name or PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor:
         raise ValueError("expected a name inside of a folder")

@@ -17,7 +17,7 @@ from tornado.web import HTTPError, RequestHandler, stream_request_body
 from tornado.websocket import WebSocketHandler
 
 from .app import App
-from .gate import Gate, file_name, inside, one_line
+from .gate import Gate, file_inside, file_name, one_line
 from .messages import Message
 from .served_page import HEADERS, NOTHING, page, policy
 from .tabs import Tab, Tabs
@@ -260,7 +260,7 @@ class Download(Guarded):
 
     async def get(self, name: str) -> None:
         try:
-            path = inside(self.server.app.folders, name)
+            path = file_inside(self.server.app.folders, name)
         except ValueError as problem:
             raise Refusal(404, str(problem)) from None
         self.set_header("Content-Type", "application/octet-stream")

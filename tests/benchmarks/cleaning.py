@@ -148,7 +148,7 @@ def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict
 
 def fillers() -> dict[str, Callable[[Mesh], tuple[Mesh, bool]]]:
     """Name -> function to a filled mesh and whether the triangles of the old one come first in it."""
-    from scanprep.adapters.open3d_filters import poisson
+    from scanprep.adapters.open3d_filters import open3d_poisson
 
     def ours(method: str) -> Callable[[Mesh], tuple[Mesh, bool]]:
         return lambda mesh: (fill_report(mesh, FillConfig(method=method)).mesh, True)     # type: ignore[arg-type]
@@ -158,7 +158,7 @@ def fillers() -> dict[str, Callable[[Mesh], tuple[Mesh, bool]]]:
     try:
         import open3d  # noqa: F401
 
-        found |= {"open3d fill_holes": open3d_fill, "open3d Poisson": lambda mesh: (poisson(mesh, 8), False)}
+        found |= {"open3d fill_holes": open3d_fill, "open3d Poisson": lambda mesh: (open3d_poisson(mesh, 8), False)}
     except (ImportError, OSError):
         pass
     try:

@@ -31,7 +31,7 @@ from model.built_in import load_built_in_model
 from model.resolution.change import ResolutionConfig, change_resolution
 from scanprep import decimate, write_landmarks, write_mesh
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.people import walk
+from scanprep.synthetic.people import synthesise_walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 FACES, FRAMES, RATE = 2000, 30, 120.0            # of the model; of a recording of markers, and a second
@@ -49,7 +49,7 @@ def write_inputs(folder: Path, different: int, frames: int) -> None:
     coarse = change_resolution(whole, decimate(whole.template, FACES, keep=marks), ResolutionConfig(rounds=0))
     coarse.save(folder / "model.npz")
     for number in range(different):
-        poses, trans = walk(FRAMES, RATE)
+        poses, trans = synthesise_walk(FRAMES, RATE)
         t = rng.integers(FRAMES)
         body = Mesh(whole.vertices(poses[t], rng.normal(size=whole.n_betas) / 2, trans[t]), whole.template.faces)
         write_mesh(folder / "complete" / f"scan{number}.ply", scan(body, CAMERA, rng).views[0].mesh)
@@ -58,7 +58,7 @@ def write_inputs(folder: Path, different: int, frames: int) -> None:
         (folder / "mosh").mkdir(exist_ok=True)
         write_markers(folder / "mosh" / f"walk{number}.c3d", walking(FRAMES, False, rng))
     person = whole.subject(np.zeros(whole.n_betas))
-    poses, trans = walk(frames, 30.0)
+    poses, trans = synthesise_walk(frames, 30.0)
     for t in range(frames):
         body = Mesh(np.asarray(person.vertices(poses[t], trans[t]), float), whole.template.faces)
         write_mesh(folder / "track" / f"frame{t:05d}.ply", scan(body, CAMERA, rng).views[0].mesh)

@@ -35,7 +35,7 @@ from scanprep.batch.pool import Workers
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.geometry.target import orient, target_of
+from scanprep.geometry.target import orient_by_mesh, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.skeleton.find import find_skeleton
 
@@ -92,7 +92,7 @@ class Story:
 def explained_share(mesh: Mesh, scan: Mesh | np.ndarray) -> float:
     """Share of the points of a scan that lie near a registered mesh and do not face away from it."""
     size = float(np.sqrt(mesh.face_areas.sum()))
-    target = orient(target_of(scan).thin(0.01 * size), mesh, 0.05 * size)
+    target = orient_by_mesh(target_of(scan).thin(0.01 * size), mesh, 0.05 * size)
     return float((apart(mesh, target, EXPLAINED * size) < EXPLAINED * size).mean())
 
 

@@ -73,10 +73,10 @@ def peer(name: str) -> Method:
             call = igl.qslim if name == "igl.qslim" else igl.decimate
             return Mesh(*call(np.asfortranarray(v), np.asfortranarray(f), faces)[:2])
         if name == "open3d":
-            from scanprep.adapters.open3d_filters import quadric_decimation
+            pass
         else:
-            from scanprep.adapters.pymeshlab_filters import quadric_decimation  # type: ignore[assignment]
-        return quadric_decimation(mesh, faces)
+            from scanprep.adapters.pymeshlab_filters import meshlab_decimation  # type: ignore[assignment]
+        return meshlab_decimation(mesh, faces)
 
     return run
 

@@ -38,7 +38,7 @@ from completion.partial.settings import CompletionConfig
 from model import LearnConfig, learn_scape
 from model.body import BodyModel
 from model.files import load_model
-from scanprep.depth_camera.person import find_person
+from scanprep.depth_camera.person import segment_person
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.geodesics import SurfaceGraph
@@ -249,7 +249,7 @@ def refusals(found: list[tuple[str, DepthPicture]], body: BodyModel) -> dict[str
     for name, picture in found:
         mine = counts.setdefault(name, {"accepted": 0, "refused": 0})
         try:
-            find_person(picture, size(body.template))
+            segment_person(picture, size(body.template))
             mine["accepted"] += 1
         except ValueError:
             mine["refused"] += 1
@@ -260,7 +260,7 @@ def picture_of(case: Case, result: Completion | None, path: Path) -> None:
     """The depth picture, then truth (dressed, points of the picture) and result from the camera and from its side."""
     from scanprep.pictures.camera import Camera
     from scanprep.pictures.shading import Dots, Solid, render
-    from scanprep.pictures.sheets import save_png, side_by_side
+    from scanprep.pictures.sheets import contact_sheet, save_png
 
     depth = np.nan_to_num(case.picture.depth[::2, ::2], nan=0.0)
     grey = np.repeat((255 * np.clip(1 - (depth - 0.5) / 3.5, 0, 1) * (depth > 0))[..., None], 3, axis=2)
@@ -275,7 +275,7 @@ def picture_of(case: Case, result: Completion | None, path: Path) -> None:
     for turn in (-90, 0):
         images += [render([Solid(mesh), dots], Camera.around([turned[0].vertices], turn, margin=1.5), 320, 400)
                    for mesh in turned]
-    save_png(path, side_by_side(images, columns=len(images)))
+    save_png(path, contact_sheet(images, columns=len(images)))
 
 
 def learned(data: RealData, path: Path | None) -> BodyModel:

@@ -13,7 +13,7 @@ import numpy as np
 from protocols import RealData, load_real, machine, write_report
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 
 UP = 2
 WRONG = 60.0                         # degrees: the picture is not one of the front any more
@@ -30,7 +30,7 @@ def true_front(body: Mesh, landmarks: dict[str, int]) -> float:
 
 def off(body: Mesh, landmarks: dict[str, int], points: bool) -> float:
     """Degrees between the front and where it is taken to be; 180 where another axis is taken for up."""
-    up, front = upright(Mesh(body.vertices, np.zeros((0, 3), dtype=np.int64)) if points else body)
+    up, front = guess_upright(Mesh(body.vertices, np.zeros((0, 3), dtype=np.int64)) if points else body)
     apart = abs((front - true_front(body, landmarks) + 180) % 360 - 180)
     return apart if up == UP else 180.0
 

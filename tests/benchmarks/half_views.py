@@ -56,7 +56,7 @@ def picture(body: Mesh, view: HalfView, result: Completion, path: Path) -> None:
     from scanprep.pictures.camera import Camera
     from scanprep.pictures.colors import heat
     from scanprep.pictures.shading import Dots, Solid, render
-    from scanprep.pictures.sheets import save_png, side_by_side
+    from scanprep.pictures.sheets import contact_sheet, save_png
 
     apart = np.linalg.norm(result.completed.vertices - body.vertices, axis=1)
     two = np.where(result.seen[:, None], [0.45, 0.6, 0.8], [0.9, 0.6, 0.35])
@@ -67,7 +67,7 @@ def picture(body: Mesh, view: HalfView, result: Completion, path: Path) -> None:
     azimuth = np.degrees(np.arctan2(away[1], away[0]))
     images = [render(shape, Camera.around(body, azimuth + turn), width=300, height=400)
               for turn in (0, 180) for shape in shapes]
-    save_png(path, side_by_side(images, columns=3))
+    save_png(path, contact_sheet(images, columns=3))
 
 
 def learned(data: RealData, people: bool, fold: int) -> ScapeModel:

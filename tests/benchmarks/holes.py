@@ -83,7 +83,7 @@ def embedded_body(seed: int, scale: float = 1.0) -> HoledBody:
     from scanprep.synthetic.data_set import near_rest, stand
 
     rng = np.random.default_rng(seed)
-    person = people.Person(BodyShape.random(rng))
+    person = people.SyntheticPerson(BodyShape.random(rng))
     rest, body = stand(person, np.zeros((16, 3))).mesh, stand(person, near_rest(rng)).mesh
     toes = {"left sole": people.LANDMARKS["left toe"], "right sole": people.LANDMARKS["right toe"]}
     marks = {hole: people.LANDMARKS[mark] for hole, mark in SYNTHETIC_MARKS.items()}

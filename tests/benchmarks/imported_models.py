@@ -71,13 +71,13 @@ def walking(model: Any, own: np.ndarray, people: list[Any], frames: int) -> dict
     from model.fitting.vertices import fit_shape
     from scanprep.geometry.farthest_points import farthest_points
     from scanprep.synthetic.landmarks import markers
-    from scanprep.synthetic.people import walk
+    from scanprep.synthetic.people import synthesise_walk
 
     here = {int(v): i for i, v in enumerate(own)}
     named = {name: here[v] for name, v in markers().items() if v in here}
     spread = farthest_points(model.template.vertices, 6)
     layout = MarkerLayout((*named, *(f"X{i}" for i in range(6))), np.array([*named.values(), *spread]), 0.0095)
-    poses, trans = walk(frames, RATE)
+    poses, trans = synthesise_walk(frames, RATE)
     rows: dict[str, list[Any]] = {"markers, shape known": [], "MoSh": []}
     for person, _ in people[:2]:
         bodies = np.stack([person.posed(pose, t)[own] for pose, t in zip(poses, trans, strict=True)])

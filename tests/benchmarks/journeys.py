@@ -29,7 +29,7 @@ from scanprep import write_landmarks
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.data_set import SUBJECT, GroundTruth, click_landmarks, near_rest, stand, subject_pose
-from scanprep.synthetic.people import BodyShape, Person, random_pose, walk
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, random_pose, synthesise_walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 MM = 1000.0
@@ -77,7 +77,7 @@ def write_user_scan(folder: Path, name: str, truth: GroundTruth, config: Scanner
 
 def write_user_files(work: Path) -> None:
     """Scans with their table, half a view, and a recording of a walk."""
-    rng, person, config = np.random.default_rng(0), Person(SUBJECT), ScannerConfig(resolution=0.009)
+    rng, person, config = np.random.default_rng(0), SyntheticPerson(SUBJECT), ScannerConfig(resolution=0.009)
     scans = work / "scans"
     scans.mkdir(parents=True, exist_ok=True)
     rows = ["name,subject,pose,sex"]
@@ -87,14 +87,14 @@ def write_user_files(work: Path) -> None:
         write_user_scan(scans, name, stand(person, pose), config, rng, (".ply", ".obj", ".stl")[k % 3])
         rows.append(f"{name},anna,{label},male")
     for k in range(PEOPLE):
-        other = Person(BodyShape.random(rng, sex="female" if k % 2 else "male"))
+        other = SyntheticPerson(BodyShape.random(rng, sex="female" if k % 2 else "male"))
         name = f"2024.06.{k + 1:02d} person"
         write_user_scan(scans, name, stand(other, near_rest(rng)), config, rng)
         rows.append(f"{name},person {k},rest,{'female' if k % 2 else 'male'}")
     (scans / "scans.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     write_user_scan(work, "half.view", stand(person, random_pose(rng)), ScannerConfig(views=1, resolution=0.009), rng)
     # a walk in a laboratory that has the CMU marker set, 120 frames a second
-    layout, (poses, trans) = read_layout("cmu41", person.mesh), walk(240, 120.0)
+    layout, (poses, trans) = read_layout("cmu41", person.mesh), synthesise_walk(240, 120.0)
     bodies = [person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)]
     markers = np.stack([body[layout.vertices] + DISTANCE * Mesh(body, person.mesh.faces).vertex_normals[layout.vertices]
                         for body in bodies])

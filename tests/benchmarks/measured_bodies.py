@@ -33,7 +33,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration.nonrigid import register
 from scanprep.synthetic.data_set import near_rest
 from scanprep.synthetic.landmarks import landmarks
-from scanprep.synthetic.people import BodyShape, Person, random_pose
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, random_pose
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 CLICKED = ("left toe", "right toe", "left knee", "right knee", "left middle finger", "right middle finger",
@@ -52,23 +52,23 @@ def kept(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.
         return dict(found)
 
 
-def somebody(k: int) -> tuple[Person, np.random.Generator]:
+def somebody(k: int) -> tuple[SyntheticPerson, np.random.Generator]:
     """The k-th person, women and men in turn."""
     rng = np.random.default_rng([18, k])
-    return Person(BodyShape.random(rng, "male" if k % 2 else "female")), rng
+    return SyntheticPerson(BodyShape.random(rng, "male" if k % 2 else "female")), rng
 
 
-def registered(person: Person, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def registered(person: SyntheticPerson, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """The average person's mesh on a scan of somebody near rest."""
     true = person.mesh.with_vertices(person.in_pose(near_rest(rng)))
     scanned = scan(true, ScannerConfig(), rng).merged
     ids = np.array([landmarks()[name] for name in CLICKED])
     clicked = true.vertices[ids] + CLICK * rng.normal(size=(len(ids), 3))
-    found = register(Person().mesh, scanned, (ids, clicked))
+    found = register(SyntheticPerson().mesh, scanned, (ids, clicked))
     return {"truth": true.vertices, "vertices": found.mesh.vertices, "confidence": found.confidence}
 
 
-def halves(model: BodyModel, person: Person, mine: np.ndarray, k: int, rng: np.random.Generator, known: bool
+def halves(model: BodyModel, person: SyntheticPerson, mine: np.ndarray, k: int, rng: np.random.Generator, known: bool
            ) -> dict[str, np.ndarray]:
     """The half view of somebody in a random pose, completed; `mine` (N, 3) is the registered body."""
     ids = np.array(model.info["people_vertices"])
@@ -88,7 +88,7 @@ def of_completion(done: Completion) -> dict[str, np.ndarray]:
             "expected_error": done.expected_error, "judgement": np.array(str(done.judgement))}
 
 
-def marked(model: BodyModel, person: Person, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def marked(model: BodyModel, person: SyntheticPerson, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """The body whose markers move between poses of the model."""
     ids = np.array(model.info["people_vertices"])
     usual = load_layout("vicon47", model.template, ids)

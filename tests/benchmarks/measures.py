@@ -25,12 +25,12 @@ from model.built_in import load_built_in_model
 from model.measurement.catalogue import CATALOGUE
 from model.measurement.find import find_tapes
 from model.measurement.measure import Measurements, laid_on, measure
-from model.measurement.section import around, tape
+from model.measurement.section import tape, tape_length
 from model.measurement.tapes import Girth, Tapes
 from model.posing.transfer import own_body
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.landmarks import landmarks
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 TRUNK = ("chest_girth", "under_bust_girth", "waist_girth", "hip_girth")
 
@@ -58,8 +58,8 @@ def true_girths(tapes: Tapes, carriers: np.ndarray, surface: Mesh, axes: np.ndar
 
     Those of the trunk without the arms, which the plane of the chest may meet.
     """
-    out, part = {}, Person().part_of_face
-    trunk = Mesh(surface.vertices, surface.faces[~np.isin(part, [p for p, name in enumerate(Person.names)
+    out, part = {}, SyntheticPerson().part_of_face
+    trunk = Mesh(surface.vertices, surface.faces[~np.isin(part, [p for p, name in enumerate(SyntheticPerson.names)
                                                                 if "arm" in name or "hand" in name])])
     for name, found in tapes.found.items():
         if isinstance(found, Girth):
@@ -74,7 +74,7 @@ def true_girths(tapes: Tapes, carriers: np.ndarray, surface: Mesh, axes: np.ndar
 @lru_cache(maxsize=1)
 def fine_tapes() -> Tapes:
     """On the average person, with all vertices."""
-    return find_tapes(Person().mesh, landmarks())
+    return find_tapes(SyntheticPerson().mesh, landmarks())
 
 
 def upright(model: BodyModel, vertices: np.ndarray) -> np.ndarray:
@@ -124,7 +124,7 @@ def carried_otherwise(tapes: Tapes, body: np.ndarray, axes: np.ndarray) -> dict[
             continue
         points = found.ring.at(body)
         flat = np.linalg.svd(points - points.mean(axis=0))[2][2]
-        polygon[name] = around(points[tape(points, flat)])[0]
+        polygon[name] = tape_length(points[tape(points, flat)])[0]
         nearest = body[found.ring.edges[0, 0]]
         normal = axes[0] if found.axis is None else found.axis[1].at(body) - found.axis[0].at(body)
         normal = normal / np.linalg.norm(normal)

@@ -21,7 +21,7 @@ from model.fitting.vertices import FitConfig, PoseFitter, ShapeFitter
 from model.learning.mixing import MIX, learn_scape_mix
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic.people import BodyShape, Person, random_pose
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, random_pose
 
 NEARLY_ONE_POSE = 0.15               # share of a random pose in which the people of the separated design stand
 FIT = FitConfig(sample=400, polish=0)
@@ -33,7 +33,7 @@ class Stage:
     def __init__(self, faces: int) -> None:
         import igl
 
-        self.first = Person()
+        self.first = SyntheticPerson()
         mesh, parts, self.kept = self.first.mesh, self.first.part_of_face, np.arange(len(self.first.mesh.vertices))
         if faces < len(mesh.faces):
             _, triangles, whose, self.kept = (np.asarray(a) for a in igl.decimate(mesh.vertices, mesh.faces, faces)[:4])
@@ -42,13 +42,14 @@ class Stage:
         joints[0] = mesh.vertices[Skeleton(parts, self.first.parents, joints).part_of_vertex(mesh) == 0].mean(axis=0)
         self.template, self.skeleton = mesh, Skeleton(parts, self.first.parents, joints, self.first.names)
 
-    def bodies(self, person: Person, count: int, rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
+    def bodies(self, person: SyntheticPerson, count: int, rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
         """One person in random poses (count, N, 3)."""
         return np.stack([person.in_pose(random_pose(rng, spread))[self.kept] for _ in range(count)])
 
     def people(self, count: int, each: int, rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
         """New people in poses of their own (count * each, N, 3)."""
-        return np.concatenate([self.bodies(Person(BodyShape.random(rng)), each, rng, spread) for _ in range(count)])
+        return np.concatenate([self.bodies(SyntheticPerson(BodyShape.random(rng)), each, rng,
+                                           spread) for _ in range(count)])
 
 
 def strangers(model: BodyModel, bodies: np.ndarray, count: int | None) -> dict[str, float]:

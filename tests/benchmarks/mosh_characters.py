@@ -38,7 +38,7 @@ from model.posing.character import Character, register_character
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
 from scanprep.synthetic.data_set import SUBJECT
-from scanprep.synthetic.people import Person, walk
+from scanprep.synthetic.people import SyntheticPerson, synthesise_walk
 
 sys.path.append(str(Path(__file__).parents[1]))
 from cartoons import CARTOONS, Cartoon, cartoon
@@ -84,9 +84,9 @@ def joints_off(model: BodyModel, figure: Cartoon, found: Character) -> list[floa
 
 def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSequence, MarkerLayout]:
     """Markers of an embedded man who walks, and their layout on the model's template."""
-    person = Person(SUBJECT)
+    person = SyntheticPerson(SUBJECT)
     layout = load_layout("cmu41", person.mesh)
-    poses, trans = walk(frames, rate)
+    poses, trans = synthesise_walk(frames, rate)
     bodies = [person.mesh.with_vertices(person.in_pose(p, t)) for p, t in zip(poses, trans, strict=True)]
     markers = MarkerSequence(np.stack([layout.place(body) for body in bodies]), layout.labels, rate)
     return markers, load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))

@@ -26,7 +26,7 @@ from model.learning.config import LearnConfig
 from model.learning.sexes import guess_sex, learn_by_sex, sex_plane
 from scanprep.geometry.surface import Surface
 from scanprep.synthetic.data_set import SUBJECT, near_rest, subject_pose
-from scanprep.synthetic.people import BodyShape, Person, walk
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, synthesise_walk
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "people"))
 MM = 1000.0
@@ -42,9 +42,9 @@ def learned(folder: Path) -> dict[str, BodyModel]:
         from make_model import decimate_person
 
         rng = np.random.default_rng(5)
-        man, sexes = Person(SUBJECT), [("female", "male")[k % 2] for k in range(120)]
+        man, sexes = SyntheticPerson(SUBJECT), [("female", "male")[k % 2] for k in range(120)]
         poses = np.stack([man.in_pose(subject_pose(k, rng)[1]) for k in range(40)])
-        shapes = np.stack([Person(BodyShape.random(rng, sex=sex)).in_pose(near_rest(rng))
+        shapes = np.stack([SyntheticPerson(BodyShape.random(rng, sex=sex)).in_pose(near_rest(rng))
                            for sex in sexes])
         small = decimate_person(man, poses, 10000)
         found = learn_by_sex(small.template, small.transfer(poses), small.transfer(shapes), sexes, small.skeleton,
@@ -55,7 +55,7 @@ def learned(folder: Path) -> dict[str, BodyModel]:
     return {name: load_model(path) for name, path in paths.items()}
 
 
-def walking(person: Person, layout: MarkerLayout, rng: np.random.Generator, error: float, frames: int
+def walking(person: SyntheticPerson, layout: MarkerLayout, rng: np.random.Generator, error: float, frames: int
             ) -> MarkerSequence:
     """A person who walks in a way of their own, with markers so far (root mean square, metres) beside their places."""
     normals = person.mesh.vertex_normals[layout.vertices]
@@ -63,7 +63,7 @@ def walking(person: Person, layout: MarkerLayout, rng: np.random.Generator, erro
     beside -= (beside * normals).sum(axis=1, keepdims=True) * normals
     on = Surface(person.mesh).closest(person.mesh.vertices[layout.vertices] + beside)
     worn = MarkerLayout(layout.labels, person.mesh.faces[on.faces], layout.distances, on.bary)
-    poses, trans = walk(frames, RATE, rng.uniform(0.8, 1.2))
+    poses, trans = synthesise_walk(frames, RATE, rng.uniform(0.8, 1.2))
     poses = poses + 0.04 * rng.normal(size=poses.shape[1:])
     bodies = [person.mesh.with_vertices(person.in_pose(p, t)) for p, t in zip(poses, trans, strict=True)]
     return MarkerSequence(np.stack([worn.place(body) for body in bodies]), layout.labels, RATE)
@@ -72,7 +72,7 @@ def walking(person: Person, layout: MarkerLayout, rng: np.random.Generator, erro
 def told(models: dict[str, BodyModel], sex: float, seed: int, args: argparse.Namespace) -> dict:
     """One subject: truth, guess, and residuals with the models of both sexes."""
     rng = np.random.default_rng([seed, 61])
-    person = Person(BodyShape.random(rng, sex=sex))
+    person = SyntheticPerson(BodyShape.random(rng, sex=sex))
     layout = load_layout("cmu41", person.mesh)
     sequence = walking(person, layout, rng, args.error, args.frames)
     kept = np.array(models["neutral"].info["people_vertices"])

@@ -41,7 +41,7 @@ from model.body import BodyModel
 from model.files import load_model
 from model.fitting.energy import rise_above_skin
 from scanprep.geometry.geodesics import SurfaceGraph
-from scanprep.pictures.camera import Camera, upright
+from scanprep.pictures.camera import Camera, guess_upright
 from scanprep.pictures.colors import Heat
 from scanprep.pictures.shading import Dots, Solid, render, save_png
 
@@ -175,7 +175,7 @@ def picture(scene: Scene, layout: MarkerLayout, number: int, bump: Bump) -> np.n
     t = int(np.argmax(np.abs(bump.swing(scene.motion.times))))
     found = soft.skin.at(soft.skin.modes, soft.motion.poses[[t]])[0]
     mesh, centre = scene.model.template.with_vertices(scene.skin[t]), int(np.argmax(bump.weight))
-    vertical = np.eye(3)[upright(mesh)[0]]
+    vertical = np.eye(3)[guess_upright(mesh)[0]]
     near = mesh.vertices[bump.weight > 0.05]
     camera = Camera.from_side(near, scene.normals[t, centre], vertical, margin=1.6)
     dots = Dots(mesh.vertices[layout.nearest], (0.1, 0.1, 0.1), 0.006)

@@ -33,7 +33,7 @@ from completion.mocap.pose.marked_body import supports
 from model.built_in import load_built_in_model
 from model.files import BUILT_IN
 from model.fitting import energy
-from scanprep.synthetic.people import walk
+from scanprep.synthetic.people import synthesise_walk
 
 RATE, NOISE = 120.0, 0.001           # frames a second; metres
 EXCHANGED, MISSING = 0.05, 0.05      # shares of the markers, at any time
@@ -45,7 +45,7 @@ def walking(frames: int, faulty: bool, rng: np.random.Generator) -> MarkerSequen
     """Markers of a synthetic person who walks."""
     model = load_built_in_model()
     layout = load_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
-    subject, (poses, trans) = model.subject(0.5 * rng.normal(size=model.n_betas)), walk(frames, RATE)
+    subject, (poses, trans) = model.subject(0.5 * rng.normal(size=model.n_betas)), synthesise_walk(frames, RATE)
     points = subject.points(*supports(model.template, layout))
     places = energy.rise_above_skin(points.evaluate(poses, trans), np.asarray(layout.distances))
     clean = MarkerSequence(places + rng.normal(0, NOISE, places.shape), layout.labels, RATE)

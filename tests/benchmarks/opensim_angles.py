@@ -22,7 +22,7 @@ from protocols import machine, write_report
 from completion.__main__ import main as scape
 from completion.cli import read_model
 from completion.mocap.files.motion_files import joint_centres
-from completion.mocap.joint_angles import Anatomy, Joint, anatomical_angles, anatomy, rest_joints
+from completion.mocap.joint_angles import Joint, SegmentAxes, anatomical_angles, anatomy, rest_joints
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.marked_body import MarkedBody
 from completion.motion import Motion
@@ -61,7 +61,7 @@ def build(subject: Subject, layout: MarkerLayout, wanted: list[str], start: dict
     return model
 
 
-def _joint(found: Anatomy, segment: dict[int, str], j: int, parent: int, body: Any, above: Any, place: np.ndarray
+def _joint(found: SegmentAxes, segment: dict[int, str], j: int, parent: int, body: Any, above: Any, place: np.ndarray
            ) -> Any:
     """Three rotations about z, x and y, with our names and signs where the two parts make a joint of the table."""
     named = [joint for joint in found.joints() if joint.sequence == "zxy" and joint.distal == segment.get(j)

@@ -30,10 +30,10 @@ def synthetic_walk(path):
     from completion.motion import Motion
     from model.built_in import load_built_in_model
     from model.files import BUILT_IN
-    from scanprep.synthetic.people import walk
+    from scanprep.synthetic.people import synthesise_walk
 
     betas = np.random.default_rng(0).normal(0, 0.7, load_built_in_model().n_betas)
-    poses, trans = walk(120, 60.0)
+    poses, trans = synthesise_walk(120, 60.0)
     Motion(poses, trans, betas, 60.0, np.zeros((len(poses), 0)), ()).save(path)
     return Path(BUILT_IN), path
 
@@ -56,12 +56,12 @@ def cases(model_file, motion_file, folder):
     from scanprep.geometry.farthest_points import spread_indices
     from scanprep.geometry.files import write_mesh
     from scanprep.geometry.format_glb import tallest, turn_up
-    from scanprep.pictures.camera import upright
+    from scanprep.pictures.camera import guess_upright
 
     model, motion = load_model(model_file), Motion.load(motion_file)
     subject = model.subject(motion.betas)
     frames = spread_indices(len(motion.poses), FRAMES)
-    up = upright(subject.template)[0]
+    up = guess_upright(subject.template)[0]
     U, times, exact = turn_up(up).T, frames / motion.rate, motion.vertices(subject, frames)
     found = {}
 

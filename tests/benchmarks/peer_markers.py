@@ -55,7 +55,7 @@ from model.files import load_model
 from model.rig import make_rig
 from scanprep.geometry import rotations
 from scanprep.geometry.format_glb import turn_up
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 from scanprep.skeleton.tree import Skeleton
 
 CALIBRATED = 12                      # frames that tell where a held-out marker is
@@ -93,7 +93,7 @@ def by_momentum(given: Given, limit: float, model_file: str, markers: MarkerSequ
                 ) -> Solved | Outcome:
     """pymomentum on the joints of our mean person, or why there is none."""
     model = load_model(model_file)
-    up = upright(model.template)[0]
+    up = guess_upright(model.template)[0]
     U, labels, rig = turn_up(up), layout.match_labels(markers.labels), make_rig(model,
                                                                                 np.zeros(model.n_betas)).with_up(up)
     worn, skeleton = layout.select(labels), rig.skeleton

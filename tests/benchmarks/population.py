@@ -39,8 +39,8 @@ GIVEN = ("stature", "weight", "waist_girth")
 def drawn(sex: Sex, count: int, crossed: int) -> dict[str, object]:
     """Measures of so many bodies of a sex beside those of the survey, and how many of some are impossible."""
     people, (mean, covariance), table = population(), population().moments[sex], survey(sex)
-    faces, n = topology.load().mesh.faces, len(people.weights)
-    tapes, rng = find_tapes(topology.load().mesh, landmarks()), np.random.default_rng(0)
+    faces, n = topology.load_topology().mesh.faces, len(people.weights)
+    tapes, rng = find_tapes(topology.load_topology().mesh, landmarks()), np.random.default_rng(0)
     names = [name for name in table.names if name not in ("age", "knee_height")]
     words = [name if name in tapes.found else f"{name}_left" for name in names]
     rest, values, impossible = people.rows(mean)[:n], [], 0

@@ -25,7 +25,7 @@ from scans import HELD_MEN, HELD_POSES, MARKS, TUNING_MEN, TUNING_POSES, TestSca
 from scanprep.judgement import size
 from scanprep.registration.figures import ScanFigures, figures_of, review
 from scanprep.registration.lead import Lead, lead_of
-from scanprep.registration.limbs import Doubt, limb_doubts
+from scanprep.registration.limbs import PlausibilityIssue, limb_doubts
 from scanprep.registration.nonrigid import METHODS, Registration, register, registration_problem
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.repair import repair_limbs
@@ -61,7 +61,7 @@ class Judged(NamedTuple):
     row: dict[str, object]
     figures: ScanFigures
     problem: str | None
-    doubts: tuple[Doubt, ...]
+    doubts: tuple[PlausibilityIssue, ...]
 
 
 def measure(data: RealData, parts: PersonParts, kind: str, index: int, marks: str, front: bool,

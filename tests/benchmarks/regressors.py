@@ -18,7 +18,7 @@ from model import LearnConfig
 from model.blending import BlendedTemplate, rigid_weights
 from model.fitting.vertices import PoseFitter
 from model.learning.parts import coarse_copy, coarse_skeleton
-from model.learning.scape import Work, learn_pose
+from model.learning.scape import ProgressShares, learn_pose
 from scanprep.skeleton.tree import Skeleton
 
 SETTINGS = {
@@ -33,7 +33,7 @@ SETTINGS = {
 def run(config: LearnConfig, parts: BlendedTemplate, training: np.ndarray, held: np.ndarray) -> dict:
     """Mean error in millimetres on held-out poses, and what it took."""
     start = time.process_time()
-    learned = learn_pose(parts, training, config, Work(None))
+    learned = learn_pose(parts, training, config, ProgressShares(None))
     seconds = time.process_time() - start
     fitter = PoseFitter(parts.subject(learned.space))
     errors = [1e3 * fitter.fit(body).mean for body in held]

@@ -22,7 +22,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 from scanprep.registration.graph_fit import start_fit
 from scanprep.registration.limbs import limb_doubts
-from scanprep.registration.matches import prepare
+from scanprep.registration.matches import prepare_problem
 from scanprep.registration.nonrigid import measure_fit
 from scanprep.registration.person import PersonParts, person_parts
 from scanprep.registration.repair import repair_limbs
@@ -59,7 +59,7 @@ def put_right(data: RealData, parts: PersonParts, pose: int, degrees: int) -> No
     """Every limb of one pose rolled and repaired: how far it is off before and after, by ten landmarks."""
     item, part = test_scan(data, "pose", pose), parts.skeleton.part_of_vertex(data.template)
     landmarks = item.landmarks(data, "10")
-    given = prepare(data.template, item.scan, landmarks)
+    given = prepare_problem(data.template, item.scan, landmarks)
     for limb in LIMBS:
         p = parts.skeleton.names.index(limb)
         x = rolled(data, parts, item.truth.vertices, p, np.radians(degrees))

@@ -31,7 +31,7 @@ from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.data_set import subject_pose
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import SyntheticPerson
 
 
 def adjusted_rand(a: np.ndarray, b: np.ndarray) -> float:
@@ -155,7 +155,7 @@ def against_truth(mesh: Mesh, poses: np.ndarray, truth: Skeleton) -> dict[str, o
 
 
 def embedded(noise: float, slide: float, seed: int = 1, count: int = 20) -> dict[str, object]:
-    person, rng = Person(), np.random.default_rng(seed)
+    person, rng = SyntheticPerson(), np.random.default_rng(seed)
     poses = np.stack([person.in_pose(subject_pose(k, rng)[1]) for k in range(count)])
     if noise or slide:
         poses = disturbed(person.mesh, poses, noise, slide, rng)

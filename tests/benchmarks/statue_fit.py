@@ -34,7 +34,7 @@ from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
 from scanprep.registration.final_fit import final_fit
-from scanprep.registration.folds import inverted_triangles, unfold
+from scanprep.registration.folds import find_inverted_triangles, unfold
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -65,7 +65,7 @@ def quality(rest: Mesh, x: np.ndarray, scan: Mesh) -> dict[str, float]:
     return {"vertices_rms_mm": 1e3 * np.sqrt(np.mean(own**2)), "vertices_p99_mm": 1e3 * np.quantile(own, 0.99),
             "vertices_max_mm": 1e3 * own.max(), "scan_rms_mm": 1e3 * np.sqrt(np.mean(found.distances**2)),
             "scan_max_mm": 1e3 * found.distances.max(), "distortion": distortion(rest, x),
-            "inverted": float(inverted_triangles(rest, x).sum()), "scan_against_percent": 100 * against.mean()}
+            "inverted": float(find_inverted_triangles(rest, x).sum()), "scan_against_percent": 100 * against.mean()}
 
 
 def timed(make: Callable[[], np.ndarray]) -> tuple[np.ndarray, dict[str, float]]:
@@ -135,9 +135,9 @@ def figure_7(picture: str | None) -> list[dict[str, object]]:
     """A regular sphere to a head: closest points, closest points with the shape, soft assignment with the shape."""
     import igl
 
-    from scanprep.synthetic.people import Person
+    from scanprep.synthetic.people import SyntheticPerson
 
-    person = Person()
+    person = SyntheticPerson()
     keep = person.part_of_face == person.names.index("head")
     head, _ = person.mesh.submesh(keep)
     v, f = _icosahedron()
@@ -157,11 +157,11 @@ def figure_7(picture: str | None) -> list[dict[str, object]]:
         meshes.append(rest.with_vertices(fit.vertices))
         rows.append({"way": way, **quality(rest, fit.vertices, head)})
     if picture:
-        from scanprep.pictures.shading import Camera, Solid, render, save_png, side_by_side
+        from scanprep.pictures.shading import Camera, Solid, contact_sheet, render, save_png
 
         camera = Camera.around(head, azimuth=-60)
-        save_png(picture, side_by_side([render(Solid(m, smooth=False), camera, 420, 520) for m in meshes],
-                                       ["head", *ways]))
+        save_png(picture, contact_sheet([render(Solid(m, smooth=False), camera, 420, 520) for m in meshes],
+                                        ["head", *ways]))
     return rows
 
 

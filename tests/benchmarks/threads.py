@@ -34,7 +34,7 @@ from model.built_in import load_built_in_model
 from model.files import BUILT_IN
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
-from scanprep.synthetic.people import BodyShape, Person, walk
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, synthesise_walk
 
 VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 TIMED = ("report.json", ".report.json", ".html", "times.csv", ".png", ".webp")      # what changes from run to run
@@ -44,7 +44,7 @@ BUSY = "while True: pass"
 def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, list[str]]:
     """What the commands read, and their arguments."""
     rng = np.random.default_rng(0)
-    person = Person(BodyShape.random(rng, sex="female"))
+    person = SyntheticPerson(BodyShape.random(rng, sex="female"))
     marks = {name: int(v) for name, v in model.info["landmarks"].items()}
     kept = np.array(model.info["people_vertices"])
     scan = model.template.with_vertices(person.mesh.vertices[kept])
@@ -60,7 +60,7 @@ def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, li
                     {names[int(v)]: p for v, p in zip(*seen.landmarks, strict=True)})
     subject = model.subject(0.5 * rng.normal(size=model.n_betas))
     layout = load_layout("cmu41", model.template, kept)
-    bodies = subject.vertices(*walk(720, 120.0))
+    bodies = subject.vertices(*synthesise_walk(720, 120.0))
     places = np.array([layout.place(model.template.with_vertices(v)) for v in bodies])
     places += rng.normal(0, 0.001, places.shape)
     write_markers(folder / "walk.c3d", MarkerSequence(places, layout.labels, 120.0))

@@ -24,7 +24,7 @@ from model.built_in import load_built_in_model
 from model.posing.transfer import subject_from_body
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.synthetic.people import BodyShape, Person, walk
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, synthesise_walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 CAMERAS = ScannerConfig(views=2, azimuth=30.0, height=0.3, resolution=0.008, noise=0.005)
@@ -104,8 +104,8 @@ def procedural(only: list[str], count: int) -> dict[str, object]:
     """The walk, with everything that may go wrong."""
     model = load_built_in_model()
     kept = np.array(model.info["people_vertices"])
-    person = Person(BodyShape.random(np.random.default_rng(SEED)))
-    poses, trans = walk(count, RATE)
+    person = SyntheticPerson(BodyShape.random(np.random.default_rng(SEED)))
+    poses, trans = synthesise_walk(count, RATE)
     truth = np.stack([person.in_pose(pose, place) for pose, place in zip(poses, trans, strict=True)])
     frames = record(truth, person.mesh.faces, SEED)
     known = subject_from_body(model, person.mesh.vertices[kept])

@@ -34,7 +34,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.registration.nonrigid import register
 from scanprep.skeleton.find import find_skeleton
-from scanprep.synthetic.people import BodyShape, Person, random_pose
+from scanprep.synthetic.people import BodyShape, SyntheticPerson, random_pose
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 CLICKABLE = 0.005                    # metres from the place of a marker to the scan
@@ -93,7 +93,7 @@ def synthetic_cases(count: int) -> Iterator[Case]:
         "left toe", "right toe", "left knee", "left middle finger", "right middle finger", "top of head", "navel")])
     for k in range(count):
         rng = np.random.default_rng(1000 + k)
-        person = Person(BodyShape.random(rng, "male" if k % 2 else "female"))
+        person = SyntheticPerson(BodyShape.random(rng, "male" if k % 2 else "female"))
         posed = person.mesh.with_vertices(person.in_pose(0.6 * random_pose(rng)))
         truth = model.template.with_vertices(posed.vertices[kept])
         whole = scan(posed, ScannerConfig(), rng).merged

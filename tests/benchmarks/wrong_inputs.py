@@ -31,7 +31,7 @@ from model.built_in import load_built_in_model
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
-from scanprep.synthetic.people import MARKERS, BodyShape, Person, random_pose, walk
+from scanprep.synthetic.people import MARKERS, BodyShape, SyntheticPerson, random_pose, synthesise_walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 MARKS = ("left toe", "right toe", "left knee", "right knee", "left middle finger", "right middle finger",
@@ -65,7 +65,7 @@ class Case:
 def subject(seed: int, posed: bool = True, views: int = 4) -> Subject:
     """A person of some seed, who stands at rest where not `posed`."""
     rng = np.random.default_rng([seed, 77])
-    person, model = Person(BodyShape.random(rng)), load_built_in_model()
+    person, model = SyntheticPerson(BodyShape.random(rng)), load_built_in_model()
     pose = random_pose(rng) if posed else np.zeros((16, 3))
     body = Mesh(person.in_pose(pose), person.mesh.faces)
     kept = np.array(model.info["people_vertices"])
@@ -240,8 +240,9 @@ def measured_cases() -> Iterator[Case]:
 def recording(seed: int) -> tuple[MarkerSequence, np.ndarray]:
     """A person who walks, with the 41 markers where their layout has them, some on bars; the vertices (T, N, 3)."""
     rng, model = np.random.default_rng([seed, 78]), load_built_in_model()
-    person, kept = Person(BodyShape.random(rng)), np.array(model.info["people_vertices"])
-    bodies = np.stack([person.in_pose(pose, trans)[kept] for pose, trans in zip(*walk(FRAMES, RATE), strict=True)])
+    person, kept = SyntheticPerson(BodyShape.random(rng)), np.array(model.info["people_vertices"])
+    bodies = np.stack([person.in_pose(pose, trans)[kept] for pose,
+                       trans in zip(*synthesise_walk(FRAMES, RATE), strict=True)])
     layout = choose_layout(model, None, tuple(MARKERS))[0]
     places = np.stack([layout.place(model.template.with_vertices(body)) for body in bodies])
     return MarkerSequence(places + rng.normal(0, 0.001, places.shape), layout.labels, RATE), bodies

@@ -15,7 +15,7 @@ import numpy as np
 from half_views import learned
 from protocols import half_view, load_real, machine, scape_fold, write_report
 
-from completion.partial.clicked_landmarks import EXCHANGED, doubts, wrong_ones
+from completion.partial.clicked_landmarks import EXCHANGED, landmark_doubts, wrong_ones
 from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
 from model.files import load_model
@@ -47,7 +47,7 @@ def main() -> None:
         for case, (clicked, wrong) in cases.items():
             pairs = np.array([data.landmarks[name] for name in clicked]), np.array(list(clicked.values()))
             done = complete(subject, view.points, pairs, config)
-            told = {EXCHANGED} if doubts(clicked, at).startswith(EXCHANGED) else set(wrong_ones(clicked, at))
+            told = {EXCHANGED} if landmark_doubts(clicked, at).startswith(EXCHANGED) else set(wrong_ones(clicked, at))
             rows.append({"k": k, "case": case, "verdict": done.judgement.verdict, "without": found.judgement.verdict,
                          "told": sorted(told), "right": told == wrong, "cpu_s": cpu})
             print(rows[-1], flush=True)

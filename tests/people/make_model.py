@@ -34,10 +34,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.data_set import near_rest, subject_pose
 from scanprep.synthetic.landmarks import landmarks, markers
-from scanprep.synthetic.people import BodyShape, Person
+from scanprep.synthetic.people import BodyShape, SyntheticPerson
 from scanprep.synthetic.population import STORED as PEOPLE
 from scanprep.synthetic.population import population
-from scanprep.synthetic.poses import arm, mirror_pose
+from scanprep.synthetic.poses import arm, mirror_synthetic_pose
 
 STANDING = 0.4                       # poses near rest for each other one: bodies at rest were 0.3 mm off, 0.5 without
 STOOD = 60                           # examples of poses of people who stand
@@ -53,11 +53,11 @@ AROUND = 200                         # vertices of which a joint is a combinatio
 def learn_people_model(poses: int, faces: int, config: LearnConfig = LEARN, n_betas: int | None = None,
                        seed: int = 5) -> ScapeModel:
     """The model of the built-in people: poses of the mean person, and the population's shape space."""
-    rng, person = np.random.default_rng(seed), Person(BodyShape("male", (0.0,) * len(population().directions)))
+    rng, person = np.random.default_rng(seed), SyntheticPerson(BodyShape("male", (0.0,) * len(population().directions)))
     at = [subject_pose(k, rng)[1] for k in range(poses // 2)]
     at += [near_rest(rng) for _ in range(round(STANDING * poses / 2))]
     # with mirror images: else the mean of the poses leaves the body at rest turned to one side
-    at = [side for pose in at for side in (pose, mirror_pose(pose))]
+    at = [side for pose in at for side in (pose, mirror_synthetic_pose(pose))]
     posed = np.stack([person.in_pose(pose) for pose in at])
     small = decimate_person(person, posed, faces)
     assert small.skeleton is not None, "a skeleton was given"
@@ -92,7 +92,7 @@ def pose_prior(template: Mesh, skeleton: Skeleton, posed: np.ndarray, standing: 
     return mix_moments((m_standing, C_standing), with_human_poses(template, skeleton, len(posed), m, C), STAND)
 
 
-def decimate_person(person: Person, posed: np.ndarray | None, faces: int) -> DecimatedSet:
+def decimate_person(person: SyntheticPerson, posed: np.ndarray | None, faces: int) -> DecimatedSet:
     """The person with fewer triangles; landmarks and markers stay where they are."""
     kept = np.unique([*landmarks().values(), *markers().values()])
     return decimate_set(person.mesh, posed, faces, keep=kept, skeleton=person.skeleton)

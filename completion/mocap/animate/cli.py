@@ -23,8 +23,8 @@ from ..files.markers import READERS
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
 from ..subject.person import PersonConfig
-from .motions import ENDINGS, MEAN_DISTANCE, is_motion, motion_among
-from .work import MEAN_ERROR, BetasTo, Work
+from .motions import ENDINGS, MEAN_DISTANCE, motion_among, names_motion
+from .work import MEAN_ERROR, AnimateTask, BetasTo
 
 MarkersArg = Annotated[Path, Place("MARKERS")]
 
@@ -82,7 +82,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     names = [path.stem for path in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):      # written over each other
         raise ValueError(f"{markers}: expected files of different names, {twice[0]} comes with several endings")
-    if markers.is_file() and is_motion(markers) and (layout or subject_prefix or unlabelled):
+    if markers.is_file() and names_motion(markers) and (layout or subject_prefix or unlabelled):
         raise ValueError(f"{markers}: a motion has no markers; leave out --layout, --subject-prefix and --unlabelled")
     if unlabelled and layout is None:
         raise UsageError("--unlabelled: expected --layout: which markers are worn, of scape layout list")
@@ -90,11 +90,12 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         raise UsageError("--unlabelled: markers without names have no --subject-prefix")
     loaded, name = read_model(model)
     body = loaded if subject == "markers" else body_of(loaded, subject, unit)
-    work = Work(loaded, name, None if layout is None else layout_or_file(layout),
-                body if isinstance(body, Subject) else None,
-                None if retarget_to is None else read_subject(loaded, retarget_to, unit),
-                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix, rate,
-                config, person, unlabelled)
+    work = AnimateTask(loaded, name, None if layout is None else layout_or_file(layout),
+                       body if isinstance(body, Subject) else None,
+                       None if retarget_to is None else read_subject(loaded, retarget_to, unit),
+                       None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix,
+                       rate,
+                       config, person, unlabelled)
     settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         return do_one("following the markers", space, work, Task("motion", markers), settings,

@@ -8,10 +8,10 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from model.motion.error import LEAN, MOST, Followed
+from model.motion.error import LEAN, MOST, RetargetingError
 from model.motion.files import is_motion as holds_poses
 from model.motion.onto import BodyMotion, read_motion
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.cli import MM
 from scanprep.console import Metric, judgement_row
 from scanprep.geometry.storage import StorageError
@@ -20,14 +20,14 @@ from scanprep.pictures.page import Page
 
 from ...motion import Motion
 from ...motion_pictures import chart_residuals, frame_panes, moving_pane, pane_with_dots, worst_frames
-from ..files.motion_files import write_glb, write_motion, write_residuals
+from ..files.motion_files import write_glb, write_motion_folder, write_residuals
 from .keys import holds_keys, judge_keys, read_keys
 
 ENDINGS = (".bvh", ".npz")
 MEAN_DISTANCE = "distance of joint centres, mean"
 
 
-def is_motion(path: Path) -> bool:
+def names_motion(path: Path) -> bool:
     """Whether a file is to be read as a motion, not as markers."""
     return path.suffix.lower() in ENDINGS or holds_keys(path)
 
@@ -41,7 +41,7 @@ def motion_among(path: Path) -> bool:
 
 
 def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit: str | None, rate: float | None,
-          room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
+          room: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
     """Bring a motion or keys onto a body and write it into the folder of a room; the figures, and the page to be
     written."""
     if holds_keys(path):
@@ -53,8 +53,8 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
         body = subject if subject is not None else model.subject(found.betas)
         judgement = judge_fit(found.fit)
     motion = Motion.of(found)
-    metrics = [judgement_row(judgement), Metric("model", name), *figures(found)]
-    write_motion(room.folder, motion, body)
+    metrics = [judgement_row(judgement), Metric("model", name), *transfer_figures(found)]
+    write_motion_folder(room.folder, motion, body)
     metrics += write_glb(room.folder / "animation.glb", motion, body)
     page = Page(f"{path.name}, on the body", "The body in motion" + (
         ", with dots where the joint centres of the motion's own skeleton would be with bones as long as these."
@@ -67,7 +67,7 @@ def bring(path: Path, model: BodyModel, name: str, subject: Subject | None, unit
     return metrics, motion, body, page.section("Figures").figures(metrics)
 
 
-def judge_fit(fit: Followed | None) -> Judgement:
+def judge_fit(fit: RetargetingError | None) -> Judgement:
     """What a motion is worth that was brought onto a body."""
     reasons = []
     if fit is not None and fit.angle > MOST:
@@ -80,7 +80,7 @@ def judge_fit(fit: Followed | None) -> Judgement:
     return Judgement.of(None, reasons)
 
 
-def figures(found: BodyMotion) -> list[Metric]:
+def transfer_figures(found: BodyMotion) -> list[Metric]:
     """How the motion came onto the body, and how well it follows."""
     out = [Metric("frames", len(found.poses)), Metric("rate", found.rate, "1/s"), Metric("copied", found.how)]
     if found.rest:
@@ -100,7 +100,7 @@ def figures(found: BodyMotion) -> list[Metric]:
     return out
 
 
-def _joints(page: Page, motion: Motion, body: Subject, fit: Followed, folder: Path) -> None:
+def _joints(page: Page, motion: Motion, body: Subject, fit: RetargetingError, folder: Path) -> None:
     """The body with the joint centres that it follows; the residuals of `motion` are their distances."""
     page.bodies([pane_with_dots(motion, body, fit.wanted, "joint centres of the motion", [*map(_words, fit.names)],
                                 True)],

@@ -11,7 +11,7 @@ from model.body import BodyModel
 from model.linear import Subject
 from model.people import person_judgement
 from scanprep.arguments import UsageError
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.cli import MM
 from scanprep.console import Metric, details, judgement_row
 from scanprep.geometry import storage
@@ -29,7 +29,7 @@ from ...motion_pictures import (
     worst_frames,
 )
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import write_glb, write_motion
+from ..files.motion_files import write_glb, write_motion_folder
 from ..files.opensim import remove_distrusted
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
@@ -40,14 +40,14 @@ from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_
 from ..retargeting.retarget import morph_vertices, retarget
 from ..subject.person import PersonConfig, PersonFit, find_person
 from ..subject.worn_elsewhere import Worn, find_worn
-from .motions import bring, is_motion
+from .motions import bring, names_motion
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, betas (k,) at the end or (T, k) of every frame
 MEAN_ERROR = "distance of markers, mean"
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class AnimateTask:
     """What is the same for all files of a call; without a subject it is found from the markers."""
 
     model: BodyModel
@@ -63,12 +63,12 @@ class Work:
     person: PersonConfig
     unlabelled: bool = False             # markers have no names
 
-    def __call__(self, path: Path, room: Room) -> list[Metric]:
+    def __call__(self, path: Path, room: TaskContext) -> list[Metric]:
         """Follow the markers of a file, or bring its motion onto the body, write everything into the folder of a room,
         and return the figures; the first says what the motion is worth.
         """
         metrics, motion, body, page = bring(path, self.model, self.name, self.subject, self.unit, self.rate, room) \
-            if is_motion(path) else self._follow(path, room)
+            if names_motion(path) else self._follow(path, room)
         if self.retarget_to is not None:
             other = retarget(motion, body, self.retarget_to)
             other.save(room.folder / "onto.npz")
@@ -85,7 +85,7 @@ class Work:
         page.write(room.folder / "report.html")
         return metrics
 
-    def _follow(self, path: Path, room: Room) -> tuple[list[Metric], Motion, Subject, Page]:
+    def _follow(self, path: Path, room: TaskContext) -> tuple[list[Metric], Motion, Subject, Page]:
         """The motion of the markers of a file."""
         labelling = Judgement()
         if self.unlabelled:
@@ -119,15 +119,15 @@ class Work:
         judgement = covered.judgement().merge(labelling, moving, worn.judgement(sequence.labels), placed)
         if found is not None:
             judgement = judge_motions(person_judgement(self.model, found.betas), judgement, [motion], body.template)
-        metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *figures(motion)]
-        write_motion(output, motion, body, remove_distrusted(motion, sequence), covered.told)
+        metrics = [judgement_row(judgement), *metrics, *covered.metrics(), *motion_figures(motion)]
+        write_motion_folder(output, motion, body, remove_distrusted(motion, sequence), covered.told)
         metrics += write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, metrics)
         if self.unlabelled:
             show_labels(page)
         return metrics, motion, body, page
 
-    def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: Room
+    def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: TaskContext
                 ) -> tuple[MarkerSequence, PersonFit, Worn]:
         """The markers under their right names, whose they are, and how they are worn."""
         def find(name: str, markers: MarkerSequence, usual: MarkerLayout) -> PersonFit:
@@ -143,7 +143,7 @@ class Work:
         return sequence, find("subject again", sequence, worn.update_layout(layout)), worn
 
 
-def figures(motion: Motion) -> list[Metric]:
+def motion_figures(motion: Motion) -> list[Metric]:
     """What a motion is judged by."""
     seen = np.isfinite(motion.residuals)
     off = MM * motion.residuals[seen] if seen.any() else np.array([np.nan])

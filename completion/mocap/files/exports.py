@@ -16,7 +16,7 @@ OTHERS = {**OTHER_MOTIONS, ".qtm": "a project file of Qualisys Track Manager: ex
           ".tak": "a take of Motive: export C3D or CSV there"}
 
 
-def read_table(path: Path, data: bytes) -> RawMarkers:
+def read_marker_table(path: Path, data: bytes) -> RawMarkers:
     """Markers in a CSV or TSV file, of ours, of Motive or of Qualisys Track Manager."""
     separator, rows = tables.table_rows(path, data, MarkerFileError)
     first = rows[0][1][0] if rows else ""

@@ -14,10 +14,10 @@ from scanprep.geometry.format_common import FARTHEST, UNITS, metres_of, unit_nam
 from scanprep.words import number_of
 
 from .c3d import read_c3d, write_c3d
-from .exports import OTHERS, read_table
+from .exports import OTHERS, read_marker_table
 from .text import MarkerFileError, RawMarkers, encode_csv, encode_trc, read_trc
 
-READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_table, ".tsv": read_table}
+READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_marker_table, ".tsv": read_marker_table}
 WRITTEN = (".c3d", ".trc", ".csv")
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
 
@@ -148,7 +148,7 @@ def read_markers(path: str | Path, unit: str | None = None, subject_prefix: str 
     return _in_metres(path, raw, columns, labels, unit, rate, usual_rate, notes)
 
 
-def read_points(path: str | Path, unit: str | None = None, rate: float | None = None) -> MarkerSequence:
+def read_marker_points(path: str | Path, unit: str | None = None, rate: float | None = None) -> MarkerSequence:
     """Read all points of a file, whoever's they are: labels as they stand there, with what is before a colon.
 
     Parameters

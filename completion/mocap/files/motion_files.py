@@ -16,7 +16,7 @@ from model.rig import subject_rig
 from scanprep.console import Metric, details
 from scanprep.geometry import storage, tables
 from scanprep.geometry.farthest_points import spread_indices
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 
 from ...motion import Motion
 from .markers import MarkerSequence
@@ -45,8 +45,8 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
     return subject.joints(motion.poses, motion.trans)
 
 
-def write_motion(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
-                 told: np.ndarray | None = None) -> None:
+def write_motion_folder(folder: Path, motion: Motion, subject: Subject, markers: MarkerSequence | None = None,
+                        told: np.ndarray | None = None) -> None:
     """motion.npz, .bvh, .trc and .mot, joint_angles.csv, joint_centres.csv and, of markers, residuals.csv; seconds.
 
     `markers`, of as many frames, go into the TRC. What is between parts of which the markers do not tell (`told` (J,)
@@ -58,10 +58,10 @@ def write_motion(folder: Path, motion: Motion, subject: Subject, markers: Marker
         angles[:, ~(told & told[np.maximum(skeleton.parents, 0)])] = np.nan     # a guess if either side of it is one
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
-    write_table(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, angles.reshape(T, -1)])
-    write_table(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
-                np.c_[motion.times, mask_unknown_centres(centres, skeleton, told).reshape(T, -1)])
+    write_numbers(folder / "joint_angles.csv", ["time", *(f"{name}_r{axis}" for name in names for axis in "xyz")],
+                  np.c_[motion.times, angles.reshape(T, -1)])
+    write_numbers(folder / "joint_centres.csv", ["time", *(f"{name}_{axis}" for name in names for axis in "xyz")],
+                  np.c_[motion.times, mask_unknown_centres(centres, skeleton, told).reshape(T, -1)])
     write_opensim(folder, motion, subject, centres, markers, told)
     if motion.labels:
         write_residuals(folder / "residuals.csv", motion)
@@ -71,14 +71,14 @@ def write_residuals(path: Path, motion: Motion) -> None:
     """CSV: time in seconds, the mean of the frame, then every marker, metres; an empty cell where it was not seen."""
     seen = np.isfinite(motion.residuals)
     mean = np.where(seen, motion.residuals, 0).sum(axis=1) / np.where(seen.any(axis=1), seen.sum(axis=1), np.nan)
-    write_table(path, ["time", "mean", *motion.labels], np.c_[motion.times, mean, motion.residuals])
+    write_numbers(path, ["time", "mean", *motion.labels], np.c_[motion.times, mean, motion.residuals])
 
 
 def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
     """BVH in centimetres: the subject's bones at rest, of fixed length, and the motion."""
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
     skeleton = replace(subject.skeleton, joints=subject.joints(np.zeros((len(subject.skeleton.parents), 3))))
-    write_bvh(path, skeleton, motion.poses, motion.trans, motion.rate, up=upright(subject.template)[0],
+    write_bvh(path, skeleton, motion.poses, motion.trans, motion.rate, up=guess_upright(subject.template)[0],
               body=subject.template.with_vertices(rest))
 
 
@@ -95,7 +95,7 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
     else:
         extra = body_correctives(rig, motion.poses, motion.trans, bodies, spread_indices(T, KEYS))
     rig = replace(rig, mesh=replace(rig.mesh, colors=colors), correctives=extra)
-    up, measured = upright(subject.template)[0], spread_indices(T, 40)      # compared with the exact bodies
+    up, measured = guess_upright(subject.template)[0], spread_indices(T, 40)      # compared with the exact bodies
     exact = motion.vertices(subject, measured) if bodies is None else bodies(measured)
     off = 1e3 * off_exact(rig, motion.poses, motion.trans, exact, measured)
     write_skinned_glb(path, aim_bones(rig, up), motion.poses, motion.trans, motion.rate, up)
@@ -103,6 +103,6 @@ def write_glb(path: Path, motion: Motion, subject: Subject, bodies: Callable[[np
                     Metric("the same, largest", float(off.max()), "mm")])
 
 
-def write_table(path: Path, columns: list[str], rows: np.ndarray) -> None:
+def write_numbers(path: Path, columns: list[str], rows: np.ndarray) -> None:
     """Numbers as CSV, whole or not at all; NaN becomes an empty cell."""
-    storage.write(path, tables.number_table(columns, rows))
+    storage.write_file(path, tables.number_table(columns, rows))

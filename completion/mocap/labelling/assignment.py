@@ -5,7 +5,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..pose.marked_body import batches
-from .body_search import assign
+from .body_search import assign_columns
 from .follow_points import forbid
 from .tracks import mean_along_tracks
 
@@ -26,7 +26,7 @@ def elect(votes: np.ndarray, tracks: np.ndarray) -> np.ndarray:
     columns = np.full((len(tracks), L), -1)
     for t, row in enumerate(tracks):
         seen = np.flatnonzero(row >= 0)
-        chosen, _ = assign(-share[row[seen]].T, -0.5)                   # no label without half of the votes
+        chosen, _ = assign_columns(-share[row[seen]].T, -0.5)                   # no label without half of the votes
         columns[t, chosen >= 0] = seen[chosen[chosen >= 0]]
     return columns
 
@@ -69,7 +69,7 @@ def assign_by_places(points: np.ndarray, tracks: np.ndarray, known: np.ndarray, 
         seen = np.flatnonzero(tracks[t] >= 0)
         cost = costs[t, seen].T.copy()
         forbid(cost, known[t, seen])
-        chosen, _ = assign(cost, ALONE)
+        chosen, _ = assign_columns(cost, ALONE)
         rows = np.flatnonzero(chosen >= 0)
         columns[t, rows] = seen[chosen[rows]]
         # the next best: this point as another marker, another point as this marker, or none

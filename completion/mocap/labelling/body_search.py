@@ -74,10 +74,10 @@ def match_points(places: np.ndarray, points: np.ndarray, scale: float) -> tuple[
     [2, 0, -1]
     """
     squared = ((places[:, None] - points)**2).sum(axis=-1)
-    return assign(np.where(np.isnan(squared), 1.0, squared / (squared + scale**2)), ALONE)
+    return assign_columns(np.where(np.isnan(squared), 1.0, squared / (squared + scale**2)), ALONE)
 
 
-def assign(costs: np.ndarray, alone: float) -> tuple[np.ndarray, float]:
+def assign_columns(costs: np.ndarray, alone: float) -> tuple[np.ndarray, float]:
     """The column (L,) of each row of costs (L, N), -1 where staying `alone` is cheaper, and the mean cost."""
     L, N = costs.shape
     rows, columns = linear_sum_assignment(np.concatenate([costs, np.full((L, L), alone)], axis=1))

@@ -11,7 +11,7 @@ from model.linear import Subject
 from scanprep.arguments import Place, UsageError
 from scanprep.batch.opening import AnyWorkspace
 from scanprep.batch.pool import Workers
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.batch.workspace import Results, Task
 from scanprep.cli import Output, Unit
 from scanprep.console import JUDGEMENT, Metric, Outcome, bar, judgement_of
@@ -80,7 +80,7 @@ def label_recordings(markers: MarkersArg, output: Output, model: ModelOrNone = N
         return do_one("labelling", space, work, Task("labels", markers), settings, f"open {output / 'report.html'}")
     with bar("labelling") as tell:
         table, page = output.with_suffix(".labels.csv"), output.with_suffix(".report.html")
-        metrics = work.write(markers, Room(output.parent, tell=tell), output.name, table.name, page.name)
+        metrics = work.write(markers, TaskContext(output.parent, tell=tell), output.name, table.name, page.name)
     return Outcome(output, metrics, settings, judgement=judgement_of(metrics), following=f"open {page}")
 
 

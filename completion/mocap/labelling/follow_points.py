@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .body_search import ALONE, JUDGED, BodySearch, Placement, assign, robust_weights
+from .body_search import ALONE, JUDGED, BodySearch, Placement, assign_columns, robust_weights
 
 EVERY = 0.1                          # seconds between key frames
 HELD = 0.3                           # what a track that has a label costs less with it
@@ -204,7 +204,7 @@ class _KeyFrameSolver:
                 cost = np.concatenate([self._costs(places[k][i], before[i][k].off, held[i][k], key, scale)
                                        for k in range(len(self.searches))])
                 forbid(cost, key.known)
-                matches[i] = assign(cost, 0.75)[0]
+                matches[i] = assign_columns(cost, 0.75)[0]
             for k, (search, (first, end)) in enumerate(zip(self.searches, self.rows, strict=True)):
                 targets = np.stack([_targets(key.points, m[first:end]) for key, m in zip(keys, matches, strict=True)])
                 unknowns[k] = _solve(search, unknowns[k], targets, scale)

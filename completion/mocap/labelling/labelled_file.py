@@ -6,11 +6,11 @@ from pathlib import Path
 
 from model.body import BodyModel
 from model.linear import Subject
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 
-from ..files.markers import MarkerSequence, read_markers, read_points
+from ..files.markers import MarkerSequence, read_marker_points, read_markers
 from ..marker_sets.layout import MarkerLayout
 from .page import label_page
 from .recording import drop_unnamed, label_recording
@@ -28,14 +28,14 @@ class LabelledFile:
     judgement: Judgement
 
 
-def label_first(room: Room, name: str, path: Path, model: BodyModel | Subject, layout: MarkerLayout,
+def label_first(room: TaskContext, name: str, path: Path, model: BodyModel | Subject, layout: MarkerLayout,
                   unit: str | None, rate: float | None) -> LabelledFile:
     """The recording with labels, NAME/labelled.c3d in the folder of a room.
 
     Beside it come labels.csv and labels.html. A step that is kept: what is done is not done again.
     """
     def make(folder: Path) -> str:
-        found = label_recording(path, read_points(path, unit, rate), model, layout, progress=room.tell)
+        found = label_recording(path, read_marker_points(path, unit, rate), model, layout, progress=room.tell)
         place = folder / name
         place.mkdir(parents=True, exist_ok=True)
         found.write(place / LABELLED)

@@ -37,11 +37,11 @@ def find_in_recording(markers: MarkersArg, output: Output, model: ModelOrNone = 
     """
     from scanprep.pictures.shading import save_png
 
-    from ..files.markers import read_points
+    from ..files.markers import read_marker_points
     from ..marker_sets.pictures import picture_layout
     from .unknown_layout import find_layout
 
-    points = read_points(markers, unit, rate)
+    points = read_marker_points(markers, unit, rate)
     loaded, name = read_model(model)
     with bar("finding the layout") as progress:
         found = find_layout(loaded, points, progress)

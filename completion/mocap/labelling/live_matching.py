@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .body_search import assign
+from .body_search import assign_columns
 
 # Where the body that is expected carries the last offset of its point, a marker is 0.9 to 1.8 mm off at 120 Hz at the
 # median and 7 to 15 mm at the 99th percentile, on three recordings; at 30 Hz 3 to 8 and 29 to 84 mm.
@@ -75,7 +75,7 @@ def match(expected: Expected, points: np.ndarray, strict: bool) -> tuple[np.ndar
     """
     cost = np.minimum(expected.half_squares(points), 2 * ALONE)
     cost += expected.vagueness(np.inf if strict else 0.5 * ALONE)[:, None]
-    chosen, _ = assign(cost, ALONE)
+    chosen, _ = assign_columns(cost, ALONE)
     return chosen, certainty(cost, chosen)
 
 
@@ -125,7 +125,7 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
         # points that no other marker has, after the shift
         pool = find_unmatched(len(points), np.delete(chosen, group))
         apart = expected.places[group][:, None] + shift - points[pool]
-        moved, _ = assign(np.minimum((apart**2).sum(axis=-1) / (2 * SHIFTED_SD**2), 2 * ALONE), ALONE)
+        moved, _ = assign_columns(np.minimum((apart**2).sum(axis=-1) / (2 * SHIFTED_SD**2), 2 * ALONE), ALONE)
         moved = np.where(moved >= 0, pool[moved], -1)
         if (moved == chosen[group]).all():
             continue

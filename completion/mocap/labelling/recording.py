@@ -111,7 +111,7 @@ class LabelledRecording:
 def label_recording(path: Path, points: MarkerSequence, model: BodyModel | Subject, layout: MarkerLayout,
                     people: int = 1, corrections: Path | None = None, relabel: bool = False,
                     progress: Progress | None = None) -> LabelledRecording:
-    """Label the points of a recording, as `read_points` gives them.
+    """Label the points of a recording, as `read_marker_points` gives them.
 
     Labels of the recording that are the layout's are known, unless `relabel`; so are those of the table `corrections`,
     which go before. Arguments else as of `label_people`.

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from model.body import BodyModel
 from model.linear import Subject
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.console import Metric
 
-from ..files.markers import read_points
+from ..files.markers import read_marker_points
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout, layout_names
 from .labelled_file import LABELLED, TABLE
@@ -34,13 +34,13 @@ class LabelWork:
     unit: str | None
     rate: float | None
 
-    def __call__(self, path: Path, room: Room) -> list[Metric]:
+    def __call__(self, path: Path, room: TaskContext) -> list[Metric]:
         """Label a recording into the folder of a room; the figures, the first says what the labels are worth."""
         return self.write(path, room, LABELLED, TABLE, PAGE)
 
-    def write(self, path: Path, room: Room, recording: str, table: str, page: str) -> list[Metric]:
+    def write(self, path: Path, room: TaskContext, recording: str, table: str, page: str) -> list[Metric]:
         """The same under other names of the three files."""
-        points = read_points(path, self.unit, self.rate)
+        points = read_marker_points(path, self.unit, self.rate)
         layout, name = self._layout(points.labels)
         found = label_recording(path, points, self.subject or self.model, layout, self.people, self.labels,
                                 self.relabel, room.tell)

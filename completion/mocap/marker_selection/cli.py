@@ -27,7 +27,7 @@ from ..marker_sets.symmetry import label_pairs, marker_pairs
 from .candidates import candidate_layout
 from .design import MarkerDesign, design_markers
 from .fits import DesignConfig
-from .linear import check_bodies, example_poses, in_poses
+from .linear import check_marker_bodies, example_poses, in_poses
 
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
@@ -84,7 +84,7 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
     for curve in result.curves:
         steps = zip(((), *curve.steps), curve.counts.tolist(), (1000 * curve.rmse).tolist(), strict=True)
         lines += [f'"{curve.name}",{count},{rmse:.4f},"{" ".join(markers)}"' for markers, count, rmse in steps]
-    storage.write(output / "curve.csv", "\n".join(lines) + "\n")
+    storage.write_file(output / "curve.csv", "\n".join(lines) + "\n")
     design_page(result, loaded, among, labels, metrics).write(output / "report.html")
     settings = {"design": config, "model": name, "candidates": candidates, "keep": keep}
     return Outcome(output, metrics, settings, judgement=Judgement())
@@ -102,7 +102,7 @@ def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.
     if not np.array_equal(faces, model.template.faces):
         raise ValueError(f"{folder}: expected the triangles of the model ({model.template}); these have {len(faces)} "
                          f"faces and {vertices.shape[1]} vertices")
-    return check_bodies(model, vertices), people
+    return check_marker_bodies(model, vertices), people
 
 
 def chart_curve(design: MarkerDesign) -> Any:

@@ -11,12 +11,12 @@ from model.body import BodyModel
 from ...motion import Progress
 from ..marker_sets.layout import MarkerLayout
 from .fits import DesignConfig, vertex_errors
-from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, symmetric_groups, walk
+from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, improve_set, symmetric_groups
 from .linear import LinearBodies, fit_bodies, share_betas
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class DesignCurve:
     """Sets of markers of many sizes, each the one before and a marker, or a pair, more or less."""
 
     name: str                        # "removed" from all, "added" to those kept, or "kept, removed": these made fewer
@@ -73,7 +73,7 @@ class MarkerDesign:
     full: float | None
     floor: float
     other_half: float
-    curves: tuple[Curve, ...]
+    curves: tuple[DesignCurve, ...]
     checks: tuple[Check, ...]
     exchanged: int
 
@@ -163,8 +163,8 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
             at = path.at(count)
             checks.append(Check(int(path.counts[at]), float(path.rmse[at]), refitted(_members(groups, path.set(at)))))
     labels = candidates.labels
-    curves = tuple(Curve(name, tuple(labels[i] for i in _members(groups, path.start)),
-                         tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts, path.rmse)
+    curves = tuple(DesignCurve(name, tuple(labels[i] for i in _members(groups, path.start)),
+                               tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts, path.rmse)
                    for name, path in choice.paths.items())
     return MarkerDesign(candidates.without([label for i, label in enumerate(labels) if i not in chosen]), choice.rmse,
                         full, float(np.sqrt(fits.linear.rest.mean())),
@@ -183,15 +183,16 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
         if tell is not None:
             tell(step[0])
 
-    paths = {"removed": walk(MarkerSets(linear, groups, every), REMOVE, free, FEWEST, stops, told),
-             "added": walk(MarkerSets(linear, groups, np.flatnonzero(kept)), ADD, free, sum(map(len, groups)), stops,
-                           told)}
+    paths = {"removed": improve_set(MarkerSets(linear, groups, every), REMOVE, free, FEWEST, stops, told),
+             "added": improve_set(MarkerSets(linear, groups, np.flatnonzero(kept)), ADD, free, sum(map(len, groups)),
+                                  stops,
+                                  told)}
     best = best_path(paths, config.count)
     sets = MarkerSets(linear, groups, best.set(best.at(config.count)))
     exchanged = exchange(sets, free, config.exchanges)
     alone = MarkerSets(linear, groups, np.flatnonzero(kept))
     if alone.count > FEWEST:
-        paths["kept, removed"] = walk(alone, REMOVE, kept, FEWEST, stops, told)
+        paths["kept, removed"] = improve_set(alone, REMOVE, kept, FEWEST, stops, told)
     chosen = np.flatnonzero(sets.inside)
     return Choice(paths, chosen, linear.rmse(_members(groups, chosen)), exchanged)
 

@@ -138,8 +138,8 @@ class MarkerSets:
         self.inside, self.costs, self._C, self._S, self._F, self._rho, self._q = state
 
 
-def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: Collection[int] = (),
-         tell: Callable[[int], None] | None = None) -> Path:
+def improve_set(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: Collection[int] = (),
+                tell: Callable[[int], None] | None = None) -> Path:
     """Let the group come or go that serves best for each of its markers, again and again.
 
     Only those of `movable` (n,), no further than `until`; it stops at counts of `through` that single markers can make.

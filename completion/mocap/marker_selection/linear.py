@@ -79,7 +79,7 @@ class WholeFits:
 def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig,
                progress: Progress | None = None) -> WholeFits:
     """Fit the model to every whole body (Z, N, 3), metres, in any poses, and linearise there."""
-    bodies, n_betas = check_bodies(model, bodies), model.n_betas if config.n_betas is None else config.n_betas
+    bodies, n_betas = check_marker_bodies(model, bodies), model.n_betas if config.n_betas is None else config.n_betas
     if not 0 < n_betas <= model.n_betas:
         raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {n_betas}")
     N, most = len(model.template.vertices), int(np.max(candidates.vertices, initial=0))
@@ -118,7 +118,7 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
     return WholeFits(x, markers, places, prior, linear)
 
 
-def check_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
+def check_marker_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     """The bodies (Z, N, 3) as an array, or ValueError; also for a model without betas."""
     if not model.n_betas:
         raise ValueError("model: expected one with betas, this one knows its template's body only")
@@ -182,7 +182,7 @@ def example_poses(model: BodyModel, count: int) -> np.ndarray:
 def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,
              progress: Progress | None = None) -> np.ndarray:
     """Each registered body (Z, N, 3), metres, with its own full shape, in poses (F, J, 3): (Z, F, N, 3) float32."""
-    bodies = check_bodies(model, bodies)
+    bodies = check_marker_bodies(model, bodies)
     poses, _ = check_pose(model.skeleton, poses, None)
     fitter, tell = ShapeFitter(model, FitConfig(polish=0)), progress or (lambda done, total: None)
     out = np.empty((len(bodies), len(poses), *bodies.shape[1:]), dtype=np.float32)

@@ -91,7 +91,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     found.save(output / "layout.json")
     if skeleton is not None:
         with contextlib.suppress(ValueError):                       # no person's parts
-            storage.write(output / "markerset.xml", marker_set(opensim_markers(found, shown, skeleton)))
+            storage.write_file(output / "markerset.xml", marker_set(opensim_markers(found, shown, skeleton)))
     layout_page(layout, shown, found, picture, {m.name: f"{m.text()} {m.unit}" for m in figures}, skeleton
                 ).write(output / "report.html")
     return Outcome(output, [Metric("body", name), *figures], {"layout": layout}, judgement=Judgement())

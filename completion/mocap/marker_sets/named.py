@@ -83,9 +83,9 @@ def load_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> Ma
     if kept is not None and len(kept) == len(template.vertices):
         for path, body in bodies:
             if body["name"] == "synthetic people":
-                from scanprep.synthetic.topology import load
+                from scanprep.synthetic.topology import load_topology
 
-                layout, whole = MarkerLayout.load(path), load().mesh.vertices
+                layout, whole = MarkerLayout.load(path), load_topology().mesh.vertices
                 on_kept = Surface(Mesh(whole[np.asarray(kept)], template.faces)).closest(whole[layout.vertices])
                 return replace(layout, vertices=template.faces[on_kept.faces], weights=on_kept.bary)
     known = ", ".join(f"{body['name']} ({body['vertices']} vertices)" for _, body in bodies)

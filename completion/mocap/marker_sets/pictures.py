@@ -10,7 +10,7 @@ from scanprep.geometry.surface import Rays
 from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane
-from scanprep.pictures.shading import Dots, Solid, render, side_by_side
+from scanprep.pictures.shading import Dots, Solid, contact_sheet, render
 from scanprep.pictures.sheets import font, webp_bytes
 from scanprep.skeleton.tree import Skeleton
 
@@ -54,10 +54,10 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
             taken.append((free or boxes)[0])
             draw.text(taken[-1][:2], layout.labels[i], fill=(24, 40, 92), font=size)
         images.append(np.asarray(image))
-    return side_by_side(images, SIDES)
+    return contact_sheet(images, SIDES)
 
 
-def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = None) -> list[tuple[str, ...]]:
+def layout_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = None) -> list[tuple[str, ...]]:
     """For every marker its label, other labels, part of the body, partner, distance from the skin and kind."""
     pairs = label_pairs(layout.labels)
     parts = None if skeleton is None else skeleton.part_of_vertex(body)
@@ -90,5 +90,5 @@ def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray
     page.bodies([layout_pane(body, layout)], "", 640, webp_bytes(picture))
     page.table(list(figures.items()), ("", ""))
     page.section("Markers").table(
-        marker_rows(body, layout, skeleton), ("label", "also", "part", "partner", "from the skin", "place"))
+        layout_rows(body, layout, skeleton), ("label", "also", "part", "partner", "from the skin", "place"))
     return page

@@ -21,8 +21,8 @@ from scanprep.ranges import Positive
 from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .mosh import MoshConfig
-from .recordings import TABLE, Actor, Grouping, write_table
-from .work import ERRORS, FIXED, Work
+from .recordings import TABLE, Actor, Grouping, write_grouping
+from .work import ERRORS, FIXED, MoshTask
 
 MarkersArg = Annotated[tuple[Path, ...], Place("MARKERS [MARKERS ...]")]
 Models = Annotated[tuple[Path, ...], Alias("-m", each=True)]
@@ -88,14 +88,14 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
 def carry_out(call: MoshCall, space: Workspace, workers: Workers, command: str, *tell: Progress) -> Outcome:
     """Do what has changed of a call in an output that is open; `tell` is the progress of people, and inside one."""
     actors, loaded = call.actors(space.folder), call.models()
-    work = Work(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
-                None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
-                call.unit, call.rate, call.unlabelled, call.config, command)
+    work = MoshTask(loaded.neutral, loaded.name, loaded.sexes, loaded.character,
+                    None if call.layout is None else choose_layout(loaded.neutral, call.layout, ()), call.hold_out,
+                    call.unit, call.rate, call.unlabelled, call.config, command)
     # who is who into subjects.csv; one that was mended stays as it is, and has to be named
     table = space.folder / TABLE
     if not table.exists() or space.is_ours(TABLE):
         with space.staging("people") as staged:
-            write_table(staged.folder / TABLE, actors)
+            write_grouping(staged.folder / TABLE, actors)
     elif Grouping.of(call.subjects).table is not None:
         warnings.warn(f"{table}: left as it was mended", stacklevel=2)
     else:

@@ -27,7 +27,7 @@ from ..marker_sets.named import choose_layout
 from .call import MoshCall
 from .cli import carry_out, describe
 from .mended_layout import Spot, apply_corrections, changes, next_file
-from .people import Found, load_people
+from .people import FoundPerson, load_people
 from .work import ERRORS
 
 MENDED = "scape mosh, mended in the browser"
@@ -41,7 +41,7 @@ class Result:
 
     call: MoshCall
     rows: dict[str, list[Metric]]
-    people: list[Found]
+    people: list[FoundPerson]
     usual: MarkerLayout
     template: Mesh
 
@@ -108,7 +108,7 @@ class MoshApp(ResultsApp):
         self._place()
 
     @property
-    def person(self) -> Found:
+    def person(self) -> FoundPerson:
         """That is shown."""
         return self.result.people[self.current]
 
@@ -243,7 +243,7 @@ class MoshApp(ResultsApp):
         return self.result.usual.aliases.get(label, label)
 
 
-def _usual(call: MoshCall, model: BodyModel, people: list[Found]) -> MarkerLayout:
+def _usual(call: MoshCall, model: BodyModel, people: list[FoundPerson]) -> MarkerLayout:
     """The layout that all people have in common, as it was before it was corrected here."""
     names = [call.layout] if call.layout else sorted({one.layout_name for one in people})
     if len(names) > 1:

@@ -12,7 +12,7 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sexes import SexGuess, guess_sex, sex_plane
 from model.linear import Subject
-from scanprep.batch.room import Step, inside, once
+from scanprep.batch.room import Step, run_uncached, substeps
 from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 
@@ -129,7 +129,7 @@ class MoshResult:
 
 @one_thread()
 def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
-         config: MoshConfig | None = None, progress: Progress | None = None, step: Step = once) -> MoshResult:
+         config: MoshConfig | None = None, progress: Progress | None = None, step: Step = run_uncached) -> MoshResult:
     """Body shape, marker places, poses and soft tissue of one subject from marker sequences.
 
     Labels are put right as far as tracks tell. The person is found from a few frames of all sequences; markers that are
@@ -147,7 +147,7 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     progress : callable, optional
         Called with (done, total).
     step : callable, optional
-        Keeps what each stage finds, as `Room.step` does.
+        Keeps what each stage finds, as `TaskContext.step` does.
 
     Raises
     ------
@@ -275,7 +275,7 @@ class _Stages:
     def find_person(self, trials: Sequence[_Trial], layout: MarkerLayout, again: str = "") -> _Person:
         """Shape and marker places; `again` names it where it was found before, of other markers."""
         used, config, step = [trial.markers for trial in trials], self.config.person, self.step
-        step = inside(step, again) if again else step
+        step = substeps(step, again) if again else step
         return _Person(self.model, self.run(
             "person", f"{again} person".strip(), (self.model, used, layout, config),
             lambda tell: find_person(self.model, used, layout, config, tell, step), not again))
@@ -341,7 +341,7 @@ class SexedMosh:
 @one_thread()
 def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Sequence[MarkerSequence],
                 layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None,
-                step: Step = once) -> SexedMosh:
+                step: Step = run_uncached) -> SexedMosh:
     """As `mosh`, with the model of the person's sex.
 
     The neutral model finds a body, its betas tell the sex, and all is done with the model of that sex.
@@ -362,7 +362,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
     """
     check_models(models)
     config = config or MoshConfig()
-    neutral = find_person(models["neutral"], sequences, layout, config.person, None, inside(step, "neutral"))
+    neutral = find_person(models["neutral"], sequences, layout, config.person, None, substeps(step, "neutral"))
     guess = guess_sex(models["neutral"], neutral.betas)
     result = mosh(models[guess.sex], sequences, layout, config, progress, step)
     motions = tuple(replace(motion, gender=guess.sex) for motion in result.motions)

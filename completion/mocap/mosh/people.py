@@ -23,14 +23,14 @@ from ..files.markers import MarkerSequence, read_markers
 from ..labelling.labelled_file import LABELLED, read_labelled
 from ..marker_sets.layout import MarkerLayout
 from .call import Models
-from .pictures import standing
+from .pictures import person_in_mean_pose
 from .recordings import Actor, Recording
 
 FRAMES = 6                           # worst frames that are shown of a person
 
 
 @dataclass(frozen=True)
-class Frame:
+class WorstFrame:
     """A frame of a recording, and the mean distance of its markers, metres."""
 
     take: int
@@ -40,7 +40,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundPerson:
     """A person as `scape mosh` found it, in a folder.
 
     Attributes
@@ -72,7 +72,7 @@ class Found:
     @cached_property
     def body(self) -> Mesh:
         """At rest."""
-        return standing(self.model, np.array(self.about["betas"]))
+        return person_in_mean_pose(self.model, np.array(self.about["betas"]))
 
     @cached_property
     def skin(self) -> Surface:
@@ -148,7 +148,7 @@ class Found:
         return found
 
     @cached_property
-    def worst(self) -> list[Frame]:
+    def worst(self) -> list[WorstFrame]:
         """The frames of all recordings in which the markers are farthest, the worst first."""
         found = []
         for take, (one, motion) in enumerate(zip(self.recordings, self.motions, strict=True)):
@@ -156,10 +156,10 @@ class Found:
                 off = float(mean_over(motion.residuals[t], 0))
                 if np.isfinite(off):
                     told = f"{one.name}, {t / motion.rate:.2f} s: {1000 * off:.0f} mm"
-                    found.append(Frame(take, t, told, off))
-        return sorted(found, key=lambda frame: -frame.off)[:FRAMES] or [Frame(0, 0, self.recordings[0].name, 0.0)]
+                    found.append(WorstFrame(take, t, told, off))
+        return sorted(found, key=lambda frame: -frame.off)[:FRAMES] or [WorstFrame(0, 0, self.recordings[0].name, 0.0)]
 
-    def pane(self, frame: Frame) -> Pane:
+    def pane(self, frame: WorstFrame) -> Pane:
         """The body in a frame with the measured markers, coloured by how far they are from where it has them."""
         motion = self.motions[frame.take]
         vertices = motion.vertices(self.subject, np.array([frame.number]))[0].astype(float)
@@ -180,7 +180,7 @@ class Found:
 
 
 def load_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str | None,
-                rate: float | None) -> list[Found]:
+                rate: float | None) -> list[FoundPerson]:
     """The people of an output, as their files tell; StorageError where they do not, ValueError where there are none."""
     found = []
     for actor in actors:
@@ -192,7 +192,7 @@ def load_people(folder: Path, actors: Sequence[Actor], models: Models, unit: str
         layout = MarkerLayout.load(own / "layout.json", len(model.template.vertices))
         there = tuple(one for one in actor.recordings if (own / one.name / "motion.npz").exists())
         if there:
-            found.append(Found(actor.name, own, there, model, layout, about, unit, rate))
+            found.append(FoundPerson(actor.name, own, there, model, layout, about, unit, rate))
     if not found:
         raise ValueError(f"{folder}: expected what scape mosh found of the people, there is none; run it once more")
     return found

@@ -11,7 +11,7 @@ from scanprep.cli import MM
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import look_around, stance
 from scanprep.pictures.scene import Pane, picture_pane, picture_panes
-from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid, side_by_side
+from scanprep.pictures.shading import Bones, Dots, Heat, Shape, Solid, contact_sheet
 from scanprep.words import number_of
 
 from ...motion_pictures import (
@@ -34,7 +34,7 @@ USUAL, UNCERTAIN, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 
 LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
 
 
-def standing(model: BodyModel, betas: np.ndarray) -> Mesh:
+def person_in_mean_pose(model: BodyModel, betas: np.ndarray) -> Mesh:
     """The person in the mean pose of the training set."""
     return model.template.with_vertices(model.vertices(model.pose_mean, betas))
 
@@ -64,7 +64,7 @@ def kinds_of_markers(take: Take) -> dict[str, tuple[Sequence[float], np.ndarray]
     return {name: (color, at) for name, (color, at) in found.items() if np.isfinite(at).any()}
 
 
-def marker_dots(take: Take, t: int, radius: float = 0.014) -> list[Dots]:
+def take_marker_dots(take: Take, t: int, radius: float = 0.014) -> list[Dots]:
     """The measured markers of a frame: believed, not believed, and those that no stage has seen."""
     return [Dots(at[t], color, radius, name=name) for name, (color, at) in kinds_of_markers(take).items()]
 
@@ -77,12 +77,12 @@ def take_pane(take: Take) -> Pane:
     return moving_pane(take.shown, take.subject, dots, take.make, take.light)
 
 
-def frame_panes(take: Take, frames: np.ndarray, looks: Sequence[Sequence[Shape]] | None = None,
-                radius: float = 0.014) -> list[Pane]:
+def take_frame_panes(take: Take, frames: np.ndarray, looks: Sequence[Sequence[Shape]] | None = None,
+                     radius: float = 0.014) -> list[Pane]:
     """Some frames with their markers; `looks` shows the body of each, if not as it is."""
     vertical, bodies = upwards(take.shown, take.subject), take.bodies(frames)
     looks = looks or [[take.light.mesh(body)] for body in bodies]
-    return [Pane([*look, *marker_dots(take, int(t), radius)],
+    return [Pane([*look, *take_marker_dots(take, int(t), radius)],
                  facing(take.subject, take.shown.poses[t], body, vertical=vertical),
                  f"{t} · {t / take.shown.rate:.2f} s")
             for t, body, look in zip(frames, bodies, looks, strict=True)]
@@ -90,9 +90,9 @@ def frame_panes(take: Take, frames: np.ndarray, looks: Sequence[Sequence[Shape]]
 
 def picture_large(take: Take, frames: np.ndarray, height: int = 340) -> np.ndarray:
     """Some frames in a row, each as large as fits."""
-    panes = frame_panes(take, frames)
-    return side_by_side([picture_pane(pane, round(0.62 * height), height) for pane in panes],
-                        [pane.label for pane in panes])
+    panes = take_frame_panes(take, frames)
+    return contact_sheet([picture_pane(pane, round(0.62 * height), height) for pane in panes],
+                         [pane.label for pane in panes])
 
 
 def soft_change(take: Take, frames: np.ndarray) -> np.ndarray:
@@ -121,7 +121,7 @@ def soft_tissue_panes(take: Take, frames: np.ndarray) -> list[Pane]:
         shown = Heat(out[light.vertex_ids], -end, end, "skin moved inwards (-) and outwards", colormap="coolwarm")
         looks.append([Solid(light.mesh(soft), shown, name="with soft tissue"),
                       Solid(light.mesh(rigid), name="fixed shape", visible=False)])
-    return frame_panes(take, frames, looks, 0.010)
+    return take_frame_panes(take, frames, looks, 0.010)
 
 
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:

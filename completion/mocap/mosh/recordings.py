@@ -99,7 +99,7 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
             for person in sorted({name for name, *_ in rows})]
 
 
-def write_table(path: Path, actors: Iterable[Actor]) -> None:
+def write_grouping(path: Path, actors: Iterable[Actor]) -> None:
     """Who is who as CSV, in the form that `Grouping.table` takes."""
     tables.write_table(path, ("file", "subject", "rule"),
                        ((r.path, actor.name, actor.rule) for actor in actors for r in actor.recordings))

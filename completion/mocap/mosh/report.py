@@ -34,7 +34,7 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
                 metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]], settings: Mapping[str, Any]
                 ) -> Page:
     """Shape and markers of a person, before in the `usual` layout, and the way to its sequences and their figures."""
-    body, labels, worn = pictures.standing(model, result.betas), result.layout.labels, result.worn
+    body, labels, worn = pictures.person_in_mean_pose(model, result.betas), result.layout.labels, result.worn
     before = usual.select(labels)
     found, moved = pictures.change_of_place(body, before, result.layout)
     page = Page(f"{name}: body shape and markers",
@@ -91,7 +91,8 @@ def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Pag
     page.chart(chart_frames(take), "mean of the markers, over time")
     page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
                                 "as bad")
-    page.bodies(pictures.frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest", 300)
+    page.bodies(pictures.take_frame_panes(take, worst_frames(take.shown, 5)), "the frames in which they are farthest",
+                300)
     # the markers, the worst first, held-out ones above all
     rows = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
                        motion.trusted)
@@ -139,7 +140,7 @@ def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
     """A person from four sides with the markers, for the page of all people."""
-    body = pictures.standing(model, result.betas)
+    body = pictures.person_in_mean_pose(model, result.betas)
     return pictures.picture_sides(body, result.layout.place(body))
 
 

@@ -14,20 +14,20 @@ from model.body import BodyModel
 from model.learning.sexes import SexGuess
 from model.people import person_judgement
 from scanprep.arguments import UsageError
-from scanprep.batch.room import Room
+from scanprep.batch.room import TaskContext
 from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, details, judgement_row, write_report
 from scanprep.folders import PICTURE
 from scanprep.geometry import storage, tables
 from scanprep.geometry.farthest_points import spread_indices
 from scanprep.judgement import Judgement
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 from scanprep.pictures.sheets import save_png
 
 from ...motion_pictures import picture_bodies
 from ..artefacts.results import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import joint_centres, write_glb, write_motion, write_residuals
+from ..files.motion_files import joint_centres, write_glb, write_motion_folder, write_residuals
 from ..files.opensim import centre_sequence, mask_unknown_centres
 from ..labelling.labelled_file import label_first, show_labels
 from ..marker_sets.layout import MarkerLayout
@@ -37,7 +37,7 @@ from ..pose.judgement import judge_motions, markers_told, motion_doubts, motion_
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, clocks, mosh, mosh_by_sex
-from .pictures import standing
+from .pictures import person_in_mean_pose
 from .recordings import Actor, Recording
 from .report import closing, person_page, person_picture, take_page, take_picture
 from .takes import LightMesh, Take, measure_held_out
@@ -50,7 +50,7 @@ HALF = 100                           # of progress: finding shape and motion, th
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class MoshTask:
     """The work on each person of a call."""
 
     model: BodyModel
@@ -65,7 +65,7 @@ class Work:
     config: MoshConfig
     command: str = field(metadata={"digest": False})
 
-    def __call__(self, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
+    def __call__(self, actor: Actor, room: TaskContext) -> tuple[list[Metric], list[str]]:
         """Everything of one person into the folder of a room: the figures, and what failed.
 
         A recording that cannot be read is left out and told; ValueError where none can. The first figure says
@@ -151,7 +151,7 @@ class _Found:
         return judge_motions(self.person, own, motions, body)
 
 
-def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
+def _solve(work: MoshTask, actor: Actor, room: TaskContext) -> tuple[_Found, list[str]]:
     recordings, sequences, failures = list[Recording](), list[MarkerSequence](), list[str]()
     labelling, units = list[Judgement](), list[str | None]()
     for recording in actor.recordings:
@@ -200,7 +200,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     return _Found(model, guess, result, takes, usual, layout_name, Judgement().merge(*labelling)), failures
 
 
-def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]
+def _write(work: MoshTask, found: _Found, take: Take, room: TaskContext, settings: Mapping[str, Any]
            ) -> tuple[list[Metric], np.ndarray]:
     """A sequence into its folder, in steps that are kept; the figures, and the seconds (2,) of the page."""
     metrics, factor = [Metric("layout", found.layout_name), *_figures([take])], work.config.exaggeration
@@ -246,7 +246,7 @@ def write_take(folder: Path, take: Take, told: np.ndarray | None = None, factor:
     Returned is how far the GLB files are from the exact bodies.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    write_motion(folder, motion, body, take.artefacts.virtual(), told)
+    write_motion_folder(folder, motion, body, take.artefacts.virtual(), told)
     exact = write_glb(folder / "animation.glb", take.shown, body, None if soft is None else take.make)
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
@@ -287,8 +287,8 @@ def _character(character: BodyModel, take: Take, folder: Path, factor: float) ->
 
 def _person_metrics(found: _Found) -> list[Metric]:
     moved, result = MM * found.result.person.moved, found.result
-    body = standing(found.model, result.betas)
-    told = [Metric("height", float(np.ptp(body.vertices[:, upright(body)[0]])), "m"),
+    body = person_in_mean_pose(found.model, result.betas)
+    told = [Metric("height", float(np.ptp(body.vertices[:, guess_upright(body)[0]])), "m"),
             Metric("volume", 1000 * abs(body.volume), "l")]
     if found.guess is not None:
         told.append(Metric("sex", f"{found.guess.sex} ({100 * found.guess.probability:.0f}%)"))

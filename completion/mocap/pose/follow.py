@@ -13,9 +13,9 @@ from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .foot_contact import FootContact
-from .initialise import reinitialise_limbs, search
-from .marked_body import AnimateConfig, MarkedBody, judge, marker_weights
-from .stream import STEPS, Tracker
+from .initialise import reinitialise_frames, search_pose
+from .marked_body import AnimateConfig, MarkedBody, judge_markers, marker_weights
+from .stream import STEPS, MarkerTracker
 from .swaps import label_order
 
 __all__ = ["AnimateConfig", "animate"]
@@ -66,8 +66,9 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
         pose, trans = low_pass(pose, trans, markers.rate, config.low_pass)
     residuals = np.full(markers.positions.shape[:2], np.nan)
     believed = np.zeros(residuals.shape, dtype=bool)
-    residuals[:, columns], believed[:, columns] = judge(body.positions(body.body.join(pose, trans)), targets, order,
-                                                        config.outlier)
+    residuals[:, columns], believed[:, columns] = judge_markers(body.positions(body.body.join(pose, trans)), targets,
+                                                                order,
+                                                                config.outlier)
     return Motion(pose.copy(), trans.copy(), subject.betas, markers.rate, residuals, markers.labels,
                   converged=converged, trusted=believed)
 
@@ -81,10 +82,10 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
     first = _first_frame(targets)
     x, converged = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)
     order = np.tile(np.arange(body.count), (len(frames), 1))
-    at, start, done = int(np.searchsorted(frames, first)), search(body, targets[first], config), 0
+    at, start, done = int(np.searchsorted(frames, first)), search_pose(body, targets[first], config), 0
     ways: tuple[Sequence[int], Sequence[int]] = range(at, len(frames)), range(at - 1, -1, -1)
     for way in ways:
-        tracker = Tracker(body, config, rate, steps)
+        tracker = MarkerTracker(body, config, rate, steps)
         tracker.begin(x[at] if done else start)
         for i in way:
             x[i], converged[i] = tracker.push(targets[frames[i]])
@@ -111,7 +112,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         # swapped labels are put right, lost limbs found again, and outliers lose their weight
         order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
-        near = reinitialise_limbs(body, x[inside].copy(), taken, config)         # x changes below, and is compared
+        near = reinitialise_frames(body, x[inside].copy(), taken, config)         # x changes below, and is compared
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
 
         # one step of all frames together

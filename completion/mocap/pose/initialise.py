@@ -7,12 +7,12 @@ from model.fitting import energy
 from model.fitting.named_points import anneal, lay_on_points
 from model.priors import typical_poses
 
-from .marked_body import AnimateConfig, MarkedBody, marker_weights, misfit
+from .marked_body import AnimateConfig, MarkedBody, marker_misfit, marker_weights
 
 SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb has lost three quarters of its weight
 
 
-def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
+def search_pose(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
     """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen."""
     x = lay_on_points(body.body, body.positions, typical_poses(body.body.pose_mean, body.body.pose_covariance, axes=6),
                       targets)
@@ -26,7 +26,7 @@ def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.n
     return x[0]
 
 
-def reinitialise_limbs(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
+def reinitialise_frames(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
     """Unknowns (T, P) in which frames that had lost a limb have it again; markers are (T, L, 3), metres.
 
     A body that follows a fast limb too late takes all its markers for outliers. Frames with three markers far away are
@@ -43,9 +43,9 @@ def reinitialise_limbs(body: MarkedBody, x: np.ndarray, targets: np.ndarray, con
     for start in starts[1:]:
         start[:, root] = x[np.ix_(frames, root)]
     found = np.stack([_from_far(body, start, targets[frames], config) for start in starts])
-    left = np.stack([misfit(_apart(body, end, targets[frames]), config.outlier) for end in found])
+    left = np.stack([marker_misfit(_apart(body, end, targets[frames]), config.outlier) for end in found])
     best = left.argmin(axis=0)
-    better = left.min(axis=0) < 0.8 * misfit(apart[frames], config.outlier)
+    better = left.min(axis=0) < 0.8 * marker_misfit(apart[frames], config.outlier)
     out = x.copy()
     out[frames[better]] = found[best, np.arange(len(frames))][better]
     return out

@@ -25,7 +25,7 @@ def markers_told(motions: Sequence[Motion]) -> Metric:
     return Metric("markers in the mean distance", f"{len(seen) - len(out)} of {len(seen)}{without}")
 
 
-def hardly_believed(motions: Sequence[Motion]) -> tuple[str, ...]:
+def distrusted_marker_warnings(motions: Sequence[Motion]) -> tuple[str, ...]:
     """A reason to look at motions of one body: markers that are distrusted throughout."""
     out = sorted({label for motion in motions for label in motion.distrusted})
     return (f"{', '.join(out)} hardly ever believed: not worn where the layout says, and not in the mean distance",
@@ -56,7 +56,7 @@ def mean_off(motions: Sequence[Motion]) -> float:
 
 def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], body: Mesh) -> tuple[str, ...]:
     """Reasons to look at motions of one body, made from markers; `body` is the model's template."""
-    reasons = [*hardly_seen(motions), *hardly_believed(motions)]
+    reasons = [*hardly_seen(motions), *distrusted_marker_warnings(motions)]
     off = mean_off(motions)
     if off > DOUBTFUL * size(body):
         reasons.append(f"the markers are {1000 * off:.0f} mm from where the body has them")

@@ -217,14 +217,14 @@ def stretches(rows: np.ndarray, times: np.ndarray | None = None, apart: float = 
     return np.split(rows, np.flatnonzero(gaps) + 1) if len(rows) else []
 
 
-def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
+def marker_misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
     """(...) how badly markers (..., L), metres off, fit, of 0 to 1; each outlier counts the same."""
     squared = apart**2
     return np.nanmean(squared / (outlier**2 + squared), axis=-1)
 
 
-def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier: float
-          ) -> tuple[np.ndarray, np.ndarray]:
+def judge_markers(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier: float
+                  ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label."""
     residuals = np.linalg.norm(positions - targets, axis=-1)
     squared, scale = distances_apart(positions, targets, outlier)

@@ -10,8 +10,8 @@ from model.linear import Subject
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 
 from ..marker_sets.layout import MarkerLayout
-from .initialise import search
-from .marked_body import AnimateConfig, MarkedBody, judge, marker_weights, misfit
+from .initialise import search_pose
+from .marked_body import AnimateConfig, MarkedBody, judge_markers, marker_misfit, marker_weights
 from .swaps import LabelWatch
 
 STEPS = 3                            # most for a frame
@@ -20,7 +20,7 @@ PATIENCE = 0.25                      # seconds from a search that found nothing 
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PoseFrame:
     """What one frame of markers tells.
 
     Attributes
@@ -76,9 +76,9 @@ class MarkerStream:
         self.rows, worn = layout.match_columns(labels)
         self.n_labels = len(labels)
         body = MarkedBody(subject, worn, config.prior_weight, config.prior_shrinkage)
-        self.tracker = Tracker(body, config, rate)
+        self.tracker = MarkerTracker(body, config, rate)
 
-    def push(self, positions: np.ndarray) -> Frame:
+    def push(self, positions: np.ndarray) -> PoseFrame:
         """The next frame.
 
         Parameters
@@ -93,10 +93,10 @@ class MarkerStream:
         tracker, targets = self.tracker, positions[self.rows]
         x, converged = tracker.push(targets)
         residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
-        residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order,
+        residuals[self.rows], trusted[self.rows] = judge_markers(tracker.places, targets, tracker.watch.order,
                                                         tracker.config.outlier)
         pose, trans, _ = tracker.body.body.split(x)
-        return Frame(pose, trans, residuals, trusted & tracker.believed, converged)
+        return PoseFrame(pose, trans, residuals, trusted & tracker.believed, converged)
 
 
 class KalmanPrediction:
@@ -143,7 +143,7 @@ class KalmanPrediction:
         self.x = x
 
 
-class Tracker:
+class MarkerTracker:
     """The state of a stream of markers (L, 3) that all belong to the body, `rate` frames a second."""
 
     def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float, steps: int = STEPS) -> None:
@@ -171,7 +171,7 @@ class Tracker:
             if not enough:
                 return np.full(self.body.n_unknowns, np.nan), False
             passed = self.passed
-            self.begin(search(self.body, targets, self.config))
+            self.begin(search_pose(self.body, targets, self.config))
             self.passed = passed
         expected, information = self.prediction.expect()
         self.places = before = self.body.positions(expected)
@@ -219,9 +219,9 @@ class Tracker:
 
     def _search_again(self, targets: np.ndarray) -> np.ndarray | None:
         """Unknowns (P,) that a search finds and that fit much better than the body at `places`, or None."""
-        found = search(self.body, targets, self.config)
+        found = search_pose(self.body, targets, self.config)
         apart = np.linalg.norm(np.stack([self.body.positions(found), self.places]) - targets, axis=2)
-        new, old = misfit(apart, self.config.outlier)
+        new, old = marker_misfit(apart, self.config.outlier)
         if new < 0.7 * old:
             self.patience = PATIENCE * self.rate
             return found

@@ -9,7 +9,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
-from scanprep.pictures.camera import upright
+from scanprep.pictures.camera import guess_upright
 
 from ...motion import Motion
 
@@ -42,9 +42,9 @@ def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
     ratio = _stands(target) / _stands(source)
     trans = motion.trans[0] + ratio * (motion.trans - motion.trans[0])
     trans[:, up] = motion.trans[:, up]
-    low = lowest(source, motion.poses, motion.trans, up, sign)
+    low = lowest_heights(source, motion.poses, motion.trans, up, sign)
     floor = np.percentile(low, 2.0)                                  # where the lowest points are when they are low
-    trans[:, up] += sign * (floor + ratio * (low - floor) - lowest(target, motion.poses, trans, up, sign))
+    trans[:, up] += sign * (floor + ratio * (low - floor) - lowest_heights(target, motion.poses, trans, up, sign))
     none = np.zeros((len(motion.poses), 0))
     return replace(motion, trans=trans, betas=target.betas, residuals=none, labels=(), trusted=none.astype(bool))
 
@@ -91,7 +91,7 @@ def morph_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mapping
     if grounded:
         own = model.subject(motion.betas)
         up, sign = world_up(motion, own)
-        low = lowest(own, poses, trans, up, sign)
+        low = lowest_heights(own, poses, trans, up, sign)
         out[:, :, up] += (sign * (low - (sign * out[:, :, up]).min(axis=1)))[:, None]
     return out
 
@@ -110,13 +110,13 @@ def betas_over_time(betas: np.ndarray | Mapping[float, np.ndarray], times: np.nd
 
 def world_up(motion: Motion, subject: Subject) -> tuple[int, float]:
     """The axis of the world that is up in a motion, and which way: where the body's own up points on average."""
-    body_up = np.eye(3)[upright(subject.template)[0]]
+    body_up = np.eye(3)[guess_upright(subject.template)[0]]
     mean = (rotations.exp(motion.poses[:, 0]) @ body_up).mean(axis=0)
     axis = int(np.abs(mean).argmax())
     return axis, float(np.sign(mean[axis]) or 1.0)
 
 
-def lowest(subject: Subject, poses: np.ndarray, trans: np.ndarray, up: int, sign: float) -> np.ndarray:
+def lowest_heights(subject: Subject, poses: np.ndarray, trans: np.ndarray, up: int, sign: float) -> np.ndarray:
     """(T,) metres: the height of the lowest point of every frame."""
     return np.concatenate([
         (sign * subject.vertices(poses[i:i + AT_ONCE], trans[i:i + AT_ONCE])[:, :, up]).min(axis=1)
@@ -125,6 +125,6 @@ def lowest(subject: Subject, poses: np.ndarray, trans: np.ndarray, up: int, sign
 
 def _stands(subject: Subject) -> float:
     """How high the root's centroid stands above the lowest point at rest, metres."""
-    up = upright(subject.template)[0]
+    up = guess_upright(subject.template)[0]
     rest = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
     return float(subject.origin[up] - rest[:, up].min())

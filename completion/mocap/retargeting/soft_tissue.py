@@ -15,7 +15,7 @@ from scanprep.geometry.farthest_points import spread_indices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import harmonic
 from scanprep.pictures.colors import color_bar, heat
-from scanprep.pictures.shading import side_by_side
+from scanprep.pictures.shading import contact_sheet
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion_pictures import bodies_in_a_row, seconds
@@ -129,10 +129,10 @@ def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, m
     who, what = model.subject(soft.motion.betas), character.subject(moved.motion.betas)
     rows = [bodies_in_a_row(who, soft.motion.poses[frames], person, None, height),
             bodies_in_a_row(what, poses, changed, None, height), bodies_in_a_row(what, poses, changed, colors, height)]
-    sheet = side_by_side([image for row in rows for image in row],
-                         [""] * 2 * len(frames) + seconds(soft.motion, frames), columns=len(frames))
+    sheet = contact_sheet([image for row in rows for image in row],
+                          [""] * 2 * len(frames) + seconds(soft.motion, frames), columns=len(frames))
     bar = color_bar(0.0, FULL, "deformation of the skin", scale=100.0, unit="%")
-    return side_by_side([sheet, bar], columns=1)
+    return contact_sheet([sheet, bar], columns=1)
 
 
 def write_character(path: Path, character: BodyModel, soft: SoftTissue) -> tuple[np.ndarray, list[Metric]]:

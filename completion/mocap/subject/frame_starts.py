@@ -11,7 +11,7 @@ from model.linear import Subject
 from scanprep.geometry import rotations
 
 from ..marker_sets.layout import MarkerLayout
-from ..pose.initialise import search
+from ..pose.initialise import search_pose
 from ..pose.marked_body import AnimateConfig, MarkedBody
 
 MEAN_PERSON = AnimateConfig(marker_sd=0.03)     # metres: the mean person carries the markers only roughly
@@ -27,10 +27,10 @@ def start_frames(body: MarkedBody, targets: np.ndarray, tell: Callable[[int], No
     found: list[np.ndarray] = []
     order = np.argsort(np.isnan(targets[..., 0]).sum(axis=1), kind="stable")
     for i in order:
-        x = _from_found(body, found, targets[i]) if found else search(body, targets[i], MEAN_PERSON)
+        x = _from_found(body, found, targets[i]) if found else search_pose(body, targets[i], MEAN_PERSON)
         # metres, median distance of a frame's markers above which it is searched anew
         if found and np.nanmedian(np.linalg.norm(body.positions(x) - targets[i], axis=1)) > 0.1:
-            x = search(body, targets[i], MEAN_PERSON)
+            x = search_pose(body, targets[i], MEAN_PERSON)
         found.append(x)
         tell(len(found))
     return np.array(found)[np.argsort(order)]

@@ -149,7 +149,7 @@ def distance_reach(layout: MarkerLayout, wand: float) -> tuple[np.ndarray, np.nd
             np.where(free, distances + wand, distances))
 
 
-def data_term(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
+def marker_term(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
     """Simulated markers against observed ones (..., L, 3); what was not seen (NaN) counts nothing. [MoSh] Eq. 17"""
     return energy.point_to_point(points, targets, CENTIMETRES**2 * weights)
 
@@ -188,7 +188,7 @@ def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class LatentState:
     """Where the solution stands."""
 
     x: np.ndarray                        # (B, 3J + 3) pose and place in every frame
@@ -218,7 +218,7 @@ class State:
         """(B, 3J + 3 + K + 3L) all unknowns, those that frames share in every row."""
         return np.concatenate([self.x, np.tile(self.z, (len(self.x), 1))], axis=1)
 
-    def with_unknowns(self, rows: np.ndarray) -> State:
+    def with_unknowns(self, rows: np.ndarray) -> LatentState:
         """The state with other unknowns."""
         n, K = self.x.shape[1], len(self.betas)
         return replace(self, x=rows[:, :n], betas=rows[0, n:n + K], coefficients=rows[0, n + K:].reshape(-1, 3))
@@ -246,12 +246,12 @@ class LatentFit:
         """Poses (B, J, 3) and places (B, 3) of unknowns (B, 3J + 3)."""
         return x[:, :self.n_angles].reshape(len(x), -1, 3), x[:, self.n_angles:]
 
-    def start(self, x: np.ndarray) -> State:
+    def start(self, x: np.ndarray) -> LatentState:
         """The mean person with the markers in their usual places, at poses (B, 3J + 3) that were found for it."""
         betas = np.zeros(self.n_betas)
         return self._attach(x, betas, self.usual_places(self.layout, betas), self.layout, self.reach, False)
 
-    def reattach(self, state: State, look: bool, last: bool) -> State:
+    def reattach(self, state: LatentState, look: bool, last: bool) -> LatentState:
         """The same places on the triangles that are nearest now; to `look` finds loose markers along their limbs.
 
         The `last` time the distances that are near one that the marker set names become that one.
@@ -265,7 +265,7 @@ class LatentFit:
         state = self._attach(state.x, state.betas, places, layout, (state.least, state.greatest), looked)
         return self._measure_distances(state, last)
 
-    def _measure_distances(self, state: State, last: bool) -> State:
+    def _measure_distances(self, state: LatentState, last: bool) -> LatentState:
         """The state with the distances of its markers from the skin as they are now, where they are unknown."""
         free = state.least < state.greatest
         if not free.any():
@@ -285,13 +285,13 @@ class LatentFit:
                        least=np.where(free, state.least, distances), greatest=np.where(free, state.greatest, distances))
 
     def _attach(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray, layout: MarkerLayout,
-                reach: tuple[np.ndarray, np.ndarray], looked: bool) -> State:
+                reach: tuple[np.ndarray, np.ndarray], looked: bool) -> LatentState:
         """The state with markers at points (L, 3) of the latent coordinate system, each on its nearest triangle."""
         vertices = self.latent.at(betas)
         markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
         corners = self.latent.combine(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
-        return State(x, betas, markers.coefficients(vertices, points), markers, self._supports(markers),
-                     self.latent.combine(markers.ids, markers.weights), corners, layout, *reach, looked)
+        return LatentState(x, betas, markers.coefficients(vertices, points), markers, self._supports(markers),
+                           self.latent.combine(markers.ids, markers.weights), corners, layout, *reach, looked)
 
     def _supports(self, markers: LatentMarkers) -> ShapedPoints:
         """Points of the skin with free shape, each made once: stitching them is what hanging markers anew costs."""
@@ -313,7 +313,7 @@ class LatentFit:
     def _usual(self, layout: MarkerLayout) -> LatentPoints:
         return self.latent.combine(*supports(self.model.template, layout))
 
-    def simulate(self, state: State, x: np.ndarray, z: np.ndarray) -> MovingPoints:
+    def simulate(self, state: LatentState, x: np.ndarray, z: np.ndarray) -> MovingPoints:
         """The markers in every frame for x (B, n) and z (K + 3L,), derivatives by both. [MoSh] Eq. 16"""
         K, (pose, trans) = self.n_betas, self.split(x)
         positions, d_pose = state.points.operator(z[:K]).jacobian(pose, trans)
@@ -321,11 +321,11 @@ class LatentFit:
         found, frame = simulate_markers(state.markers.kind, moving, z[K:].reshape(-1, 3))
         return MovingPoints(found.positions, np.concatenate([found.jacobian, each_own(frame)], axis=-1))
 
-    def residuals(self, state: State) -> np.ndarray:
+    def residuals(self, state: LatentState) -> np.ndarray:
         """(B, L) distances of simulated from observed markers, metres; NaN where one was not seen."""
         return np.linalg.norm(self.simulate(state, state.x, state.z).positions - self.targets, axis=2)
 
-    def weights(self, state: State) -> np.ndarray:
+    def weights(self, state: LatentState) -> np.ndarray:
         """(B, L) weights of the data, per square centimetre; outliers have less, as loose markers not yet found."""
         off = self.residuals(state)
         usual = np.nanmedian(off, axis=1, keepdims=True)
@@ -333,7 +333,7 @@ class LatentFit:
         # how much farther off a loose marker may be before it was looked for
         return self.config.data * share / np.where(self.loose & (not state.looked), 5.0, 1.0)**2
 
-    def solve(self, state: State, factor: float, last: bool) -> tuple[np.ndarray, bool, int]:
+    def solve(self, state: LatentState, factor: float, last: bool) -> tuple[np.ndarray, bool, int]:
         """One stage of [MoSh] Eq. 23, everything together: unknowns as `State.rows`, whether it settled, and steps."""
         weights, usual, n = self.weights(state), self._usual(state.layout), state.x.shape[1]
 
@@ -348,14 +348,15 @@ class LatentFit:
         end = levenberg_marquardt(equations, state.rows, 24 if last else 8, 1e-4, angles=self.n_angles)
         return end.x, bool(end.converged[0]), end.iterations
 
-    def of_frames(self, state: State, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float
+    def of_frames(self, state: LatentState, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float
                   ) -> dict[str, Residual]:
         """The terms of the frames, derivatives by (x, z)."""
         whole = np.concatenate([x, np.tile(z, (len(x), 1))], axis=1)
-        return {"data": data_term(self.simulate(state, x, z), self.targets, weights),
-                "pose": energy.pose_prior(whole, self.prior, factor * self.config.pose)}            # [MoSh] Eq. 21
+        return {"data": marker_term(self.simulate(state, x, z), self.targets, weights),
+                "pose": energy.pose_prior_term(whole, self.prior, factor * self.config.pose)}            # [MoSh] Eq. 21
 
-    def shared_terms(self, state: State, usual: LatentPoints, z: np.ndarray, factor: float) -> dict[str, Residual]:
+    def shared_terms(self, state: LatentState, usual: LatentPoints, z: np.ndarray, factor: float) -> dict[str,
+                                                                                                          Residual]:
         """The terms of what frames share."""
         c, markers = self.config, latent_places(state.markers.kind, state.supports, z)
         distances = np.asarray(state.layout.distances)
@@ -364,13 +365,13 @@ class LatentFit:
                                       factor * self.place_weight),
                 "shape": shape_term(z, self.n_betas, factor * c.shape)}
 
-    def energies(self, state: State) -> dict[str, float]:
+    def energies(self, state: LatentState) -> dict[str, float]:
         """What each term is, weights included."""
         both = self.of_frames(state, state.x, state.z, self.weights(state), 1.0) | self.shared_terms(
             state, self._usual(state.layout), state.z, 1.0)
         return {name: float(np.sum(term.energy)) for name, term in both.items()}
 
-    def export_layout(self, state: State) -> MarkerLayout:
+    def export_layout(self, state: LatentState) -> MarkerLayout:
         """The layout with every marker on the triangle it hangs on at its own distance, exact in the latent pose."""
         vertices, points, hung = self.latent.at(state.betas), state.places, state.markers
         if hung.kind != "triangle":

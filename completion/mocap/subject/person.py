@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.batch.room import Step, once
+from scanprep.batch.room import Step, run_uncached
 from scanprep.console import Metric
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points, spread_indices
@@ -103,7 +103,7 @@ def judge_moves(moves: Mapping[str, float], count: int) -> Judgement:
 
 @one_thread()
 def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
-                config: PersonConfig | None = None, progress: Progress | None = None, step: Step = once
+                config: PersonConfig | None = None, progress: Progress | None = None, step: Step = run_uncached
                 ) -> PersonFit:
     """The betas of a person and the places of the markers on the skin, from some frames of one or more sequences.
 
@@ -121,7 +121,7 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     progress : callable, optional
         Called with (done, total).
     step : callable, optional
-        Keeps what leads to the person, as `Room.step` does.
+        Keeps what leads to the person, as `TaskContext.step` does.
 
     Raises
     ------

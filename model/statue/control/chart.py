@@ -122,7 +122,7 @@ class Chart:
         face = np.repeat(np.arange(len(boxes)), boxes)
         within = np.arange(len(face)) - np.repeat(np.cumsum(boxes) - boxes, boxes)
         at = low[face] + np.stack(np.divmod(within, np.maximum(count[face, 1], 1)), axis=1)
-        bary = barycentric(at, *corners[face].swapaxes(0, 1))
+        bary = planar_barycentric(at, *corners[face].swapaxes(0, 1))
         inside = (bary >= -1e-12).all(axis=1)
         pixel = (size - 1 - at[inside, 1]) * size + at[inside, 0]
         pixel, first = np.unique(pixel, return_index=True)             # a centre on an edge lies in two triangles
@@ -235,7 +235,7 @@ def _twice_area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
-def barycentric(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+def planar_barycentric(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """(n, 3) where points lie in triangles of the plane, negative outside."""
     parts = np.stack([_twice_area(points, b, c), _twice_area(points, c, a), _twice_area(points, a, b)], axis=1)
     return parts / _twice_area(a, b, c)[:, None]

@@ -124,7 +124,7 @@ def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: 
         if "TEXCOORD_0" in attributes:       # glTF counts from the upper left
             uv.append(glb.accessor(tree, binary, attributes["TEXCOORD_0"], "VEC2").astype(np.float64) * [1, -1]
                       + [0, 1])
-        count, own = len(points[-1]), glb.triangles_of(tree, binary, primitive, len(points[-1]))
+        count, own = len(points[-1]), glb.primitive_triangles(tree, binary, primitive, len(points[-1]))
         if len(own) and (own.min() < 0 or own.max() >= count):
             raise ValueError(f"a triangle refers to vertex {own.max()}, expected 0..{count - 1}")
         weights.append(glb.weights_of(tree, binary, primitive, joints))

@@ -47,8 +47,8 @@ class DisplacementConfig(Settings):
     vectors: bool = False
 
 
-def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None,
-         progress: Progress | None = None) -> DisplacementMap:
+def bake_displacement(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None,
+                      progress: Progress | None = None) -> DisplacementMap:
     """The displacement map of a scan over a control model that has been fitted to it.
 
     ValueError for a scan without triangles, or a chart that covers no pixel.

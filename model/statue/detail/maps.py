@@ -123,7 +123,7 @@ def _decode_image(path: Path) -> tuple[np.ndarray, int]:
 
     data = read_bytes(path, "an image")
     if data[:8] == png16.SIGNATURE and png16.depth(data) in ((16, 2), (16, 3), (16, 4)):
-        return png16.decode(data), 16
+        return png16.decode_png16(data), 16
     with Image.open(io.BytesIO(data)) as image:
         check_pixels(image.size)
         if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):

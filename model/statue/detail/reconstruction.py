@@ -13,7 +13,7 @@ from scanprep.pictures.textures import bilinear
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap, Statue
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
-from .subdivision import Displaced, Subdivision, chart_places, subdivide, subdivide_adaptive
+from .subdivision import Displaced, Subdivision, chart_places, subdivide_adaptive, subdivide_uniform
 
 
 class Reconstruction:
@@ -117,7 +117,7 @@ def measure_levels(statue: Statue, scan: Mesh, count: int = 4) -> tuple[list[Lev
     """
     levels = []
     for number in range(count):
-        fine = subdivide(statue.control.mesh, statue.control.chart, number)
+        fine = subdivide_uniform(statue.control.mesh, statue.control.chart, number)
         levels.append(_level(f"level {number}", statue, fine, scan))
     return levels, fine
 
@@ -132,7 +132,7 @@ def adaptive_level(statue: Statue, scan: Mesh, tolerance: float = 0.0005, level:
 def _level(name: str, statue: Statue, fine: Subdivision, scan: Mesh) -> Level:
     mesh = Reconstruction(statue.control, statue.map, fine).mesh()
     shown = (coverage_at(statue.control, statue.map, fine.parent, fine.bary)[fine.faces] != HOLE).all(axis=1)
-    error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError.of(np.zeros(0))
+    error = reconstruction_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError.of(np.zeros(0))
     return Level(name, mesh, error.mean, error.rms, shown)
 
 
@@ -151,7 +151,7 @@ class SurfaceError:
         return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))))
 
 
-def surface_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
+def reconstruction_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
     """Distance from a reconstructed surface to the scan, one way, at so many places spread evenly. [Statues] Eq. 22, 23
     """
     points = reconstructed.sample(count, np.random.default_rng(14))[0]

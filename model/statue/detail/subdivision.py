@@ -64,7 +64,7 @@ def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarra
     return np.einsum("nc,ncd->nd", bary, chart.uv[chart.faces[faces]])
 
 
-def subdivide(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
+def subdivide_uniform(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
     """Every triangle in four, `level` times over."""
     return _subdivide(mesh, chart, level, lambda now: np.ones(now.vertex.shape, dtype=bool))
 

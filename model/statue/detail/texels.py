@@ -10,10 +10,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Look, Texture, bilinear, pad_charts
 
-from ..control.chart import Chart, barycentric
+from ..control.chart import Chart, planar_barycentric
 from ..control.model import ControlModel, DisplacementMap
 from .normal_volume import interpolate
-from .subdivision import Subdivision, chart_places, subdivide
+from .subdivision import Subdivision, chart_places, subdivide_uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,8 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
     bary = np.clip(found.bary, 0, None)
     seam = np.flatnonzero(beyond >= 0)
     f, s, g, t = face[seam], side[seam], beyond[seam], back[face[seam], side[seam]]
-    at = np.einsum("nc,ncd->nd", barycentric(uv[seam], *chart.uv[chart.faces[f]].swapaxes(0, 1)), mesh.corners[f])
+    at = np.einsum("nc,ncd->nd", planar_barycentric(uv[seam], *chart.uv[chart.faces[f]].swapaxes(0, 1)),
+                   mesh.corners[f])
     a, b = mesh.vertices[mesh.faces[f, s]], mesh.vertices[mesh.faces[f, (s + 1) % 3]]
     length = np.maximum(np.linalg.norm(b - a, axis=1), 1e-30)
     along = np.einsum("nd,nd->n", at - a, b - a) / length**2
@@ -113,7 +114,7 @@ class Lattice:
     """
 
     def __init__(self, control: ControlModel, level: int = 3) -> None:
-        self.control, self.subdivision = control, subdivide(control.mesh, control.chart, level)
+        self.control, self.subdivision = control, subdivide_uniform(control.mesh, control.chart, level)
         self.fine = self.subdivision.mesh(control.mesh)
         self._surface = Surface(self.fine)
 

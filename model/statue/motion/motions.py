@@ -30,7 +30,7 @@ from ...motion.same import copy_motion
 from ...rig import check_motion, joint_places
 from ..control.model import ControlModel, Statue
 from ..detail.reconstruction import Reconstruction
-from ..detail.subdivision import subdivide
+from ..detail.subdivision import subdivide_uniform
 
 
 def read_statue_motion(statue: Statue, path: Path, rate: float | None = None) -> Retargeted:
@@ -79,7 +79,7 @@ def _own(control: ControlModel, path: str | Path, stored: StoredMotion) -> Retar
                           dict(zip(names, names, strict=True)))
 
 
-def write_motion(path: str | Path, control: ControlModel, motion: Retargeted) -> None:
+def write_body_motion(path: str | Path, control: ControlModel, motion: Retargeted) -> None:
     """Write a motion as `own_motion` reads it, with the array names that body-model files use."""
     arrays = {"poses": motion.poses.reshape(len(motion.poses), -1),
               "trans": motion.trans + middle_drift(control, motion.poses), "betas": np.zeros(0),
@@ -112,9 +112,9 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
 @lru_cache(maxsize=1)
 def _average_skeleton() -> Skeleton:
     """That of the average synthetic person, whose surface takes a second to make."""
-    from scanprep.synthetic.people import Person
+    from scanprep.synthetic.people import SyntheticPerson
 
-    return Person().skeleton
+    return SyntheticPerson().skeleton
 
 
 def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> Retargeted:
@@ -130,7 +130,7 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: MovingSkeleton) -> 
     return same or retarget_pair(Pairing(control.skeleton, control.rig.vertices, bvh, pose), here=True)
 
 
-class Follower:
+class BoundControl:
     """A control mesh bound to the surface of a learned model's person, in the pose and place of the scan.
 
     Each control vertex keeps its offset from the point of the surface that it is bound to, in axes that turn with the
@@ -188,11 +188,11 @@ def _bound(mesh: Mesh, body: Mesh) -> csr_array:
 
 
 def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None = None,
-                progress: Callable[[int, int], None] | None = None) -> Follower:
+                progress: Callable[[int, int], None] | None = None) -> BoundControl:
     """The control mesh bound to a learned model, whose template, if not `registered`, is registered first."""
     control, pairs, hints = statue.control, None, None
     if registered is None:
-        surface = Reconstruction(control, statue.map, subdivide(control.mesh, control.chart, 2)).mesh()
+        surface = Reconstruction(control, statue.map, subdivide_uniform(control.mesh, control.chart, 2)).mesh()
         places = {name: control.mesh.vertices[vertex] for name, vertex in control.landmarks.items()}
         try:
             pairs = match_landmarks(model.info.get("landmarks") or {}, places, minimum=8)[1:]
@@ -207,4 +207,4 @@ def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None 
         registered = found.mesh.vertices
     fit = fit_shape(model, registered)
     subject = model.subject(fit.betas if model.n_betas else None)
-    return Follower(control.mesh, subject, fit.pose, fit.trans, registered)
+    return BoundControl(control.mesh, subject, fit.pose, fit.trans, registered)

@@ -12,7 +12,7 @@ from ..control.model import ControlModel
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class BoundPoints:
     """Points that hang on a control model, by the weights (n, J) of its parts, in the default pose (n, 3), metres."""
 
     weights: np.ndarray
@@ -108,8 +108,8 @@ class Articulated:
         return np.concatenate([np.zeros(len(self.axes)), np.ones(len(self.lengths)), np.zeros(3)])
 
     @cached_property
-    def vertices(self) -> Points:
-        return Points(self.control.weights, self.control.mesh.vertices)
+    def vertices(self) -> BoundPoints:
+        return BoundPoints(self.control.weights, self.control.mesh.vertices)
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Angles (A,), length factors (S,) and place (3,)."""
@@ -146,11 +146,11 @@ class Articulated:
         shapes = factors[segment, None, None] * self.along + self.size(x) * (np.eye(3) - self.along)
         return Frames(R, joints, shapes, axes, shifts)
 
-    def positions(self, frames: Frames, points: Points) -> np.ndarray:
+    def positions(self, frames: Frames, points: BoundPoints) -> np.ndarray:
         """Where points are (n, 3), metres. [Statues] Eq. 2"""
         return np.einsum("nj,njd->nd", points.weights, self._by_part(frames, points))
 
-    def derivatives(self, frames: Frames, points: Points) -> np.ndarray:
+    def derivatives(self, frames: Frames, points: BoundPoints) -> np.ndarray:
         """(n, 3, P) of the positions by the parameters."""
         skeleton, w = self.control.skeleton, points.weights
         n, J = w.shape
@@ -165,7 +165,7 @@ class Articulated:
         by_length = by_length + along.transpose(0, 2, 1) @ self.is_of + across[..., None] * self.shares
         return np.concatenate([by_angle, by_length, np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
 
-    def _by_part(self, frames: Frames, points: Points) -> np.ndarray:
+    def _by_part(self, frames: Frames, points: BoundPoints) -> np.ndarray:
         """(n, J, 3) where each part alone would carry each point."""
         d = points.rest[:, None] - self.control.skeleton.joints
         return frames.joints + _each(frames.R @ frames.shapes, d)

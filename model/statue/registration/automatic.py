@@ -18,7 +18,7 @@ from scanprep.words import number_of
 
 from ..control.model import ControlModel
 from .features import FeatureFit, fit_features
-from .person_search import find_person
+from .person_search import find_stand
 
 SHOWN = 0.3                      # share of the vertices around a joint or landmark, or of a limb, that must have data
 OWN = 0.02                       # metres from the rest of the body: points that are nearer say nothing of a limb
@@ -54,10 +54,10 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     if len(scan.vertices) < 100:
         raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
     scan = sanitise(scan)
-    unit = likely_unit(scan.vertices)
+    unit = guess_person_unit(scan.vertices)
     metres = UNITS[unit]
     data = scan if len(scan.vertices) < 40_000 else scan.vertices[thin(scan.vertices, 0.007 / metres)]
-    stands = find_person(control, data, metres)
+    stands = find_stand(control, data, metres)
     best = stands[0]
     margin = stands[1].off / best.off
     problem = nobody_problem(best.off, margin, f"{unit}, {metres * _length(scan.vertices):.2f} m long")
@@ -95,7 +95,7 @@ def why_uncertain(off: float, margin: float, missed: float) -> str | None:
     return "; ".join(reasons) + ": look at it, or click" if reasons else None
 
 
-def likely_unit(points: np.ndarray) -> str:
+def guess_person_unit(points: np.ndarray) -> str:
     """The unit in which points (n, 3) span most nearly as much as a person."""
     longest = max(_length(points), 1e-12)
     return min(UNITS, key=lambda unit: abs(np.log(longest * UNITS[unit] / 1.7)))                # metres

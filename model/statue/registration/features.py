@@ -11,7 +11,7 @@ from scanprep.alignment.icp import align_landmarks
 from scanprep.geometry import rotations
 
 from ..control.model import ControlModel
-from .articulated import Articulated, Points
+from .articulated import Articulated, BoundPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
 
     def energy(z: np.ndarray) -> tuple[float, np.ndarray]:
         x = unit * z
-        value, slope = misfit(model, x, features, goal)
+        value, slope = feature_misfit(model, x, features, goal)
         off = (x - model.rest)[:-3]
         off[:3] = 0                                             # the way the body stands is nobody's default
         # one radian, or a length twice the default one, is worth a misfit of 1 mm: what the features leave open
@@ -74,7 +74,8 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
                       _rms(apart[len(joints):]), bool(found.success))
 
 
-def misfit(model: Articulated, x: np.ndarray, features: Points, goal: np.ndarray) -> tuple[float, np.ndarray]:
+def feature_misfit(model: Articulated, x: np.ndarray, features: BoundPoints, goal: np.ndarray) -> tuple[float,
+                                                                                                        np.ndarray]:
     """Sum of squares between features and where they are wanted (n, 3), and its gradient (P,). [Statues] Eq. 4"""
     frames = model.frames(x)
     off = model.positions(frames, features) - goal
@@ -105,7 +106,7 @@ def head_share(control: ControlModel) -> np.ndarray:
 
 
 def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
-              ) -> tuple[Points, np.ndarray]:
+              ) -> tuple[BoundPoints, np.ndarray]:
     """The features on the control model and where they are wanted (n, 3): joints first."""
     names = control.skeleton.names
     for what, given, known in (("joints", joints, names), ("points", points, control.landmarks)):
@@ -119,13 +120,13 @@ def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: M
         if np.shape(place) != (3,) or not np.isfinite(place).all():
             raise ValueError(f"{name}: expected three finite numbers, got {place!r}")
     goal = np.array([*joints.values(), *points.values()], dtype=np.float64).reshape(-1, 3)
-    return Points(np.concatenate([np.eye(len(names))[parts], control.weights[vertices]]),
-                  np.concatenate([control.skeleton.joints[parts], control.mesh.vertices[vertices]])), goal
+    return BoundPoints(np.concatenate([np.eye(len(names))[parts], control.weights[vertices]]),
+                       np.concatenate([control.skeleton.joints[parts], control.mesh.vertices[vertices]])), goal
 
 
-def _place(model: Articulated, features: Points, joints: Mapping[str, np.ndarray], goal: np.ndarray) -> np.ndarray:
+def _place(model: Articulated, features: BoundPoints, joints: Mapping[str, np.ndarray], goal: np.ndarray) -> np.ndarray:
     """The similarity (4, 4) of the trunk, from the bases of the limbs where they suffice, else from all features."""
-    bases = [model.control.skeleton.names[base] for base, _, _ in limbs(model)]
+    bases = [model.control.skeleton.names[base] for base, _, _ in limb_joints(model)]
     trunk = [k for k, name in enumerate(joints) if name in bases]
     for rows in (trunk, list(range(len(goal)))):
         if len(rows) > 2 and not _on_a_line(goal[rows]) and not _on_a_line(features.rest[rows]):
@@ -142,7 +143,7 @@ def _rms(distances: np.ndarray) -> float:
     return float(np.sqrt(np.mean(distances**2))) if len(distances) else np.nan
 
 
-def limbs(model: Articulated) -> list[tuple[int, int, int | None]]:
+def limb_joints(model: Articulated) -> list[tuple[int, int, int | None]]:
     """Base, middle and end joint of every limb: a joint of three axes, on it one of one axis, and what it carries."""
     freedom = np.bincount(model.joint_of, minlength=len(model.control.axes))
     parents = model.control.skeleton.parents
@@ -167,7 +168,7 @@ def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarr
                 np.linalg.norm(at[names[c]] - at[names[p]]) / max(np.linalg.norm(o[c] - o[p]), 1e-9))
     for s, values in ratios.items():
         factors[s] = np.mean(values)
-    for base, middle, end in limbs(model):
+    for base, middle, end in limb_joints(model):
         if names[base] in at and names[middle] in at:
             goal = [at[names[middle]] - at[names[base]]]
             if end is not None and names[end] in at:

@@ -60,7 +60,7 @@ def control_body(control: ControlModel) -> SkinningModel:
         pose_examples=np.zeros((0, J, 3)) if known is None else known, joint_components=joints)
 
 
-def find_person(control: ControlModel, scan: Mesh | np.ndarray, metres: float) -> list[Stand]:
+def find_stand(control: ControlModel, scan: Mesh | np.ndarray, metres: float) -> list[Stand]:
     """The best stand in a scan whose unit is so many `metres`, and the best that faces another way."""
     body = as_body(control_body(control))
     fit = scan_fit(body, prepare_scan(scan, metres=metres), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), SETTINGS)
@@ -85,10 +85,10 @@ def facing_back(fit: ScanFit, x: np.ndarray) -> np.ndarray:
 
 def _stand(fit: ScanFit, x: np.ndarray) -> Stand:
     mesh = fit.mesh(x)
-    return Stand(mesh, *misfit(mesh, fit.thin.points, fit.thin.normals))
+    return Stand(mesh, *stand_misfit(mesh, fit.thin.points, fit.thin.normals))
 
 
-def misfit(body: Mesh, points: np.ndarray, normals: np.ndarray) -> tuple[float, float]:
+def stand_misfit(body: Mesh, points: np.ndarray, normals: np.ndarray) -> tuple[float, float]:
     """How far apart a body and the points (n, 3) of a scan are: `off` and `misfit` of a `Stand`."""
     there = Surface(body).closest(points)
     facing = np.einsum("nd,nd->n", body.face_normals[there.faces], normals)

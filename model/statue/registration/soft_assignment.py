@@ -35,7 +35,7 @@ class SoftAssignment:
         return np.diff(self.matches.indptr) > 0
 
 
-class ScanPoints:
+class DirectedPoints:
     """Points of a scan with normals, searched for the nearest ones that face the same way."""
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, border: np.ndarray) -> None:
@@ -73,8 +73,8 @@ class ScanPoints:
                 np.where(facing, np.take_along_axis(apart, order, axis=1) ** 2, np.inf))
 
 
-def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, slack: Slack = "rest",
-           tolerance: float = 0.01, most: int = 5) -> SoftAssignment:
+def assign_softly(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, slack: Slack = "rest",
+                  tolerance: float = 0.01, most: int = 5) -> SoftAssignment:
     """Balanced soft assignment, at one temperature (m²), of vertices to the points (I, K) that each knows, -1 for none,
     by their squared distances; done when no share of a point changes by more than `tolerance` of itself.
     [Statues] Eq. 14, 17

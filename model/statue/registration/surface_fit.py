@@ -19,11 +19,11 @@ from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface, check_points
 from scanprep.geometry.target import Target, target_of
 from scanprep.ranges import Count, Positive, Range, Settings
-from scanprep.registration.folds import inverted_triangles, unfold
+from scanprep.registration.folds import find_inverted_triangles, unfold
 from scanprep.threads import one_thread
 
 from .local_shape import local_shape
-from .soft_assignment import ScanPoints, Slack, assign
+from .soft_assignment import DirectedPoints, Slack, assign_softly
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     if config.polish:
         x = fit.onto_the_surface(x)
     seen, _ = fit.find_data(x)
-    apart, inverted = fit.surface.closest(x).distances[seen], int(inverted_triangles(rest, x).sum())
+    apart, inverted = fit.surface.closest(x).distances[seen], int(find_inverted_triangles(rest, x).sum())
     return SurfaceFit(x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
                       float(apart.max(initial=0.0)), inverted, temperatures, bool(converged and seen.any()))
 
@@ -145,7 +145,7 @@ class _Fit:
         target = scan_target(scan)
         self.rest, self.target, self.surface, self.config = rest, target, Surface(scan), config
         self.shape = local_shape(rest)
-        self.points = ScanPoints(target.points, target.normals, target.border)
+        self.points = DirectedPoints(target.points, target.normals, target.border)
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
         # ten points of the scan for each vertex draw the mesh
         self.sample = target.thin(max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4))
@@ -185,7 +185,7 @@ class _Fit:
         """
         near, squared = self.points.nearest(x, self.normals(x), self.config.neighbours)
         near[~self.beside_data(x, near[:, 0])] = -1
-        found = assign(near, squared, len(self.points.points), T, self.config.slack)
+        found = assign_softly(near, squared, len(self.points.points), T, self.config.slack)
         n = self.points.normals[near[:, 0]]
         edge = (self.points.border[near] & (near >= 0)).any(axis=1)
         A = np.where(edge[:, None, None], np.einsum("ni,nj->nij", n, n), np.eye(3))
@@ -250,10 +250,10 @@ class _Fit:
         free, _ = self.find_data(x)
         found = self.surface.closest(x)
         free &= np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) > 0
-        already = inverted_triangles(self.rest, x)
+        already = find_inverted_triangles(self.rest, x)
         for _ in range(10):
             y = np.where(free[:, None], found.points, x)
-            inverted = inverted_triangles(self.rest, y) & ~already
+            inverted = find_inverted_triangles(self.rest, y) & ~already
             if not inverted.any():
                 break
             free[self.rest.faces[inverted]] = False
