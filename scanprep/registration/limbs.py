@@ -89,7 +89,8 @@ class LimbMeasures:
             if part in LIMBS and abs(self.growth[part]) > SCALE:
                 share, way = 100 * abs(np.expm1(self.growth[part])), "smaller" if self.growth[part] < 0 else "larger"
                 found.append(PlausibilityIssue(
-                    abs(float(self.growth[part])) / SCALE, f"the {name} is {share:.0f}% {way} than on the template", part))
+                    abs(float(self.growth[part])) / SCALE,
+                    f"the {name} is {share:.0f}% {way} than on the template", part))
         return tuple(sorted(found, key=lambda doubt: -doubt.excess))
 
 
