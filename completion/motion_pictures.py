@@ -20,7 +20,6 @@ from scanprep.pictures.shading import Dots, Moving, Solid, contact_sheet, render
 from .motion import Motion
 
 MARKER, LOST = (0.85, 0.25, 0.2), (0.78, 0.78, 0.78)
-LIGHT = 7000                         # triangles of a body in small pictures and in motion
 PLAYED, MOST_PLAYED = 30, 2000       # frames a second, and in all, that a page plays
 TURN = 35.0                          # degrees from the front of the body where the camera stands
 
@@ -64,9 +63,10 @@ class LightMesh:
     @staticmethod
     def of(template: Mesh) -> LightMesh:
         """At most `LIGHT` triangles; of a body that has no more its own."""
-        if len(template.faces) <= LIGHT:
+        light = 7000  # triangles of a body in small pictures and in motion
+        if len(template.faces) <= light:
             return LightMesh(np.arange(len(template.vertices)), template.faces)
-        small = decimate_set(template, None, LIGHT)
+        small = decimate_set(template, None, light)
         return LightMesh(small.vertex_map, small.template.faces)
 
     def mesh(self, vertices: np.ndarray) -> Mesh:

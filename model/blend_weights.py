@@ -11,7 +11,6 @@ from scanprep.geometry.sparse import Factored, factor
 from scanprep.skeleton.tree import Skeleton
 
 CARRIERS = 4                         # parts that one vertex follows: more is not what other programs read
-LEAST = 0.01                         # a weight below is dropped: it would cost a term and move nothing
 
 
 def skin_weights(template: Mesh, skeleton: Skeleton, width: float = 0.05) -> np.ndarray:
@@ -58,9 +57,10 @@ def face_weights(template: Mesh, skeleton: Skeleton, width: float) -> np.ndarray
     linked = np.eye(len(skeleton.parents), dtype=bool)
     child = np.arange(1, len(skeleton.parents))
     linked[child, skeleton.parents[child]] = linked[skeleton.parents[child], child] = True
-    spread[~linked[skeleton.part_of_face] | (spread < LEAST)] = 0
+    least = 0.01  # a weight below is dropped: it would cost a term and move nothing
+    spread[~linked[skeleton.part_of_face] | (spread < least)] = 0
     own = np.arange(len(spread)), skeleton.part_of_face
-    spread[own] = np.maximum(spread[own], LEAST)
+    spread[own] = np.maximum(spread[own], least)
     return spread / spread.sum(axis=1, keepdims=True)
 
 

@@ -40,15 +40,12 @@ PARTS = {"shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand", "hip": "t
          "foot": "toes"}
 KNUCKLES = {"cmc": 1, "mcp": 1, "thumb_mcp": 2, "pip": 2, "dip": 3, "ip": 3}
 
-STEP = 1e-4                          # of a control, to see what it does
-BONE = 0.1                           # of a control of bones, to learn what it does: about 7% of a length
 LONGER = 0.04                        # share of what a bone carries that a beta of it adds: statures spread by it
 BENT, POSES = 0.5, 32                # radians, standard deviation, and number of the poses of a joint to learn from
 LEFT_OUT, TESTS = 0.3, 60            # the same of all controls together, of the bodies that tell the error
 AT_ONCE = 8                          # bodies that the library makes together: 18,000 vertices with a matrix each
 ROUNDING = 1e-6                      # metres below which a change is none
 BONES, NOTHING = -2, -1              # what a control may lead in the place of a joint
-NEAR = 200                           # vertices that a joint is a combination of
 
 
 def import_any(path: str | Path, progress: Progress | None = None) -> SkinningModel:
@@ -136,7 +133,8 @@ def joint_rows(vertices: np.ndarray, joints: np.ndarray, shapes: np.ndarray, mov
     """
     out = np.zeros((len(joints), len(vertices)))
     for j, place in enumerate(joints):
-        near = np.argsort(np.linalg.norm(vertices - place, axis=1), kind="stable")[:NEAR]
+        # vertices that a joint is a combination of
+        near = np.argsort(np.linalg.norm(vertices - place, axis=1), kind="stable")[:200]
         start = affine_weights(vertices[near], place)
         free = null_space(np.vstack([np.ones(len(near)), vertices[near].T]))
         U = np.swapaxes(shapes[:, near], 1, 2).reshape(-1, len(near))
@@ -207,7 +205,8 @@ class Library:
         """
         C, x = self.rest.shape[1], self.vertices(self.rest)[0]
         bones, own = np.flatnonzero(self._leaders == BONES), np.arange(C, C + self._size("identity"))
-        units = np.eye(C + len(own))[np.r_[bones, own]] * np.r_[np.full(len(bones), BONE), np.ones(len(own))][:, None]
+        # of a control of bones, to learn what it does: about 7% of a length
+        units = np.eye(C + len(own))[np.r_[bones, own]] * np.r_[np.full(len(bones), 0.1), np.ones(len(own))][:, None]
         by_vertex, by_joint = zip(*[(self.vertices(*both), self.skeleton(*both)[1]) for both in (
             np.split(sign * units, [C], axis=1) for sign in (1, -1))], strict=True)
         shapes, moved = (by_vertex[0] - by_vertex[1]) / 2, (by_joint[0] - by_joint[1]) / 2
@@ -247,16 +246,17 @@ class Library:
         it turns none, but changes place or size of joints below the pelvis, else `NOTHING`.
         """
         parents, pelvis = np.array(self.theirs.parents), self._common[0]
-        G = self._evaluate(self.theirs.forward_skeleton, np.r_[self.rest, STEP * np.eye(self.rest.shape[1])], None)
+        step = 1e-4  # of a control, to see what it does
+        G = self._evaluate(self.theirs.forward_skeleton, np.r_[self.rest, step * np.eye(self.rest.shape[1])], None)
         R = turns(G)
         R = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)
-        turned = np.linalg.norm(rotations.log(np.swapaxes(R[0], -1, -2) @ R[1:]), axis=-1) / STEP           # (C, all)
+        turned = np.linalg.norm(rotations.log(np.swapaxes(R[0], -1, -2) @ R[1:]), axis=-1) / step           # (C, all)
         order = np.argsort([len(self._above(j)) for j in range(len(parents))], kind="stable")
         most = turned.max(axis=1)
         leader = order[(turned[:, order] > most[:, None] - 1e-3).argmax(axis=1)]
         G[..., :3, 3] -= G[:, pelvis, None, :3, 3]
         below = [j for j in range(len(parents)) if pelvis in self._above(j)]
-        changed = np.abs(G[1:, below] - G[0, below]).max(axis=(1, 2, 3)) / STEP
+        changed = np.abs(G[1:, below] - G[0, below]).max(axis=(1, 2, 3)) / step
         return np.where(most > 1e-3, leader, np.where(changed > 1e-3, BONES, NOTHING))
 
     @cached_property

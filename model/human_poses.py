@@ -19,7 +19,6 @@ Moments = tuple[np.ndarray, np.ndarray]         # mean (J, 3) and covariance (3J
 TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 WORTH = 8                            # training poses that what people do with their joints counts as
-DRAWN = 400                          # poses for its mean and covariance
 HELD = ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")   # parts that stay at rest
 
 
@@ -83,13 +82,14 @@ def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.nd
     The fewer poses were seen, the more is taken from all people, of whom no joint is quite like this body's: of eight
     poses one half, of eighty a tenth. Nothing changes for a body that is no person.
     """
-    people = human_poses(template, skeleton, DRAWN, np.random.default_rng(0))
+    drawn = 400  # poses for its mean and covariance
+    people = human_poses(template, skeleton, drawn, np.random.default_rng(0))
     if people is None:
         return mean, covariance
     # radians by which joints of this body may differ from those of all people
     loose = np.full(mean.size, 0.25)
     loose[:3] = 0                                                                 # the root is at rest
-    theirs = people.mean(axis=0), np.cov(people.reshape(DRAWN, -1).T) + np.diag(loose**2)
+    theirs = people.mean(axis=0), np.cov(people.reshape(drawn, -1).T) + np.diag(loose**2)
     return mix_moments((mean, covariance), theirs, count / (count + WORTH))
 
 

@@ -15,8 +15,6 @@ from .blend_weights import CARRIERS, skin_weights, strongest
 from .body import BodyModel
 from .linear import Subject
 
-SLIDER = 3.0                         # standard deviations that a morph target of a beta reaches at weight 1
-
 
 @dataclass(frozen=True, eq=False)
 class Correctives:
@@ -105,8 +103,9 @@ class Rig:
         Two for each beta, `beta 1 +3` and `beta 1 -3`: sliders from 0 to 1 reach so many standard deviations of
         either sign.
         """
-        names = [f"beta {k + 1} {sign}{SLIDER:g}" for k in range(len(self.shapes)) for sign in "+-"]
-        changes = SLIDER * np.stack([self.shapes, -self.shapes], axis=1)
+        slider = 3.0  # standard deviations that a morph target of a beta reaches at weight 1
+        names = [f"beta {k + 1} {sign}{slider:g}" for k in range(len(self.shapes)) for sign in "+-"]
+        changes = slider * np.stack([self.shapes, -self.shapes], axis=1)
         return names, changes.reshape(-1, *self.mesh.vertices.shape)
 
     def transform(self, R: np.ndarray, shift: np.ndarray | float = 0.0) -> Rig:

@@ -21,8 +21,6 @@ from .linear import Subject, combination_weights
 from .products import Products, Terms
 from .resolution.transfer import SurfaceCarrier
 
-SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SkinningModel(BodyModel):
@@ -297,9 +295,10 @@ _STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_co
 
 def invert_blended(B: np.ndarray) -> np.ndarray:
     """Inverses (N, 3, 3) of means of rotations, gently where they have collapsed."""
-    flat = np.linalg.det(B) < SOFTEST
+    softest = 0.2  # a mean of rotations that shrinks further is not undone
+    flat = np.linalg.det(B) < softest
     if flat.any():
         U, s, Vt = np.linalg.svd(B[flat])
         B = B.copy()
-        B[flat] = (U * np.maximum(s, SOFTEST)[:, None]) @ Vt
+        B[flat] = (U * np.maximum(s, softest)[:, None]) @ Vt
     return np.linalg.inv(B)

@@ -30,8 +30,6 @@ from .features import PoseFeatures
 from .linear import PointOperator, Subject
 from .products import Products, ShapedProducts, Terms
 
-SMALL = 1e-3                         # square radians below which a series is exact to 1e-12
-
 
 def rotation_matrices(twist: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians, with finite gradients at 0 and π.
@@ -51,7 +49,8 @@ def rotation_matrices(twist: Tensor) -> Tensor:
 
 def _sine_ratio(square: Tensor) -> Tensor:
     """sin θ / θ of θ²."""
-    small = square < SMALL
+    # square radians below which a series is exact to 1e-12
+    small = square < 1e-3
     angle = torch.where(small, torch.ones_like(square), square).sqrt()
     series = 1 - square / 6 * (1 - square / 20 * (1 - square / 42))
     return torch.where(small, series, angle.sin() / angle)

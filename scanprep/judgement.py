@@ -17,7 +17,6 @@ HAND = 0.06                 # of a body's size, the root of its area: a hand's w
 # ANSUR II, 6,068 soldiers: 1.41 to 1.99 m, 36 to 144 kg, 15 to 43 kg/m²; one litre of a person weighs about a kilogram.
 # Everybody is more varied than soldiers; beyond 1.40 to 2.10 m or 35 to 200 litres somebody should look.
 ADULTS, VOLUMES = (1.40, 2.10), (35.0, 200.0)          # metres, litres
-ANYBODY = (1.00, 2.30)                                 # metres: from a child of about four
 # litres per square metre of stature, of people and of anybody; 400 synthetic people have 14 to 31, a chair's body 8.6
 BUILD, ANY_BUILD = (13.0, 55.0), (9.0, 90.0)
 # Squared lengths of the betas of K components are chi-square distributed: one person of so many is beyond the first
@@ -159,7 +158,8 @@ def implausible_body(stature: float, volume: float | None = None, betas: np.ndar
     'the person is 2.61 m tall: the wrong unit or scale? (--unit)'
     """
     failed, check = [], []
-    if not ANYBODY[0] <= stature <= ANYBODY[1]:
+    anybody = (1.00, 2.30)  # metres: from a child of about four
+    if not anybody[0] <= stature <= anybody[1]:
         failed.append(f"the person is {stature:.2f} m tall: {cause or 'the wrong unit or scale? (--unit)'}")
     elif not ADULTS[0] <= stature <= ADULTS[1]:
         who = "a child" if stature < ADULTS[0] else "a giant"

@@ -49,7 +49,6 @@ from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion, save_completion
 from .truth import TruthMap, distance, surface_error
 
-LANDMARKS = 7                            # that are marked on the half view
 MARKER_NOISE = 0.001                     # metres
 
 
@@ -254,15 +253,16 @@ class Demo:
         """What one camera sees of the first held-out pose, a few landmarks on it, and the truth."""
         truth, scanner = self.held_out[0], replace(self.scanner, views=1, azimuth=-30.0)
 
+        landmarks = 7  # that are marked on the half view
         def make(folder: Path) -> None:
             rng = np.random.default_rng([self.config.seed, 8])
             seen = scan(truth.mesh, scanner, rng)
             marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
-            few = spread_indices(len(marks), LANDMARKS)
+            few = spread_indices(len(marks), landmarks)
             write_scan(folder / HALF.parent, HALF.stem, seen, truth,
                        {name: marks[name] for name in np.array(list(marks))[few]}, views=False)
 
-        self.space.step("half view", (self.config.seed, scanner, LANDMARKS), make)
+        self.space.step("half view", (self.config.seed, scanner, landmarks), make)
         half = self.folder / HALF
         return read_mesh(half), read_landmarks(half.with_suffix(".landmarks.json")), truth
 

@@ -27,8 +27,6 @@ from .chain import Demo
 from .truth import distance, mean_over_area, surface_error
 
 FAR = 0.01                 # metres at the end of the heat maps
-WORST = 6                  # scans in the table of registrations
-SMALL = 15_000             # triangles of one of many bodies
 
 
 def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Callable[[int, int], None],
@@ -67,7 +65,8 @@ def write_page(demo: Demo, metrics: list[Metric], judgement: Judgement, tell: Ca
 
 def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str, turn: float = 25.0) -> Pane:
     solid = shape if isinstance(shape, Solid) else Solid(shape)
-    return Pane([thin_solid(solid, SMALL)], look_around(demo.template, fits, (turn,))[0], label)
+    # triangles of one of many bodies
+    return Pane([thin_solid(solid, 15_000)], look_around(demo.template, fits, (turn,))[0], label)
 
 
 def _in_rows(page: Page, panes: Sequence[Pane], caption: str) -> None:
@@ -110,9 +109,10 @@ def _registration(demo: Demo, page: Page) -> None:
                         f"{means[name]:.2f} mm from the truth")]
     _in_rows(page, panes, "the worst: the scan, and the template on it")
     figures = {one.name: one for one in demo.prepared.figures}
+    worst = 6  # scans in the table of registrations
     page.table([(name, 1000 * figures[name].distance, means[name], 100 * figures[name].seen)
-                for name in order[:WORST]],
-               (f"the worst {min(WORST, len(order))} of {len(order)} scans", "to the scan (mm)", "to the truth (mm)",
+                for name in order[:worst]],
+               (f"the worst {min(worst, len(order))} of {len(order)} scans", "to the scan (mm)", "to the truth (mm)",
                 "with data (%)"))
 
 

@@ -12,9 +12,6 @@ from scanprep.viewer.surface_clicks import Clickable
 from .completion import Completion
 
 EXCHANGED = "left and right are exchanged"
-FIRST = 10                           # landmarks that are offered first: far from each other, all over the body
-WRONG = 0.1                          # metres off from where a body found without it has a landmark that is wrong
-HELPFUL = 0.06                       # metres that a part may be off, from which on a landmark there is asked for
 
 
 def pairs_of(places: Mapping[str, np.ndarray], marks: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -27,7 +24,8 @@ def far_apart_first(places: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     names = list(places)
     if not names:
         return {}
-    first = [names[i] for i in farthest_points(np.array([places[name] for name in names]), min(FIRST, len(names)))]
+    # landmarks that are offered first: far from each other, all over the body
+    first = [names[i] for i in farthest_points(np.array([places[name] for name in names]), min(10, len(names)))]
     return {name: places[name] for name in dict.fromkeys([*first, *names])}
 
 
@@ -53,7 +51,8 @@ def landmark_doubts(places: Mapping[str, np.ndarray], found: Mapping[str, np.nda
 def wrong_ones(places: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Landmarks that are far from where they were found, with how far, metres; the farthest first."""
     off = {name: float(np.linalg.norm(place - found[name])) for name, place in places.items()}
-    return {name: off[name] for name in sorted(off, key=lambda name: -off[name]) if off[name] > WRONG}
+    # metres off from where a body found without it has a landmark that is wrong
+    return {name: off[name] for name in sorted(off, key=lambda name: -off[name]) if off[name] > 0.1}
 
 
 def helpful(done: Completion, marks: Mapping[str, int], places: Mapping[str, np.ndarray]) -> list[str]:
@@ -62,4 +61,5 @@ def helpful(done: Completion, marks: Mapping[str, int], places: Mapping[str, np.
     if error is None:
         return []
     far = {name: float(error[vertex]) for name, vertex in marks.items() if name not in places}
-    return [name for name in sorted(far, key=lambda name: -far[name]) if far[name] > HELPFUL][:5]
+    # metres that a part may be off, from which on a landmark there is asked for
+    return [name for name in sorted(far, key=lambda name: -far[name]) if far[name] > 0.06][:5]

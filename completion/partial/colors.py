@@ -16,12 +16,6 @@ from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture
 from scanprep.ranges import Positive, Settings
 
-NEIGHBOURS = 3                       # points of a cloud that make the colour of a place
-RIM = 0.015                          # metres: towards its border a view counts less and less
-SQUARE = 2                           # power of the cosine at which a view looked
-MIN_COSINE = 0.5                     # between the normals of scan and body
-GREY = 0.6                           # what was not seen
-
 
 @dataclass(frozen=True)
 class ColorConfig(Settings):
@@ -70,12 +64,14 @@ class ColoredView:
                 colors = np.einsum("nc,ncd->nd", found.bary, self.colors[mesh.faces[found.faces]])
         else:
             assert self.colors is not None and self.normals is not None, "a view without colours was left out"
-            apart, near = self.tree.query(places, NEIGHBOURS)
+            # points of a cloud that make the colour of a place
+            apart, near = self.tree.query(places, 3)
             far, facing = apart[:, 0], self.normals[near[:, 0]]
             share = 1 / np.maximum(apart, 1e-6)
             colors = np.einsum("nk,nkd->nd", share / share.sum(axis=1, keepdims=True), self.colors[near])
         cosine = np.einsum("nd,nd->n", facing, normals)
-        weight = ((far < config.reach) & (cosine > MIN_COSINE)).astype(float)
+        # between the normals of scan and body
+        weight = ((far < config.reach) & (cosine > 0.5)).astype(float)
         return colors, weight * self._squarely(places, normals) * self._inside(places)
 
     def _squarely(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -83,10 +79,12 @@ class ColoredView:
             return np.ones(len(places))
         to = self.camera - places
         cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
-        return np.clip(cosine, 0.02, 1)**SQUARE
+        # power of the cosine at which a view looked
+        return np.clip(cosine, 0.02, 1)**2
 
     def _inside(self, places: np.ndarray) -> np.ndarray:
-        return np.ones(len(places)) if self.rim is None else np.clip(self.rim.query(places)[0] / RIM, 0.02, 1)
+        # metres: towards its border a view counts less and less
+        return np.ones(len(places)) if self.rim is None else np.clip(self.rim.query(places)[0] / 0.015, 0.02, 1)
 
 
 def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], config: ColorConfig | None = None,
@@ -121,7 +119,8 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
     near = body.vertex_adjacency
     closed = seen | (near @ seen.astype(float) > 0.5 * near.sum(axis=1))     # single gaps amid what was seen
     known = closed & (weight > 0)
-    out = np.where(known[:, None], colors, GREY)
+    # what was not seen
+    out = np.where(known[:, None], colors, 0.6)
     return np.clip(sparse.harmonic(near, out, known), 0, 1) if config.fill and known.any() else out
 
 

@@ -44,18 +44,10 @@ _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 # Of eleven right completions of synthetic people, seen from one side or all: the worst part is expected to be off by 5
 # to 14 mm, the worst joint 6 to 19 degrees from any known way to hold it, 0.988 to 0.997 of the scan has a body near.
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
-PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
-MONSTROUS = np.radians(75)           # from any known way to hold a joint; a chair has 58, sides exchanged 133
-PARTIAL = 0.25                       # share of the body with data; shins and feet 0.23, one view 0.26 to 0.46
-LEFT_OVER = 0.03                     # share of a scan without a body near; of long hair 0.05, of clothes 0.04 to 0.31
-# share of a scan explained below which a completion means nothing: of two people 0.58; landmarks of other places end at
-# 0.18 to 0.54, a horse at 0.08
-LOST = 0.5
 # the same where hardly half of the body has data; a cylinder ends at 0.60 and 0.37, a chair at 0.57 and 0.30, one view
 # of a dressed person with raised arms at 0.59 and 0.29 or 0.38
 CROWDED = 0.7
-COVERED = 0.5                        # share of the body with data; of one of two people it is 0.94, at 0.58 explained
 # of a body, by area, outside of a scan whose edges are borders at most so often: a man in shoes whose feet were taken
 # for ankles has 0.08; four right ones have 0, two of them with fists where the body has fingers
 OUTSIDE, NEARLY_CLOSED = 0.02, 0.01
@@ -203,9 +195,11 @@ def find_contortion(fit: ScanFit, x: np.ndarray, seen: float, marked: bool) -> s
     """
     names, away = fit.body.skeleton.names, fit.body.joints_from_known(fit.body.split(x)[0])
     worst = int(away.argmax())
-    if away[worst] <= MONSTROUS:
+    # from any known way to hold a joint; a chair has 58, sides exchanged 133
+    if away[worst] <= np.radians(75):
         return None
-    cause = (f"a part of a body only, {100 * seen:.0f}% of it has data" if seen < PARTIAL else
+    # share of the body with data; shins and feet 0.23, one view 0.26 to 0.46
+    cause = (f"a part of a body only, {100 * seen:.0f}% of it has data" if seen < 0.25 else
              "landmarks of other places, left and right exchanged" if marked else "a pose that needs landmarks")
     return (f"the {joint_in_words(names[worst])} is {np.degrees(away[worst]):.0f} degrees from any way that it is "
             f"known to be held: {cause}, or something else than a person?")
@@ -218,8 +212,9 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
     picture is a guess, and no reason to doubt what is within.
     """
     names, found, shown = fit.body.skeleton.names, [], ~fit.beyond(x)
+    # share of a part within the picture, below which it is beyond
     open_parts = [(float(np.sqrt((error[mine]**2).mean())), p) for p in range(len(names))
-                  if (mine := fit.part == p).any() and shown[mine].mean() >= PART_SHOWN]
+                  if (mine := fit.part == p).any() and shown[mine].mean() >= 0.5]
     for off, p in sorted(open_parts, reverse=True):
         if off > DOUBTFUL:
             share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
@@ -235,7 +230,8 @@ def completion_doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.n
 
 def find_unexplained(fit: ScanFit, explained: float) -> list[str]:
     """What of a scan no body is near, where that is a limb's worth; of a picture `find_stray` tells."""
-    if fit.cloud.person is not None or 1 - explained <= LEFT_OVER:
+    # share of a scan without a body near; of long hair 0.05, of clothes 0.04 to 0.31
+    if fit.cloud.person is not None or 1 - explained <= 0.03:
         return []
     cause = "a second person, or clutter?" if explained < CROWDED else "clutter, or a limb elsewhere"
     return [f"{100 * (1 - explained):.1f}% of the scan has no body near: {cause}"]
@@ -283,7 +279,11 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
     """
     off, most = done.landmark_rms / size(done.predicted), done.explained
     wrong = None if free_scale else unit_problem(extent(points), extent(done.predicted.vertices), "the scan is", 0.05)
-    least = CROWDED if done.seen.mean() < COVERED else LOST
+    # share of a scan explained below which a completion means nothing: of two people 0.58; landmarks of other places
+    # end at 0.18 to 0.54, a horse at 0.08
+    lost = 0.5
+    covered = 0.5  # share of the body with data; of one of two people it is 0.94, at 0.58 explained
+    least = CROWDED if done.seen.mean() < covered else lost
     if wrong is None and done.seen.any() and most >= least and not (off > HAND or (off > ASTRAY and most < ENOUGH)):
         return None
     marks = "" if np.isnan(done.landmark_rms) else f", the landmarks are {1000 * done.landmark_rms:.0f} mm off"

@@ -10,11 +10,8 @@ from scanprep.geometry.mesh import Mesh
 
 # Chosen so that the stated probabilities fit best (least Brier score at 5, 10, 20 and 40 mm) on completed half views
 # of tuning bodies: 14 poses of a known man and 7 men of unknown shape, none of which the models were learned from.
-INFLATED = 1.4                       # real errors against those that the fit believes in, as it is not quite linear
 BEYOND = 0.0075                      # metres: what the model cannot explain far from all data, and its share of the
 LEFT_OUT = 0.85                      # error of poses that were left out of learning, where that is known
-FADES = 0.014                        # metres along the surface from the data, within which errors set in
-NEAREST = 0.0005                     # metres: no scan is better
 
 
 def posterior_error(body: FixedBody, x: np.ndarray, precision: np.ndarray) -> np.ndarray:
@@ -52,9 +49,12 @@ def estimate_error(posterior: np.ndarray, away: np.ndarray, rms: float, left_out
     the model said of poses that it was not learned from, where that is known.
     """
     beyond = BEYOND if left_out is None else LEFT_OUT * left_out
-    sets_in = 1 - np.exp(-away / FADES)
-    near = max(NEAREST, 0.0 if np.isnan(rms) else rms)
-    return np.sqrt(near**2 + sets_in * ((INFLATED * posterior)**2 + beyond**2))
+    # metres along the surface from the data, within which errors set in
+    sets_in = 1 - np.exp(-away / 0.014)
+    # metres: no scan is better
+    near = max(0.0005, 0.0 if np.isnan(rms) else rms)
+    # real errors against those that the fit believes in, as it is not quite linear
+    return np.sqrt(near**2 + sets_in * ((1.4 * posterior)**2 + beyond**2))
 
 
 def probability_within(error: np.ndarray, tolerance: float) -> np.ndarray:

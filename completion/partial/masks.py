@@ -12,9 +12,6 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_points
 
-GREY = 0.1                           # least difference of two channels of a colour that marks
-NEAR = 6e-4                          # of the scan's extent: from a point of a marked file to the point it means
-
 
 def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> np.ndarray:
     """Which points of a scan a file marks.
@@ -103,8 +100,10 @@ def _find_painted(path: Path, points: np.ndarray, unit: str | None) -> np.ndarra
     cloud = read_points(path, unit)
     if cloud.colors is None:
         raise ValueError(f"{path}: expected colours, those of clothing other than grey; found none")
-    coloured = np.ptp(cloud.colors, axis=1) > GREY
-    limit = NEAR * float(np.ptp(points, axis=0).max())
+    # least difference of two channels of a colour that marks
+    coloured = np.ptp(cloud.colors, axis=1) > 0.1
+    # of the scan's extent: from a point of a marked file to the point it means
+    limit = 6e-4 * float(np.ptp(points, axis=0).max())
     if len(cloud.points) == len(points) and np.allclose(cloud.points, points, rtol=0, atol=limit):
         return coloured
     far, near = cKDTree(points).query(cloud.points[coloured])

@@ -21,10 +21,6 @@ from .settings import CompletionConfig
 
 LOOSE = 0.3                          # standard deviation of the logarithm of what the first guess is off by
 POINTS = 1500                        # that show how far a scan extends
-DIRECTIONS = 40                      # from which each pose is looked at
-ALIKE = 25                           # views of poses that extend like the scan
-AXES = 4                             # main directions of the poses
-ALIGNED = 12                         # poses that meet the landmarks best and are followed up
 
 
 class ScaledBody(FixedBody):
@@ -111,20 +107,23 @@ def rough_scale(body: FixedBody, points: np.ndarray) -> float:
     part = body.skeleton.part_of_vertex(body.template)[ids]
     R = body.skeleton.part_rotations(poses)[:, part]
     normals = (R @ body.template.vertex_normals[ids][:, :, None])[..., 0]
-    toward = all_rotations(DIRECTIONS)[:, :, 0]
+    directions = 40  # from which each pose is looked at
+    toward = all_rotations(directions)[:, :, 0]
     sizes, forms = [], []
     for y, n in zip(places, normals, strict=True):
         seen = (toward @ n.T > 0.15).astype(float)
         each = _extent(np.repeat(y[None], len(seen) + 1, axis=0), np.vstack([seen, np.ones(len(y))]))
         sizes.append(each[0])
         forms.append(each[1])
-    _, near = cKDTree(np.vstack(forms)).query(form[0], min(ALIKE, len(forms) * (DIRECTIONS + 1)))
+    alike = 25  # views of poses that extend like the scan
+    _, near = cKDTree(np.vstack(forms)).query(form[0], min(alike, len(forms) * (directions + 1)))
     return float(np.median(np.concatenate(sizes)[near]) / size[0])
 
 
 def _usual_poses(body: FixedBody) -> np.ndarray:
     """(M, J, 3) those the body was learned from, where it keeps them, and steps along their main directions."""
-    typical = typical_poses(body.pose_mean, body.pose_covariance, AXES)
+    # main directions of the poses
+    typical = typical_poses(body.pose_mean, body.pose_covariance, 4)
     return np.concatenate([body.pose_examples, typical]) if len(body.pose_examples) else typical
 
 
@@ -154,7 +153,8 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
         turned[0] = rotations.log(R @ rotations.exp(pose[0]))
         stand = points.mean(axis=0) + R @ (body.subject.origin - at.mean(axis=0)) / factor - body.subject.origin
         start.append(np.concatenate([turned.ravel(), stand, np.zeros(body.n_betas), [np.log(factor) / LOOSE]]))
-    x = np.array(start)[np.argsort(misfit)[:ALIGNED]]
+    # poses that meet the landmarks best and are followed up
+    x = np.array(start)[np.argsort(misfit)[:12]]
     follow = scaled.follow(vertices, np.r_[x[0, :-1 - body.n_betas], np.zeros(body.n_betas + 1)])
     weights = np.full(len(points), config.landmark_sd**-2)
 

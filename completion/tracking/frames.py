@@ -14,8 +14,6 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.places import distinct_places
 from scanprep.geometry.sanitise import sanitise
 
-DENSER = 4                           # times as many points as are matched make the normals
-ASKED = 500                          # triangles of a view that are compared with the expected body
 CLOSE, AGREE = 0.05, 0.95            # metres; share of those this close that face as the body does: 0.99 of a walk
 
 Frame = Mesh | PointCloud | np.ndarray | Sequence[View] | None
@@ -90,7 +88,8 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
     Without a body rays would have to tell it, as `sanitise` asks them: that takes more than ten times as long.
     """
     # some of the triangles, without those at vertices that are not finite
-    some = view.faces[:: max(1, len(view.faces) // ASKED)]
+    # triangles of a view that are compared with the expected body
+    some = view.faces[:: max(1, len(view.faces) // 500)]
     corners = view.vertices[some]
     middle = corners.mean(axis=1)
     seen = np.isfinite(middle).all(axis=1)
@@ -107,8 +106,9 @@ def _faces_as(skin: _Skin, view: Mesh) -> bool:
 def _orient(view: _Points, count: int, neighbours: int, skin: _Skin | None
             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some points of a view, their normals, and the denser points that these were made from."""
+    denser = 4  # times as many points as are matched make the normals
     many = spread_points(view.points,
-                         DENSER * count) if len(view.points) > DENSER * count else np.arange(len(view.points))
+                         denser * count) if len(view.points) > denser * count else np.arange(len(view.points))
     dense = view.points[many]
     few = spread_points(dense, count) if len(dense) > count else np.arange(len(dense))
     _, near = cKDTree(dense).query(dense[few], neighbours)

@@ -109,8 +109,9 @@ def tracking_doubts(motion: Motion, body: Mesh) -> list[str]:
     lost, off = seen & ~motion.converged, float(motion.residuals[seen].mean()) if seen.any() else 0.0
     found = [f"the body was lost in {lost.sum()} of {seen.sum()} frames that show something: frames in another order, "
              "or too far apart?"] if lost.sum() > LOST_FRAMES * seen.sum() else []
+    # of the size; people 1 to 2 mm, 3 with noise; of half the size 21, shuffled 19 mm
     return found + ([f"the points are {1000 * off:.0f} mm from the body: the wrong scale, frames in another order, or "
-                     "clothes?"] if off > APART * size(body) else [])
+                     "clothes?"] if off > 0.01 * size(body) else [])
 
 
 def tracking_problem(motion: Motion) -> str | None:
@@ -127,7 +128,6 @@ def tracking_problem(motion: Motion) -> str | None:
 # Shares of the frames. Six runs of the benchmark and a synthetic person are found in all; a person enlarged by 1.6 in
 # none, one whose frames are shuffled in 0.8 of them.
 FOUND, LOST_FRAMES = 0.1, 0.05
-APART = 0.01                         # of the size; people 1 to 2 mm, 3 with noise; of half the size 21, shuffled 19 mm
 MOMENTUM, LOST = 0.9, 0.5            # share of the velocity that the prediction keeps; after a lost frame
 
 

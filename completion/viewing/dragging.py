@@ -9,7 +9,6 @@ from model.priors import whitening
 
 from .movable import MovableBody
 
-NEAR = 0.01                          # metres: a point this far from where it is wanted costs 1
 HOLD, USUAL = 0.05, 0.02             # weights of the pose it had, and of poses the model was learned from
 
 
@@ -53,14 +52,15 @@ class Drag:
             x = pose.ravel()[self.columns]
             return x - self.start[self.columns], x - self.mean[self.columns]
 
+        near = 0.01  # metres: a point this far from where it is wanted costs 1
         def energy(pose: np.ndarray) -> float:
             held, usual = away(pose)
-            off = (self.operator.evaluate(pose, trans)[0] - target) / NEAR
+            off = (self.operator.evaluate(pose, trans)[0] - target) / near
             return float(off @ off + HOLD * held @ self.precision @ held + USUAL * usual @ self.precision @ usual)
 
         for _ in range(4):
             y, J = self.operator.jacobian(pose, trans)
-            off, J = (y[0] - target) / NEAR, J[0][:, self.columns] / NEAR
+            off, J = (y[0] - target) / near, J[0][:, self.columns] / near
             held, usual = away(pose)
             H = J.T @ J + (HOLD + USUAL) * self.precision
             g = J.T @ off + self.precision @ (HOLD * held + USUAL * usual)

@@ -32,7 +32,6 @@ from .statues import read_statue
 PLACES = (".pp", ".json", ".lnd", ".landmarks.txt", ".landmarks.csv", ".fcsv")
 COMPLETION, MOTION, SET = "completion.npz", "motion.npz", "set.json"
 SHOWN = ("surface", "picture", "model", "motion", "markers")
-ENOUGH = 3                           # labels that a recording and a motion have in common
 DEEP = 3                             # folders inside folders that are looked into
 
 
@@ -262,7 +261,8 @@ class Files:
         tried = [(virtual, None)] if virtual.is_file() and path.name == MOTION else []
         for file, unit in [*tried, *((one, self.unit) for one in self.known["markers"] if self.over)]:
             markers = read_recording(file, unit, self.rate)
-            if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= ENOUGH:
+            # labels that a recording and a motion have in common
+            if len(markers.positions) == len(motion.poses) and len({*markers.labels} & {*motion.labels}) >= 3:
                 return markers
         return None
 

@@ -18,7 +18,6 @@ from .contents import Content
 from .motions import AT_ONCE, MADE, columns_of, of_motion, with_markers
 
 SOFT = (0.55, 0.66, 0.80)
-LEAST = 0.003                        # standard deviations: a direction in which the shape changes less is left out
 
 
 def of_soft_tissue(name: str, soft: SoftTissue, model: BodyModel) -> Content:
@@ -68,7 +67,8 @@ def soft_columns(soft: SoftTissue, model: BodyModel, frames: np.ndarray) -> tupl
     basis = columns_of(frames)
     own = soft.betas(0.0)[0]
     shares, sizes, directions = np.linalg.svd(soft.changes, full_matrices=False)
-    shares = (shares * sizes)[:, sizes > LEAST * np.sqrt(len(soft.changes))]
+    # standard deviations: a direction in which the shape changes less is left out
+    shares = (shares * sizes)[:, sizes > 0.003 * np.sqrt(len(soft.changes))]
     rest, whole = model.operator(own), basis.sum(axis=0)[:, None]
     gained = [model.operator(own + direction).plus(-1, rest) for direction in directions[:shares.shape[1]]]
     amounts = np.hstack([np.ones((len(shares), 1)), shares])               # of each body, in every frame

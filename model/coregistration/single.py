@@ -25,7 +25,6 @@ from .config import CoregistrationConfig
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
-ENOUGH = 0.98                        # share of a scan that a start must explain for no other to be sought
 # of the misfit of a start that explains its scan, below which another is better: of a crab, a body that lay the other
 # way round had 1.0 to 1.6 times the misfit of the right one
 CLEARLY = 0.8
@@ -139,7 +138,8 @@ def _pose_and_shape(fit: ScanFit, given: np.ndarray | None) -> tuple[np.ndarray,
     few, tried, best = fit.few(), 0, None
     if given is not None:
         best, tried = reinitialise_limbs(few, best_starts(few, given)[0]), 1
-    explains = best is not None and few.find_unexplained(best, few.thin).mean() <= 1 - ENOUGH
+    # share of a scan that a start must explain for no other to be sought
+    explains = best is not None and few.find_unexplained(best, few.thin).mean() <= 1 - 0.98
     if best is None or not explains or misplaced_limbs(few, best):
         starts = first_starts(fit, few)
         tried += len(starts)

@@ -15,7 +15,6 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..rig import check_motion, turn_up
 
-_DIGITS = 8                          # after the point: in any unit finer than a tenth of a micrometre
 _ORDER = "ZXY"                       # R = R_z R_x R_y, about axes that turn with the part
 _TURNS = " ".join(f"{axis}rotation" for axis in _ORDER)
 
@@ -131,5 +130,6 @@ def _offset(offset: np.ndarray) -> str:
 
 def _numbers(rows: np.ndarray) -> list[str]:
     """Lines of numbers (T, K), none of which is a negative zero."""
-    zero = f"{0:.{_DIGITS}f}"
-    return [line.replace(f"-{zero}", zero) for line in number_lines(rows, f"%.{_DIGITS}f", " ")]
+    digits = 8  # after the point: in any unit finer than a tenth of a micrometre
+    zero = f"{0:.{digits}f}"
+    return [line.replace(f"-{zero}", zero) for line in number_lines(rows, f"%.{digits}f", " ")]

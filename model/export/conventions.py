@@ -14,8 +14,6 @@ from ..rig import Rig, change_root, transform_rig, turn_up
 from .bvh import part_ends
 from .names import Names, rename_bones
 
-FRAMES = 200                         # of a motion, in which its lowest point is looked for
-
 
 def for_programs(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, root: str | None = None,
                  names: Names | None = None, ground: bool = False, front: bool = False
@@ -88,7 +86,8 @@ def place_on_ground(rig: Rig, poses: np.ndarray, trans: np.ndarray, up: int, gro
     vertical = np.eye(3)[up]
     shift = step = -rig.mesh.vertices[:, up].min() * vertical
     if len(poses):
-        chosen = spread_indices(len(poses), FRAMES)
+        # of a motion, in which its lowest point is looked for
+        chosen = spread_indices(len(poses), 200)
         # twenty bodies are held at a time
         step = -min(float(rig.vertices(poses[some], trans[some])[..., up].min())
                     for some in np.array_split(chosen, -(-len(chosen) // 20))) * vertical

@@ -23,7 +23,6 @@ from ..rig import Correctives, Rig, make_rig
 AT_ONCE = 256                        # frames that are held at a time, of a few points
 SEEN = 100                           # frames whose whole bodies say what is lacking: 200 say the same to 0.02 mm
 POINTS = 600                         # that tell the weights of a frame; all 12,500 tell the same to 0.02 mm
-NEAR = 5e-4                          # metres, root mean square: where no number is asked for, correctives end here
 
 
 def rest_corrections(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarray:
@@ -114,7 +113,8 @@ def _directions(lacking: np.ndarray, count: int | None) -> tuple[np.ndarray, np.
     power = np.maximum(power[order], 0)
     left = np.sqrt(np.maximum(power.sum() - np.cumsum(np.r_[0, power]), 0) / lacking[..., 0].size)
     # at most 48 correctives: 2 s of kicks and punches need 11, 15 s need 37
-    wanted = min(int(np.argmax(left <= NEAR)), 48 - 1) if count is None else count - 1
+    # metres, root mean square: where no number is asked for, correctives end here
+    wanted = min(int(np.argmax(left <= 5e-4)), 48 - 1) if count is None else count - 1
     kept = order[:wanted][power[:wanted] > 1e-12 * max(float((lacking**2).sum()), 1e-12)]
     basis = modes[:, kept].T @ changes
     basis /= np.linalg.norm(basis, axis=1, keepdims=True)

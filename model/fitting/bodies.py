@@ -19,7 +19,6 @@ from ..linear import PointOperator, Subject
 from .energy import MovingPoints, moving_points
 
 Follow = Callable[[np.ndarray], MovingPoints]
-PEOPLE = 150                         # poses that people take, beside those a body was seen in
 
 
 class NearPoints(Protocol):
@@ -54,7 +53,8 @@ class FixedBody:
     @cached_property
     def known_poses(self) -> np.ndarray:
         """(M, J, 3) radians, that the body was seen in, and for a person as many as `PEOPLE` that people take."""
-        people = human_poses(self.template, self.skeleton, PEOPLE, np.random.default_rng(0))
+        # poses that people take, beside those a body was seen in
+        people = human_poses(self.template, self.skeleton, 150, np.random.default_rng(0))
         return self.pose_examples if people is None else np.concatenate([self.pose_examples, people])
 
     @cached_property

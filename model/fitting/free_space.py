@@ -20,9 +20,7 @@ from scanprep.skeleton.tree import Skeleton
 from .normals import faces, facing_point
 from .scan import ScanPoints
 
-FACING = 0.97                        # share of the points of a scan that must face its one viewpoint
 TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
-RIM = 2                              # pixels that a depth camera loses at the edge of a body
 INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
 CELL, MARGIN, CAP = 0.05, 0.3, 0.15   # metres: of the table of what cameras must have seen; further off is as bad
 CLOTHING, NOISE = 0.10, 0.003        # metres that hair or a skirt may stand off the skin; that skin may stick out
@@ -73,7 +71,8 @@ class PictureView:
         self.picture = person.picture
         self.points, self.viewpoint = person.picture.points()[person.mask], np.zeros(3)
         known = np.isfinite(person.picture.depth)
-        self._empty = known & ~binary_dilation(person.mask, np.ones((3, 3)), RIM)
+        # pixels that a depth camera loses at the edge of a body
+        self._empty = known & ~binary_dilation(person.mask, np.ones((3, 3)), 2)
         told = person.mask | self._empty
         nearest = minimum_filter(np.where(told, person.picture.depth, np.inf), 3)     # an edge is good to a pixel
         self._depth = np.where(told, nearest, 0.0)
@@ -141,7 +140,8 @@ def find_camera(cloud: ScanPoints, viewpoint: np.ndarray | None = None) -> Camer
     if viewpoint is None:
         viewpoint = facing_point(cloud.points, cloud.normals)
     facing = faces(viewpoint, cloud.points, cloud.normals)
-    return CameraView(np.asarray(viewpoint, dtype=np.float64), cloud.points) if facing.mean() >= FACING else None
+    # share of the points of a scan that must face its one viewpoint
+    return CameraView(np.asarray(viewpoint, dtype=np.float64), cloud.points) if facing.mean() >= 0.97 else None
 
 
 class Contact:

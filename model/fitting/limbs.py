@@ -16,20 +16,14 @@ from .scan import spread_points
 from .scan_fit import EVIDENCE, ScanFit
 from .starts import approach
 
-LOOSE = 0.1                          # radians around the limb of a known pose
 REACHES = (0.2, 0.15, 0.1)           # metres, of the rounds after a limb was moved
-DRAWS = 12                           # times as many poses of a limb are drawn as `random_starts` says
 SKIN, SCAN = 80, 120                 # vertices of a limb and points of the scan that a draw is judged by
 CAP = 0.1                            # metres: further off is as bad
 CAPS, NOISES = (0.4, 0.25, 0.15, 0.1), (0.4, 0.25, 0.15, 0.1)   # metres, and radians, of draws around the best
-KEPT = 24                            # draws around which the next are made
 CELL = 0.03                          # metres: of the table of the inside of a body
 EXPLAINED = 0.04                     # metres of the body within which a point of the scan needs no limb
 FOLLOWED, APART = 4, 0.1             # draws that are followed, and by how many metres they differ at the limb's end
-CARRIED = 2                          # of them, those that go on after the first round
 AMISS = 30.0                         # energy of what is wrong with a limb from which on it is sought
-GRAVE = 100.0                        # energy from which on the whole body may be wrong
-RIVAL = 1.1                          # times the least misfit that of another body may have to be nearly as good
 BETTER, SHARE = 5.0, 0.01            # by how much, and what share of it, the misfit must fall for a limb to be moved
 ROUNDS = 2                           # times that all limbs that are amiss are gone through
 
@@ -44,14 +38,16 @@ def with_limbs(fit: ScanFit, few: ScanFit, starts: np.ndarray) -> tuple[np.ndarr
     ends = [reinitialise_limbs(few, starts[0])]
     for x in starts[1:]:
         both = len(ends) == 1 and fit.cloud.person is not None and not len(fit.vertices)
-        if not both and not misplaced_limbs(few, min(ends, key=few.misfit), GRAVE):
+        # energy from which on the whole body may be wrong
+        if not both and not misplaced_limbs(few, min(ends, key=few.misfit), 100.0):
             break
         ends.append(reinitialise_limbs(few, x))
     if len(ends) == 1:
         return ends[0], None
     misfits = np.array([fit.misfit(x) for x in ends])
     first, *others = np.argsort(misfits)
-    rival = next((ends[i] for i in others if misfits[i] < RIVAL * misfits[first]), None)
+    # times the least misfit that of another body may have to be nearly as good
+    rival = next((ends[i] for i in others if misfits[i] < 1.1 * misfits[first]), None)
     return ends[first], rival
 
 
@@ -104,9 +100,11 @@ def misplacement(fit: ScanFit, x: np.ndarray, limb: list[int], wrong: np.ndarray
 def _reinitialise(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
     """Unknowns (P,) with a limb as it is, or as the draw that explains most after a few rounds."""
     best, search = fit.misfit(x), LimbSearch.around(fit, x, limb)
-    drawn = search.best(draws(fit, x, limb, DRAWS * fit.config.random_starts))
+    # times as many poses of a limb are drawn as `random_starts` says
+    drawn = search.best(draws(fit, x, limb, 12 * fit.config.random_starts))
     begun = sorted((approach(fit, one, REACHES[:1]) for one in drawn), key=fit.misfit)
-    for one in begun[:CARRIED]:
+    # of them, those that go on after the first round
+    for one in begun[:2]:
         tried = approach(fit, one, REACHES[1:])
         if (misfit := fit.misfit(tried)) < best - max(BETTER, SHARE * best):
             x, best = tried, misfit
@@ -153,7 +151,8 @@ class LimbSearch:
         for cap, noise in zip(CAPS, NOISES, strict=True):
             places, cost = self.evaluate(drawn, cap)
             order = np.argsort(cost)
-            kept = drawn[order[distinct_bodies(places[order][:, self.end], KEPT, noise / 4)]]
+            # draws around which the next are made
+            kept = drawn[order[distinct_bodies(places[order][:, self.end], 24, noise / 4)]]
             near = np.repeat(kept, len(drawn) // len(kept), axis=0)
             near[:, angles] += self.fit.rng.normal(0, noise, (len(near), len(angles)))
             drawn = np.vstack([kept, near])
@@ -245,7 +244,8 @@ def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.r
         parts = np.flatnonzero(body.skeleton.descends[:, root])
         angles = (3 * parts[:, None] + np.arange(3)).ravel()
         drawn[:, angles] = known[np.arange(count) * max(1, len(known) // count) % len(known)][:, angles]
-        drawn[:, angles] += rng.normal(0, LOOSE, (count, len(angles)))
+        # radians around the limb of a known pose
+        drawn[:, angles] += rng.normal(0, 0.1, (count, len(angles)))
     return drawn
 
 

@@ -13,8 +13,6 @@ from ..priors import GaussianPrior, typical_poses
 from . import energy
 from .bodies import FixedBody, Follow
 
-ANNEALING = (10.0, 3.0, 1.0)         # weight of the pose prior: first near the usual poses, then free
-
 
 def search_bodies(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prior: GaussianPrior, axes: int
                   ) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +43,8 @@ def anneal(solve: Callable[[np.ndarray, float], Minimum[np.ndarray]], x: np.ndar
 
     `solve` takes unknowns (n, P) and the weight of the pose prior.
     """
-    for stiff in ANNEALING:
+    # weight of the pose prior: first near the usual poses, then free
+    for stiff in (10.0, 3.0, 1.0):
         end = solve(x, stiff)
         x = end.x
     return end

@@ -10,12 +10,7 @@ from scanprep.geometry.sparse import spanning_tree
 from scanprep.threads import search_threads
 
 COARSE = 2000                        # points that show the form at large
-EACH = 4                             # one of so many points is asked which way its patch bulges
-WIDE = 0.12                          # metres: at this scale a body is convex enough to tell in from out
 GRAZING = 0.3                        # cosine below which a scanner sees little
-FEW = 2000                           # points that are enough to find the viewpoint
-ONE_VIEW = 0.9                       # share of the points that face one viewpoint, of a scan from there
-AGREE = 0.95                         # share of neighbours that must agree for given normals to be of one sign
 
 
 def spread_points(points: np.ndarray, count: int) -> np.ndarray:
@@ -55,7 +50,8 @@ def complete_normals(given: np.ndarray, points: np.ndarray, near: np.ndarray) ->
 
 def one_sign(normals: np.ndarray, near: np.ndarray) -> bool:
     """Whether given normals were oriented: many programs estimate them and leave their sign to chance."""
-    return float((np.einsum("nd,nd->n", normals, normals[near[:, 1]]) > 0).mean()) > AGREE
+    # share of neighbours that must agree for given normals to be of one sign
+    return float((np.einsum("nd,nd->n", normals, normals[near[:, 1]]) > 0).mean()) > 0.95
 
 
 def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, distance: np.ndarray, reach: float
@@ -81,15 +77,18 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
             flipped[i] = flipped[parent] != turn_it
     out = np.where(np.array(flipped)[:, None], -normals, normals)
     coarse = points[spread_points(points, COARSE)] if n > COARSE else points
-    some = np.r_[roots, 0:n:EACH]
-    far, around = cKDTree(coarse).query(points[some], 48, distance_upper_bound=WIDE, workers=search_threads(len(some)))
+    # one of so many points is asked which way its patch bulges
+    some = np.r_[roots, 0:n:4]
+    # metres: at this scale a body is convex enough to tell in from out
+    far, around = cKDTree(coarse).query(points[some], 48, distance_upper_bound=0.12, workers=search_threads(len(some)))
     found = np.isfinite(far)
     total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[some, None], 0).sum(axis=1)
     bulge = -np.einsum("nd,nd->n", out[some], total)
     sign = np.where(np.bincount(patch[some], bulge, patches) < 0, -1.0, 1.0)
     out = out * sign[patch][:, None]
     facing = faces(facing_point(points, out), points, out)
-    if facing.mean() < ONE_VIEW:
+    # share of the points that face one viewpoint, of a scan from there
+    if facing.mean() < 0.9:
         return out
     sign = np.where(np.bincount(patch, facing - 0.5, patches) < 0, -1.0, 1.0)
     return out * sign[patch][:, None]
@@ -103,7 +102,8 @@ def faces(viewpoint: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.
 
 def facing_point(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """The viewpoint (3,) from which the fewest normals (n, 3) of points (n, 3) turn away; its distance is not exact."""
-    keep = spread_points(points, FEW) if len(points) > FEW else slice(None)
+    few = 2000  # points that are enough to find the viewpoint
+    keep = spread_points(points, few) if len(points) > few else slice(None)
     normals, centre = normals[keep], points[keep].mean(axis=0)
     points = points[keep] - centre
     size = max(np.linalg.norm(points, axis=1).max(), 1e-12)

@@ -14,11 +14,8 @@ from .pull import MatchTargets
 from .scan_fit import EVIDENCE, FINAL_REACH, REACH, Matched, ScanFit
 from .vertices import share_of_vertices
 
-WIDE_REACH = 0.08                    # metres: limit on the distance of matches, for models that follow a scan badly
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
-FINE = 2                             # rounds at the wide reach that take all vertices, at least
 NARROWING, SETTLING = 3, 12          # rounds from the wide to the final reach; that a reach is held at most
-ALIGNINGS = 4                        # times that the points of a body are linearised anew to meet an alignment
 CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
 
 
@@ -41,10 +38,12 @@ def solve_jointly(fit: ScanFit, few: ScanFit, x: np.ndarray, tell: Callable[[int
 
     [SCAPE] Eq. 10
     """
-    reaches = np.geomspace(REACH, WIDE_REACH, fit.config.rounds)
+    wide_reach = 0.08  # metres: limit on the distance of matches, for models that follow a scan badly
+    reaches = np.geomspace(REACH, wide_reach, fit.config.rounds)
     rough = _in_rounds(few, x, reaches, tell, 0)
-    wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(FINE), lambda i: None)
-    narrow = _in_rounds(fit, wide.x, np.geomspace(WIDE_REACH, FINAL_REACH, NARROWING), lambda i: None)
+    # rounds at the wide reach that take all vertices, at least
+    wide = _in_rounds(fit, rough.x, reaches[-1:].repeat(2), lambda i: None)
+    narrow = _in_rounds(fit, wide.x, np.geomspace(wide_reach, FINAL_REACH, NARROWING), lambda i: None)
     best = wide if fit.misfit(wide.x) < CLEARLY * fit.misfit(narrow.x) else narrow
     return replace(best, rounds=rough.rounds + wide.rounds + narrow.rounds)
 
@@ -73,7 +72,8 @@ def meet_vertices(fit: ScanFit, x: np.ndarray, vertices: np.ndarray, weights: np
     near = EVIDENCE / config.scan_sd**2 * share * weights[ids]
     to_point = np.concatenate([np.full(len(fit.vertices), config.landmark_sd**-2), near])
     targets = np.concatenate([fit.points, vertices[ids]])
-    for _ in range(ALIGNINGS):
+    # times that the points of a body are linearised anew to meet an alignment
+    for _ in range(4):
         points, at = fit.body.gather(np.concatenate([fit.vertices, ids]), x)
         pull = MatchTargets(points, at, targets, np.zeros_like(targets), to_point, np.zeros(len(targets)))
         x = levenberg_marquardt(partial(_equations, Matched(pull, len(fit.vertices), len(ids), fit.prior_terms),

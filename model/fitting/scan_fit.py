@@ -23,18 +23,12 @@ from .upright import TILT, Upright
 
 Terms = dict[str, Residual]
 
-LIKELY = 0.04                        # metres: matches closer than this are mostly right
-PERSON = 1.36                        # metres: root of the surface area of a person
 REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches, first and last
-DAMPING = 1e-3, 1e-1                 # of the first step for a matching, and of another one where that lowers nothing
-FEW = 3000                           # vertices that a search takes
-BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
 MIN_COSINE = 0.6                     # between the normals of a match
 # Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
 # this is far fewer than there are points.
 EVIDENCE = 400.0
 STRANGE, ODD = np.radians(45), 0.05  # from the nearest known joint on: strange; and what that may vary, radians
-UNDER_CLOTHES = 0.1                  # weight of a match of skin below what a depth camera saw, against skin above it
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +169,8 @@ class ScanFit:
         """The same with few vertices of the body and points of the scan: for a search."""
         template, skeleton = self.body.template, self.body.skeleton
         rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
-        some = self.some(np.concatenate([spread_points(template.vertices, FEW), *rings]), self.config.model_points // 2)
+        # vertices that a search takes
+        some = self.some(np.concatenate([spread_points(template.vertices, 3000), *rings]), self.config.model_points // 2)
         return replace(some, scan_points=self.config.scan_points // 2)
 
     def mesh(self, x: np.ndarray) -> Mesh:
@@ -259,12 +254,14 @@ class ScanFit:
         held = np.full(len(x), self.config.twist_weight)
         held[:3] = held[self.body.n_angles:] = 0
         matched, betas = self.match_at(x, scan, reach), self.body.n_angles + 3
-        stiff = max(1.0, reach / LIKELY)             # far matches are often wrong, and shape gives way before pose does
+        # metres: matches closer than this are mostly right
+        stiff = max(1.0, reach / 0.04)             # far matches are often wrong, and shape gives way before pose does
 
         def equations(at: np.ndarray) -> Deferred:
             return matched.equations(at, energy.shape_prior(at, betas, stiff), energy.stay_near(at, x, held))
 
-        for damping in DAMPING:
+        # of the first step for a matching, and of another one where that lowers nothing
+        for damping in 1e-3, 1e-1:
             ahead = levenberg_marquardt(equations, x[None], steps, 1e-3, damping).x[0]   # [SCAPE] Eq. 11
             if not np.array_equal(ahead, x):
                 break
@@ -306,7 +303,8 @@ class ScanFit:
         weights = EVIDENCE / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
         if self.cloud.person is not None:
             under = np.einsum("nd,nd->n", normal, skin.places[ids] - target) < 0
-            weights = np.where(under, UNDER_CLOTHES, 1.0) * weights
+            # weight of a match of skin below what a depth camera saw, against skin above it
+            weights = np.where(under, 0.1, 1.0) * weights
         if self.data.clothing is None:
             return ids, target, normal, weights
         under, over, away = self.data.clothing.below(skin.places[mine], skin.normals[mine])
@@ -350,7 +348,8 @@ def scan_fit(body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: n
     """
     sample = sample_body(body, None, config.model_points, config.ignored_parts)
     prior, known = gaussian_prior(body.pose_mean, body.pose_covariance), len(body.pose_examples) >= LEAST_POSES
-    limits = JointLimits.from_poses(body.pose_examples, 1.0, BEYOND) if config.joint_limits and known else None
+    # radians that joints may rotate farther than in the training poses
+    limits = JointLimits.from_poses(body.pose_examples, 1.0, 0.2) if config.joint_limits and known else None
     upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
     return ScanFit(sample, ScanData(cloud, config), vertices, points, prior, limits, upright,
                    config.scan_points, config, np.random.default_rng(config.seed))
@@ -364,7 +363,8 @@ def prepare_scan_fit(body: FixedBody, scan: Mesh | np.ndarray, vertices: np.ndar
     and `points` (L, 3), metres, are landmarks, none or more.
     """
     size = float(np.sqrt(body.template.face_areas.sum()))
-    factor = 1.0 if 0.5 < size / PERSON < 2 else PERSON / size
+    person = 1.36  # metres: root of the surface area of a person
+    factor = 1.0 if 0.5 < size / person < 2 else person / size
     sized = body if factor == 1 else ResizedBody(body, factor)
     return scan_fit(sized, prepare_scan(scan, metres=factor), vertices, factor * points, config), factor
 

@@ -24,9 +24,6 @@ from .starts import best_starts, first_starts, from_nothing
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 NO_LANDMARKS = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-# of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is another
-# thing than the model; a woman has 0.004 and 0.0002, a crab 0.005 and 0.088
-OTHER = 0.02, 0.05
 # Of the body's size: bodies no vertex of which is farther apart come to the same end; so far off a body is what a limb
 # that is elsewhere leaves uncovered; and the share of a scan that is then lost, where a hand is 0.02 of a man.
 ALIKE, FAR, LOST = 0.015, 0.045, 0.005
@@ -60,10 +57,13 @@ def lay_model(model: BodyModel, template: Mesh, progress: Callable[[int, int], N
     if np.array_equal(own.faces, template.faces) and np.allclose(own.vertices, template.vertices, atol=1e-6):
         tell(1, 1)                             # a model of this very template
         return template
+    # of a template: share off the body that was laid on it, and of the body that is stretched, from which on it is
+    # another thing than the model; a woman has 0.004 and 0.0002, a crab 0.005 and 0.088
+    other = 0.02, 0.05
     for body in find_bodies(model, template):
         tell(1, 2)
         laid = register(body, template, start=body.vertices)
-        if laid.uncovered <= OTHER[0] and share_stretched(body, laid.mesh) <= OTHER[1]:
+        if laid.uncovered <= other[0] and share_stretched(body, laid.mesh) <= other[1]:
             tell(2, 2)
             return laid.mesh
     raise ModelMismatchError(f"the model does not come to lie on the template, {100 * laid.uncovered:.0f}% of which "

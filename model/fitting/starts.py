@@ -17,27 +17,15 @@ from .scan_fit import EVIDENCE, ScanFit
 from .upright import SPREAD, SPREAD_OF_MANY
 
 AXES = 4                             # directions of the training poses along which a search from landmarks starts
-CANDIDATES = 3                       # starts that are carried on from the landmarks to the scan
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
-STEPS = 2                            # for each matching of them: they are too few to settle with one
-PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
-# of many starts, those that go on after the first round: on 14 half views the bodies are those of all 24
-THROUGH = 12
 FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
 # of a body's length: a scan that is shorter is of a part of it; half a man had 0.49
 HALF = 0.65
-ROTATIONS = 600                         # about 25 degrees between neighbours
-LEVELS = 5                           # heights at which a body that stands is laid on what is seen of it
-POSES = 100                          # tried at most
 VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns, or all draws
-CAP = 0.15                           # metres: further off is as bad
-NORMALS = 0.1                        # metres that a difference of normals of unit length weighs
-FACING = 0.15                        # cosine to the camera's direction from which a vertex counts as seen
 PROMISING, STANDING = 0.4, 0.15      # share of all placements, those least denied by the camera, that are compared
 AT_ONCE = 1000                       # points that are compared at a time
 # placements that are compared on all points, after a first look on a third: fifteen times as many as are kept
 FINE = 3000
-POOL = 200                           # best placements that are kept
 BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
 
 
@@ -52,7 +40,8 @@ def first_starts(fit: ScanFit, few: ScanFit) -> np.ndarray:
     if not fit.config.correspondences:
         return marked
     pairs = find_correspondences(fit.body.template, fit.cloud.points, (fit.vertices, fit.points))
-    more = from_landmarks(fit, few, pairs.template_vertices, pairs.scan_points, PAIRS_SD)
+    # metres: correspondences are that far off, and not independently of each other
+    more = from_landmarks(fit, few, pairs.template_vertices, pairs.scan_points, 0.05)
     return np.concatenate([more, marked])
 
 
@@ -73,13 +62,14 @@ def from_landmarks(fit: ScanFit, few: ScanFit, vertices: np.ndarray, points: np.
     body = fit.body.fix_shape(mean)
     follow = body.follow(vertices, mean)
     x, _ = search_bodies(body, follow, points, sd, fit.prior, AXES)
-    x = x[distinct_bodies(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), CANDIDATES)]
+    candidates = 3  # starts that are carried on from the landmarks to the scan
+    x = x[distinct_bodies(body.subject.points(few.ids[few.sample.spread]).evaluate(*body.split(x)[:2]), candidates)]
     drawn = np.concatenate([x, *(sample_around(body, follow, start, points, sd, fit.prior, fit.config.random_starts,
                                                fit.rng)
                                 for start in x)])
     drawn = np.hstack([drawn, np.zeros((len(drawn), fit.body.n_betas))])
     drawn = drawn[np.argsort(coarse_cost(few, drawn))]
-    return drawn[distinct_bodies(sample_vertices(few, drawn), CANDIDATES)]
+    return drawn[distinct_bodies(sample_vertices(few, drawn), candidates)]
 
 
 def coarse_cost(fit: ScanFit, x: np.ndarray) -> np.ndarray:
@@ -117,7 +107,8 @@ def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
     ends, free = np.array(starts), fit.body.n_angles + 3
     if len(ends) > FINALISTS:
         held = fit.fix_shape(ends[0])
-        for reach, left in zip(COARSE[:2], (len(ends), THROUGH), strict=True):
+        # of many starts, those that go on after the first round: on 14 half views the bodies are those of all 24
+        for reach, left in zip(COARSE[:2], (len(ends), 12), strict=True):
             ends = ends[:left]
             ends[:, :free] = [approach(held, x[:free], (reach,)) for x in ends]
             ends = ends[np.argsort([held.misfit(x[:free]) for x in ends], kind="stable")]
@@ -137,7 +128,8 @@ def sample_vertices(fit: ScanFit, x: np.ndarray) -> np.ndarray:
 def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
     """Unknowns (P,) after a few rounds on few points."""
     for reach in reaches:
-        x, _ = fit.step(x, fit.coarse, reach, STEPS)
+        # for each matching of them: they are too few to settle with one
+        x, _ = fit.step(x, fit.coarse, reach, 2)
     return x
 
 
@@ -158,7 +150,8 @@ def starting_poses(fit: ScanFit) -> np.ndarray:
         return typical_poses(body.pose_mean, body.pose_covariance, AXES)
     mean = body.pose_mean.copy()
     mean[0] = 0
-    return pick_varied(np.concatenate([mean[None], body.known_poses]), POSES)
+    # tried at most
+    return pick_varied(np.concatenate([mean[None], body.known_poses]), 100)
 
 
 def pick_varied(poses: np.ndarray, count: int) -> np.ndarray:
@@ -202,7 +195,8 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     best &= np.isfinite(cost)
     whole = free_space_cost(fit, places, turns, shift, best) + distance_cost(places, normals, turns, shift, scan, best)
     cost = np.where(best, whole, np.inf)
-    order = np.argsort(cost, axis=None, kind="stable")[:POOL]
+    # best placements that are kept
+    order = np.argsort(cost, axis=None, kind="stable")[:200]
     which, turn = np.unravel_index(order, cost.shape)
     x = np.array([body.join(_rotate_root(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
     stand = body.subject.origin
@@ -241,11 +235,13 @@ def candidate_rotations(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarra
     beyond the picture; a scan that is much shorter than a body, and that no camera explains, is of either half. Others
     have no direction: their middle is laid on that of the scan.
     """
-    upright, every = fit.upright, all_rotations(ROTATIONS)
+    # about 25 degrees between neighbours
+    upright, every = fit.upright, all_rotations(600)
     if upright is not None:
         turns = upright.rotations(all_rotations(SPREAD if len(upright.ups) == 1 else SPREAD_OF_MANY))
         up = upright.ups[np.argmax(turns @ upright.of_body @ upright.ups.T, axis=1)]
-        lift = np.linspace(0, 1, LEVELS)
+        # heights at which a body that stands is laid on what is seen of it
+        lift = np.linspace(0, 1, 5)
     else:
         extent = np.ptp(fit.body.template.vertices, axis=0)
         off = fit.cloud.points - fit.cloud.points.mean(axis=0)
@@ -260,7 +256,8 @@ def _facing(n: np.ndarray, turns: np.ndarray, toward: np.ndarray) -> np.ndarray:
     """(T, L) 1 for vertices with normals (L, 3) that face a camera in direction (C, 3) when turned; without one all."""
     if not len(toward):
         return np.ones((len(turns), len(n)))
-    return np.any([(to @ turns) @ n.T > FACING for to in toward], axis=0).astype(float)
+    # cosine to the camera's direction from which a vertex counts as seen
+    return np.any([(to @ turns) @ n.T > 0.15 for to in toward], axis=0).astype(float)
 
 
 def _laid(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray, scan: np.ndarray) -> np.ndarray:
@@ -287,14 +284,16 @@ def _stood(y: np.ndarray, n: np.ndarray, turns: np.ndarray, lift: np.ndarray, to
 def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarray, scan: ScanPoints) -> np.ndarray:
     """Mean squared distance (T,) of the scan to one pose turned every way; places and normals in one space."""
     points, directions = (scan.points - shift[:, None]) @ turns, scan.normals @ turns
-    ask = np.concatenate([points, NORMALS * directions], axis=2).reshape(-1, 6).astype(np.float32)
-    have = np.hstack([y, NORMALS * n]).astype(np.float32)
+    normals = 0.1  # metres that a difference of normals of unit length weighs
+    ask = np.concatenate([points, normals * directions], axis=2).reshape(-1, 6).astype(np.float32)
+    have = np.hstack([y, normals * n]).astype(np.float32)
     # |a - b|² = |a|² + (|b|², b)·(1, -2 a); a piece at a time, so that it stays near the processor
     have = np.hstack([(have**2).sum(axis=1, keepdims=True), have])
     other = np.hstack([np.ones_like(ask[:, :1]), -2 * ask])
     nearest = np.concatenate([(have @ some.T).min(axis=0)
                               for some in np.array_split(other, 1 + len(other) // AT_ONCE)]) + (ask**2).sum(axis=1)
-    return np.minimum(nearest, CAP**2).reshape(len(turns), len(scan.points)).mean(axis=1)
+    # metres: further off is as bad
+    return np.minimum(nearest, 0.15**2).reshape(len(turns), len(scan.points)).mean(axis=1)
 
 
 def _rotate_root(pose: np.ndarray, R: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ from scanprep.skeleton.roles import LIMBS, find_numbered_roles
 from scanprep.skeleton.tree import Skeleton
 
 TILT = 0.35                          # radians that trunks of people who stand lean, standard deviation
-WIDEST = 0.6                         # radians that they lean at most where the search begins
 PICTURE = np.array([[0, -1.0, 0], [0, 1.0, 0], [1.0, 0, 0], [-1.0, 0, 0]])    # a camera as it is, upside down, rolled
 SPREAD = 3000                        # rotations of which those are tried that stand, when up is known: every 15 degrees
 SPREAD_OF_MANY = 1500                # when it is one of several
@@ -43,7 +42,8 @@ class Upright:
 
     def rotations(self, spread: np.ndarray) -> np.ndarray:
         """Those (T, 3, 3) of rotations (n, 3, 3) in which the body stands."""
-        return spread[((spread @ self.of_body) @ self.ups.T).max(axis=1) > np.cos(WIDEST)]
+        # radians that they lean at most where the search begins
+        return spread[((spread @ self.of_body) @ self.ups.T).max(axis=1) > np.cos(0.6)]
 
     def nearest(self, x: np.ndarray) -> np.ndarray:
         """The direction (..., 3) among them that is up for bodies of unknowns (..., P)."""

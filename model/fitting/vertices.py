@@ -19,8 +19,6 @@ from ..body import BodyModel
 from ..features import twists
 from ..linear import PointOperator, Subject
 
-EXACT = 1e-15                        # square metres, over all points: a step that gains less is none
-
 
 @dataclass(frozen=True)
 class FitConfig(Settings):
@@ -221,7 +219,8 @@ def _minimise(equations: Callable[[np.ndarray], Dense], x: np.ndarray, J: int, i
         out[0, :3 * J] = twists(out[0, :3 * J].reshape(J, 3)).ravel()
         return out
 
-    return levenberg_marquardt(equations, x, iterations, tolerance, exact=EXACT, retract=retract)
+    # square metres, over all points: a step that gains less is none
+    return levenberg_marquardt(equations, x, iterations, tolerance, exact=1e-15, retract=retract)
 
 
 def _equations(points: PointOperator | ShapedPoints, target: np.ndarray, weights: np.ndarray | None = None

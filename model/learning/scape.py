@@ -41,10 +41,6 @@ POSES = 2 / 3                        # of the time of learning, where there are 
 # The pose space of a prior's own bodies: refined once it was 0.3 mm better on held-out poses, for three times the time.
 PRIOR = LearnConfig(prunings=(0.01,), ridges=(1e-3,), refinements=0)
 WORTH = 10.0                         # people that the people of a prior count as
-ONE_POSE = 0.016                     # metres by which the built-in people's movement misses SCAPE poses of one scan
-# Metres by which a prior should not miss left-out poses: of one man 12 to 16 from three poses on, of four of him
-# with four other men, told to be one person, 27
-STRANGE = 0.02
 
 
 class ProgressShares:
@@ -326,10 +322,11 @@ def training_metadata(template: Mesh, skeleton: Skeleton, learned: LearnedPose, 
         examples = np.concatenate([examples, pose_examples(
             template, skeleton, skeleton.pose_of(skeleton.fit_rotations(template, prior.poses)))])
     of_prior = {} if prior is None else describe_prior(prior, skeleton, learned)
+    # metres by which the built-in people's movement misses SCAPE poses of one scan
     return {"pose_mean": mean, "pose_covariance": covariance, "pose_examples": examples, "info": {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
-        "left_out_error": design.left_out_error if len(poses) > 1 else ONE_POSE,     # of a single pose none is left out
+        "left_out_error": design.left_out_error if len(poses) > 1 else 0.016,     # of a single pose none is left out
         "digest": digest(template, poses, shapes), "digests": body_digests(poses, shapes), **of_prior}}
 
 
@@ -426,7 +423,10 @@ def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement
         doubts = ["the body has one part and no joint: it takes no pose"]
     doubts += skeleton_doubts(model.skeleton)
     error = model.info.get("left_out_error", 0.0)
-    if known and error > STRANGE:
+    # Metres by which a prior should not miss left-out poses: of one man 12 to 16 from three poses on, of four of him
+    # with four other men, told to be one person, 27
+    strange = 0.02
+    if known and error > strange:
         doubts += [f"a pose that was left out is predicted {1000 * error:.0f} mm off, more than by the prior alone: "
                    "meshes of two people, or wrong ones?"]
     elif error > CRUDE:

@@ -24,7 +24,6 @@ from .regression import ridge_operator
 from .scape import POSES, Progress, ProgressShares, check_training, estimate_pose_prior, fit_poses, pose_examples
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
-PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
 
@@ -247,8 +246,9 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
 
 def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, work: ProgressShares) -> SkinningModel:
     """The model with the shape components of people (P, N, 3) whose poses are fitted and undone in turn."""
-    share = 1 / (PEOPLE_ROUNDS * len(shapes))
-    for k in range(PEOPLE_ROUNDS):
+    people_rounds = 3  # of fitting the poses of the other people and undoing them
+    share = 1 / (people_rounds * len(shapes))
+    for k in range(people_rounds):
         quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
         fitter = ShapeFitter(model, quick) if k else PoseFitter(model.subject(), quick)
         people = np.stack([work.step(f"round {k}, person {body_digest(body)}", (model, quick, k, body), share,

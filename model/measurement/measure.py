@@ -14,10 +14,8 @@ from .tapes import Tapes
 
 TURNED = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}       # degrees from the standard pose that change little
 # Chosen on half views of the ten even people of `tests/benchmarks/measures.py`, which tells how far the odd ones agree.
-REACH = 0.10                         # metres, over which errors of the surface go together
 MOST, SHARE = 0.010, 0.02            # metres, and of the value: more is an error of the pose, which repose takes away
 MANY = 2000                          # vertices, whose distances from each other are 100 megabytes
-SLIDE = 0.003                        # metres that a section may lie beside its place along the part, or a landmark
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +147,14 @@ def measurement_error(reading: Reading, vertices: np.ndarray, expected: np.ndarr
     most = MOST if reading.unknown else min(MOST, SHARE * reading.value)
     pull = np.minimum(expected[reading.vertices], most)[:, None] * reading.force / np.sqrt(3)
     # of thousands of vertices those of one cube are taken together: within a quarter of the reach errors are alike
-    cubes = vertices if len(np.unique(reading.vertices)) < MANY else np.floor(vertices / (0.25 * REACH))
+    reach = 0.10  # metres, over which errors of the surface go together
+    cubes = vertices if len(np.unique(reading.vertices)) < MANY else np.floor(vertices / (0.25 * reach))
     first, place = np.unique(cubes[reading.vertices], axis=0, return_index=True, return_inverse=True)[1:]
     place = place.ravel()
     sums = np.zeros((len(first), 3))
     np.add.at(sums, place, pull)
     points = vertices[reading.vertices[first]]
-    together = np.exp(-0.5 * (np.linalg.norm(points[:, None] - points, axis=2) / REACH)**2)
+    together = np.exp(-0.5 * (np.linalg.norm(points[:, None] - points, axis=2) / reach)**2)
     variance = np.einsum("id,ij,jd->", sums, together, sums)
-    return float(np.sqrt(max(variance, 0) + (SLIDE * reading.slope)**2 + reading.unknown**2))
+    # metres that a section may lie beside its place along the part, or a landmark
+    return float(np.sqrt(max(variance, 0) + (0.003 * reading.slope)**2 + reading.unknown**2))

@@ -17,8 +17,6 @@ from .tapes import Extent, Found, Girth, Height, Span, Straight, Tapes, Way, Wei
 DENSITY, DENSITY_SPREAD = 985.0, 0.02
 ENDS = np.sqrt(2.0)                  # slope of what has two landmarks, which slide each for itself
 
-STRAIGHT = 0.05                      # metres at the end of a way that tell where it goes on
-
 
 class NotMeasured(ValueError):
     """A measurement that cannot be taken of a body, and why."""
@@ -248,7 +246,8 @@ def _until(girth: Girth, way: SectionCurve, body: Standing) -> tuple[float, np.n
     """
     (origin, normal), points = _plane(girth, body), way.at(body.vertices)
     last = way.edges[0, 0]
-    k = int((np.linalg.norm(points - points[0], axis=1) > STRAIGHT).argmax()) or len(points) - 1
+    # metres at the end of a way that tell where it goes on
+    k = int((np.linalg.norm(points - points[0], axis=1) > 0.05).argmax()) or len(points) - 1
     before = way.edges[k, int(way.share[k] > 0.5)]                        # a vertex, as points of ways slide
     ahead = points[0] - body.vertices[before]
     reach, rise, lack = float(np.linalg.norm(ahead)), ahead @ normal, (origin - points[0]) @ normal

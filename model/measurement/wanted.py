@@ -13,7 +13,6 @@ from .measure import measure
 from .reading import DENSITY_SPREAD
 from .tapes import Tapes
 
-FARTHEST = 8.0                       # standard deviations, of all betas together: what no model is asked to reach
 OFTEN = 1.6449                       # standard deviations within which 90% of people are
 FACTORS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
 HEAVY_FACTORS = {"grams": 0.001}     # pounds look like kilograms
@@ -274,7 +273,8 @@ def _not_too_far(S: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     squares, along = np.maximum(squares, 0), axes.T @ wanted
 
     def size(logarithm: float) -> float:
-        return float(np.sqrt(squares @ (along / (squares + np.exp(logarithm)))**2)) - FARTHEST
+        # standard deviations, of all betas together: what no model is asked to reach
+        return float(np.sqrt(squares @ (along / (squares + np.exp(logarithm)))**2)) - 8.0
 
     least, most = np.log(0.01), np.log(squares.max() + np.abs(along).max()**2 + 1)
     damping = np.exp(brentq(size, least, most) if size(least) > 0 > size(most) else least)

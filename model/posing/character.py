@@ -20,7 +20,6 @@ from ..shape_statistics import PLANE
 
 # registrations of the template, each from where the last one left it: one alone does not stretch so far
 REGISTRATIONS = 2
-LOST = 0.5                           # share of the character missed, or of joints outside it, that means nothing
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,8 @@ def points_inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 def character_problem(found: Character) -> str | None:
     """Why a character means nothing, with the likely cause; None where it means something."""
     missed = 0.0 if found.registration is None else found.registration.uncovered
-    if missed <= LOST and found.inside.mean() >= LOST:
+    lost = 0.5  # share of the character missed, or of joints outside it, that means nothing
+    if missed <= lost and found.inside.mean() >= lost:
         return None
     return (f"{100 * missed:.0f}% of the character lies off the template and {found.inside.sum()} of "
             f"{len(found.inside)} joints inside it; landmarks of other places, left and right exchanged, or a mesh "

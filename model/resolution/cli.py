@@ -19,7 +19,6 @@ from .change import ResolutionConfig, change_resolution, resample, resolution_ga
 
 # metres; of 5,002 vertices of a model of people 1,000 are left at 4 mm, 500 at 8, 300, hands and feet gone, at 13
 FAR = 0.01
-MEASURED = 20                        # poses in which the two models are compared
 
 
 def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: Faces | None = None,
@@ -44,14 +43,15 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         changed = change_resolution(loaded, mesh, config, progress)
     changed.save(output)
     rng = np.random.default_rng(1)
-    poses, betas = sample_poses(loaded, MEASURED, rng), rng.normal(size=(MEASURED, loaded.n_betas))
+    measured = 20  # poses in which the two models are compared
+    poses, betas = sample_poses(loaded, measured, rng), rng.normal(size=(measured, loaded.n_betas))
     gaps = [("the template's own body", resolution_gap(loaded, changed, poses))]
     if loaded.n_betas:
         gaps.append(("random people", resolution_gap(loaded, changed, poses, betas)))
     return Outcome(output, [
         Metric("vertices before", len(loaded.template.vertices)), Metric("vertices", len(mesh.vertices)),
         Metric("triangles", len(mesh.faces)),
-        *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", 1000.0 * float(value), "mm")
+        *(Metric(f"distance in {measured} random poses, {who}, {what}", 1000.0 * float(value), "mm")
           for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
         {"resample": config}, judgement=Judgement.of(check=[
             f"{who} in random poses: {1000 * float(gap.mean()):.0f} mm from where it was; take more vertices"

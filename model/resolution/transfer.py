@@ -15,8 +15,6 @@ from scanprep.skeleton.tree import Skeleton
 from ..gradients import edges
 from ..stitching import edge_operator
 
-LEAST = 6                            # triangles that a part needs: fewer are no piece of surface
-
 
 def transfer_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
     """The same tree and joints, the parts painted onto the new triangles by majority.
@@ -31,10 +29,11 @@ def transfer_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
     np.add.at(votes, (np.repeat(np.arange(F), len(bary)), skeleton.part_of_face[hit]), 1 / len(bary))
     part = keep_connected(-votes, new.face_pairs, new.face_areas, votes.argmax(axis=1))
     found = np.bincount(part, minlength=J)
-    if found.min() < LEAST:
+    least = 6  # triangles that a part needs: fewer are no piece of surface
+    if found.min() < least:
         lost = int(found.argmin())
         share = old.face_areas[skeleton.part_of_face == lost].sum() / old.face_areas.sum()
-        needed = 2 * LEAST * max(1 / share, F / max(found[lost], 1))       # by its area, and by what it got
+        needed = 2 * least * max(1 / share, F / max(found[lost], 1))       # by its area, and by what it got
         raise ValueError(f"template: {F} triangles are too coarse, {found[lost]} are left for part "
                          f"'{skeleton.names[lost]}'; expected some {needed:.0f} or more")
     carried = Skeleton(part, skeleton.parents, skeleton.joints, skeleton.names)

@@ -9,8 +9,6 @@ import numpy as np
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 
-NEIGHBOURS = 20                        # points that tell a normal, and to which it is oriented
-
 
 class MissingLibrary(ImportError):
     """A library that a setting asks for is not there, or not the system's libraries it stands on."""
@@ -38,8 +36,9 @@ def estimate_oriented_normals(points: np.ndarray) -> np.ndarray:
     """Unit normals (n, 3) of points (n, 3), metres, that face the same way along the surface; inward or outward."""
     o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
-    cloud.orient_normals_consistent_tangent_plane(NEIGHBOURS)
+    neighbours = 20  # points that tell a normal, and to which it is oriented
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
+    cloud.orient_normals_consistent_tangent_plane(neighbours)
     return np.asarray(cloud.normals).copy()
 
 

@@ -15,10 +15,6 @@ from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 MUTUAL, SPARSE = 6, 3.0              # neighbours of a point where points are few, and how far off, in links
-LITTLE = 0.2                         # share of a scan that may be taken off unasked: floor, chair and specks have 0.1
-STEPS = 5.0                          # spacings between the steps of a depth camera on a surface that it sees slantwise
-# a piece left out that is so large against the body, and has so many of its points, may be a person: a child has half
-SECOND = (0.5, 0.25)
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 
 
@@ -80,8 +76,11 @@ def cleaning_doubts(found: CleanedScan) -> list[str]:
     """Why a cleaned scan is to be looked at: a piece that may be a second person was taken for furniture."""
     body = max((max(piece.size) for piece in found.components if piece.kept), default=0.0)
     points = max((piece.points for piece in found.components if piece.kept), default=0)
+    # a piece left out that is so large against the body, and has so many of its points, may be a person: a child has
+    # half
+    second = (0.5, 0.25)
     others = [piece for piece in found.components if piece.reason == FAR
-              and max(piece.size) >= SECOND[0] * body and piece.points >= SECOND[1] * points]
+              and max(piece.size) >= second[0] * body and piece.points >= second[1] * points]
     return [f"a piece {max(piece.size):.2f} m large with {piece.points} points was left out: a second person?"
             for piece in others[:1]]
 
@@ -96,7 +95,8 @@ def take_clutter(scan: Mesh | np.ndarray) -> tuple[Mesh | np.ndarray, float]:
     except ValueError:                 # nothing would be left
         return scan, 0.0
     removed = 1 - float(cleaned.kept.mean())
-    return (cleaned.scan, removed) if 0 < removed <= LITTLE and not cleaning_doubts(cleaned) else (scan, 0.0)
+    # share of a scan that may be taken off unasked: floor, chair and specks have 0.1
+    return (cleaned.scan, removed) if 0 < removed <= 0.2 and not cleaning_doubts(cleaned) else (scan, 0.0)
 
 
 def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,
@@ -147,8 +147,9 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     row_of[large] = np.arange(len(large))
     label[rest] = len(planes) + row_of[piece]
     body = cKDTree(points[rest[piece == main]])
+    # spacings between the steps of a depth camera on a surface that it sees slantwise
     near = _near_pieces([points[rest[piece == number]] for number in large], int(np.flatnonzero(large == main)[0]),
-                        max(config.gap, STEPS * step))
+                        max(config.gap, 5.0 * step))
     rows = []
     for number in range(int(label.max()) + 1):
         mine = label == number

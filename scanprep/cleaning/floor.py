@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 
 WIDEST = 0.03              # metres: farthest distance of the points that a first guess is fitted to
 SIGMAS = 3.5               # standard deviations from a floor within which points are on it
-MOST_BELOW = 0.01          # share of all points that may lie behind a floor
 
 
 @dataclass(frozen=True)
@@ -48,6 +47,7 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
     few = points[rng.permutation(len(points))[:10_000]]
     tree = cKDTree(few)
     best, best_area = None, min_area
+    most_below = 0.01  # share of all points that may lie behind a floor
     for seed in rng.choice(len(few), min(150, len(few)), replace=False):
         near = few[tree.query_ball_point(few[seed], 2 * WIDEST)]
         if len(near) < 6:
@@ -56,7 +56,7 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
         height = plane.height(few)
         if np.mean(height < -WIDEST) > np.mean(height > WIDEST):
             plane, height = plane.flip(), -height
-        if np.mean(height < -WIDEST) > MOST_BELOW:
+        if np.mean(height < -WIDEST) > most_below:
             continue
         area = _area_of_cells(plane.flat(few[np.abs(height) < WIDEST / 2]), WIDEST)
         if area > best_area:
@@ -67,7 +67,7 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
     height = plane.height(points)
     on_it = np.abs(height) <= plane.thickness
     if (plane.noise > 2 * local_noise(points, rng)           # a back is nearly flat, but only nearly
-            or np.mean(height < -WIDEST / 2) > MOST_BELOW
+            or np.mean(height < -WIDEST / 2) > most_below
             or _area_of_cells(plane.flat(points[on_it]), WIDEST) < min_area):
         return None
     return plane

@@ -28,7 +28,6 @@ from .sheet import Sheet
 
 # Of the trial of a hypothesis: fewer points, and one coarse level
 TRIAL = CorrelatedConfig(points=90, levels=(BeliefLevel(900, 60),), iterations=25)
-APART = 0.28                  # of the template's size: an end is the farthest place within it along the surface
 
 
 @one_thread()
@@ -89,11 +88,12 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypothese
     """
     check_template(template)
     size = float(np.sqrt(template.face_areas.sum()))
-    own, ways = _template_ends(template, ends, APART * size)
+    apart = 0.28  # of the template's size: an end is the farthest place within it along the surface
+    own, ways = _template_ends(template, ends, apart * size)
     if len(own) < 3:
         raise ValueError(f"template: expected at least three limbs, found {len(own)} ends")
     sheet = Sheet(target_of(scan), TRIAL.spacing * size)
-    seen, seen_ways = _ends(sheet.points, sheet.distances, ends + 2, APART * size)
+    seen, seen_ways = _ends(sheet.points, sheet.distances, ends + 2, apart * size)
     if len(seen) < 3:
         raise ValueError(f"scan: expected at least three ends of limbs, found {len(seen)}")
     matches = match_ends(ways[:, own], seen_ways[:, seen], hypotheses)

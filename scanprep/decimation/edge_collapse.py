@@ -11,7 +11,6 @@ from .quadrics import curve_quadrics, minimise_quadrics, surface_quadrics, value
 FREE, CURVE, FIXED = 0, 1, 2
 THINNEST = 0.1                       # triangles of less quality (1: equilateral) are not made of better ones
 HOLD = 3e-4                          # weight of the distance to vertices beside that to planes: even size where flat
-PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
 
 
 class Rounds:
@@ -69,8 +68,9 @@ class Rounds:
 
     def _price(self, rows: np.ndarray) -> None:
         """Order the ends of edges (kept first), and set the cost of collapsing them."""
-        for start in range(0, len(rows), PIECE):
-            part = rows[start:start + PIECE]
+        piece = 20_000  # edges priced at once: what stays in the processor's cache
+        for start in range(0, len(rows), piece):
+            part = rows[start:start + piece]
             a, b = self.ends[part].T
             swap = self.kinds[b] > self.kinds[a]
             a, b = np.where(swap, b, a), np.where(swap, a, b)

@@ -12,8 +12,6 @@ from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
 LEAST_AREA, LEAST_RADIUS = 0.075, 0.08  # of what is seen of a body, and of the largest circle in it: a leg has less
-PIECE = 0.003                        # area below which a piece is noise
-APART = 0.08                         # pieces closer than this are one: an arm in front of its body
 THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, cosine within which points are on one
 
 
@@ -146,15 +144,17 @@ def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.nda
     number = _label_pieces(mask, across, down)
     count = np.bincount(number[mask])
     area = np.bincount(number[mask], weights=picture.depth[mask]**2) / np.prod(np.diag(picture.intrinsics)[:2])
-    kept = [i for i in np.argsort(-area) if area[i] > PIECE * size**2 and count[i] > 20]
+    # area below which a piece is noise
+    kept = [i for i in np.argsort(-area) if area[i] > 0.003 * size**2 and count[i] > 20]
     points = picture.points()
     pieces = [number == i for i in kept]
     trees = [cKDTree(points[piece & mask][::3]) for piece in pieces]
     group = list(range(len(kept)))
+    apart = 0.08  # pieces closer than this are one: an arm in front of its body
     for i in range(len(kept)):
         for j in range(i):
-            if group[i] != group[j] and trees[i].query(trees[j].data, distance_upper_bound=APART * size)[0].min() \
-                    < APART * size:
+            if group[i] != group[j] and trees[i].query(trees[j].data, distance_upper_bound=apart * size)[0].min() \
+                    < apart * size:
                 group = [group[j] if g == group[i] else g for g in group]
     found = [np.any([pieces[i] for i in range(len(kept)) if group[i] == g], axis=0) & mask for g in sorted(set(group))]
     return sorted(found, key=lambda piece: -float((picture.depth[piece]**2).sum()))

@@ -16,7 +16,6 @@ from ..ranges import Cell, Cosine, Range, Settings, Share
 from ..repair.manifold import drop_small_components, split_vertices
 
 BLOCK = 4                      # voxels along the side of a block; the smallest piece of the volume that is stored
-TAPER = 0.02                   # metres from its border at which a view has its full weight
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
 
 
@@ -138,7 +137,8 @@ def _prepare(mesh: Mesh, camera: np.ndarray, config: MergeConfig) -> _View:
     normals = smooth_taubin(mesh, 5).vertex_normals                  # noise tilts the single triangles
     cosine = np.einsum("nd,nd->n", normals, towards)
     angle = np.clip((cosine - config.min_cosine) / (1 - config.min_cosine), 0, 1)
-    border = border_distance(mesh, TAPER) / TAPER
+    taper = 0.02  # metres from its border at which a view has its full weight
+    border = border_distance(mesh, taper) / taper
     return _View(mesh, camera, Rays(mesh), np.clip(cosine, config.min_cosine, 1), angle * border)
 
 

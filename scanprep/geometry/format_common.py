@@ -18,7 +18,6 @@ FARTHEST = 1e9                       # of a coordinate, in whatever unit
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 _SPELLED = {"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm", "centimetres": "cm",
             "centimeters": "cm", "inches": "in"}
-PERSON = 1.3, 2.3                    # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
 
 
 class MeshFileError(storage.StorageError):
@@ -105,7 +104,8 @@ def metres_of(unit: str | None) -> float:
 
 def guess_unit(extent: float) -> str | None:
     """The unit in which `extent` is that of a person, other than metres; None where none is or several may be."""
-    likely = [unit for unit in ("mm", "cm", "in") if PERSON[0] <= extent * UNITS[unit] <= PERSON[1]]
+    person = 1.3, 2.3  # metres: half-grown to arms stretched out; 51 to 91 are inches, 130 to 230 cm
+    likely = [unit for unit in ("mm", "cm", "in") if person[0] <= extent * UNITS[unit] <= person[1]]
     return likely[0] if len(likely) == 1 else None
 
 

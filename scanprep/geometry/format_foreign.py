@@ -20,7 +20,6 @@ POINTS = (".e57", ".ptx")
 _EXPORTS = {**dict.fromkeys((".las", ".laz"), "CloudCompare (File > Save as) makes PLY of it"),
             **dict.fromkeys((".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz"),
                             "Blender (File > Open or Import, then Export) makes GLB of it")}
-_SECONDS = 600                       # for one file: a cloud of 2 GB takes 90
 
 
 def advice(ending: str) -> str:
@@ -35,15 +34,16 @@ def read(path: Path, data: bytes) -> Contents:
     """
     if path.suffix.lower() == ".gz":
         raise MeshFileError(f"{path}: a packed file of this format is not read here: unpack it first")
+    seconds = 600  # for one file: a cloud of 2 GB takes 90
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "read.npz"
         command = [sys.executable, "-m", "scanprep.adapters.pymeshlab_filters", str(path.absolute()), str(made)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [*sys.path]))}
         try:
             done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True,
-                                  timeout=_SECONDS, stdin=subprocess.DEVNULL, check=False)
+                                  timeout=seconds, stdin=subprocess.DEVNULL, check=False)
         except subprocess.TimeoutExpired:
-            raise MeshFileError(f"{path}: MeshLab did not read it within {_SECONDS} s") from None
+            raise MeshFileError(f"{path}: MeshLab did not read it within {seconds} s") from None
         if done.returncode or not made.exists():
             reason = (done.stderr.strip().splitlines() or [f"it ended with code {done.returncode}"])[-1]
             raise MeshFileError(f"{path}: MeshLab cannot read it ({reason[:300]})")

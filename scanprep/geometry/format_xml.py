@@ -14,7 +14,6 @@ from . import rotations, storage
 from .format_common import Contents, MeshFileError, polygons, strip_triangles
 
 _METRES = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
-_UNPACKED = 100              # bytes of XML for one of a zip: meshes have about ten
 _DEEPEST = 100               # nodes below nodes, components of components
 
 
@@ -183,14 +182,15 @@ def _source(ids: dict[str, ElementTree.Element], element: ElementTree.Element) -
 
 def read_3mf(path: Path, data: bytes) -> Contents:
     """The meshes that a 3MF file builds, in the unit that it names; supports are left out."""
+    unpacked = 100  # bytes of XML for one of a zip: meshes have about ten
     with (storage.taking_apart(path, "a whole 3MF file", MeshFileError), np.errstate(all="ignore"),
           zipfile.ZipFile(io.BytesIO(data)) as archive):
-        if sum(info.file_size for info in archive.infolist()) > 2**24 + _UNPACKED * len(data):
+        if sum(info.file_size for info in archive.infolist()) > 2**24 + unpacked * len(data):
             raise ValueError("it would unpack to far more than a mesh has")
         names = {"/" + name.lower().lstrip("/"): name for name in archive.namelist()}
         links = _parse(archive.read(names["/_rels/.rels"]))
         start = next(e.attrib["Target"] for e in links.iter("Relationship") if e.attrib["Type"].endswith("3dmodel"))
-        scene, parts = _Scene(path, 10**6 + 4 * _UNPACKED * len(data)), dict[str, ElementTree.Element]()
+        scene, parts = _Scene(path, 10**6 + 4 * unpacked * len(data)), dict[str, ElementTree.Element]()
 
         def part(name: str) -> ElementTree.Element:
             key = "/" + name.lower().lstrip("/")

@@ -18,7 +18,6 @@ from .sparse import label_components
 from .surface import Rays
 
 SAMPLES = 400            # triangles of each patch that look for what is in front of them and behind
-REACH = 0.15             # of the diagonal, that a ray goes: through a trunk, but not across a room
 
 
 def sanitise(scan: Mesh, name: str = "scan") -> Mesh:
@@ -139,7 +138,8 @@ def _inside_out(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     rank = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
     # rays of each, to either side
     some = np.repeat(order[rank < SAMPLES], 4)
-    around, reach = _directions(mesh.face_normals[some], rng), REACH * float(np.linalg.norm(np.ptp(
+    # of the diagonal, that a ray goes: through a trunk, but not across a room
+    around, reach = _directions(mesh.face_normals[some], rng), 0.15 * float(np.linalg.norm(np.ptp(
         mesh.vertices, axis=0)))
     start, off = mesh.corners[some].mean(axis=1), 1e-4 * reach * mesh.face_normals[some]
     rays = Rays(mesh)

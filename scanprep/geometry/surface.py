@@ -11,17 +11,16 @@ from scipy.spatial import cKDTree
 from ..threads import search_threads
 from .mesh import Mesh
 
-FARTHEST = 1e30                      # metres; the square of what lies beyond, or its float32, is infinite
-
 
 def check_points(points: np.ndarray, name: str = "points") -> np.ndarray:
     """Query points (n, 3) as float64, in one block; ValueError for one too far away for any library."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name}: expected points of shape (n, 3), got shape {points.shape}")
-    bad = np.flatnonzero(~(np.abs(points) < FARTHEST).all(axis=1))
+    farthest = 1e30  # metres; the square of what lies beyond, or its float32, is infinite
+    bad = np.flatnonzero(~(np.abs(points) < farthest).all(axis=1))
     if len(bad):
-        raise ValueError(f"{name}: {len(bad)} points are not finite, or beyond {FARTHEST:g} m; the first is number "
+        raise ValueError(f"{name}: {len(bad)} points are not finite, or beyond {farthest:g} m; the first is number "
                          f"{bad[0]}: {points[bad[0]].tolist()}")
     return points
 

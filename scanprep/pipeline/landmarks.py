@@ -39,14 +39,12 @@ from .scans import ScanTask, find_scans
 
 SET, TABLE = "set", "landmarks.csv"
 POINTS = "points/"               # before the names of the results that are landmarks of a scan
-NEAR = 0.01                      # of the body's size: as far off, the scan has no data; `Registration.uncovered` has it
 # Names whose places end or bend sharply, so that the surface holds a landmark there; along other skin it slides.
 ENDS = {"toe", "heel", "finger", "thumb", "nose", "mouth", "chin", "eye", "ear", "neck"}
 # Metres, on a body of the size of a man. Two of three landmarks were within these on six men who are not the template;
 # joints and trunk were alike. And the share of the way to the nearest data by which errors grow, on poses from the
 # front. Both by tests/benchmarks/found_landmarks.py FOLDER --set tuning.
 ERRORS, MAN, ACROSS = {"end": 0.005, "skin": 0.026}, 1.4, 0.3
-CHECKED = 2.0                    # on a scan to be looked at, where a limb or the head may be elsewhere
 COLUMNS = ("scan", "landmark", "x", "y", "z", "expected_error_mm", "data", "verdict")
 
 
@@ -223,8 +221,9 @@ def points_on_scan(scan: Mesh | np.ndarray, body: Mesh, vertices: np.ndarray) ->
     # the other side of a thin limb is near too: points count that face as the body does
     scale = size(body)
     target = orient_by_mesh(target_of(scan), body, NORMALS * scale)
+    # of the body's size: as far off, the scan has no data; `Registration.uncovered` has it
     match = OrientedPoints(target.points, target.normals, NORMALS * scale).match(
-        body.vertices, body.vertex_normals, NEAR * scale)
+        body.vertices, body.vertex_normals, 0.01 * scale)
     seen, points = match.valid[vertices], body.vertices[vertices]
     gaps = np.where(seen, 0.0, np.inf)
     if match.valid.any():
@@ -256,7 +255,8 @@ def landmark_errors(found: ScanLandmarks, verdict: str) -> np.ndarray:
     # an end without data is not held by its shape: hands seen from the front came out short
     places = np.where(found.seen, [place_of(name) for name in found.names], "skin")
     errors = np.array([ERRORS[place] for place in places]) * found.size / MAN + ACROSS * found.gaps
-    return errors * (CHECKED if verdict == "check" else 1.0)
+    # on a scan to be looked at, where a limb or the head may be elsewhere
+    return errors * (2.0 if verdict == "check" else 1.0)
 
 
 def landmark_rows(found: Mapping[str, ScanLandmarks], verdicts: Mapping[str, str]) -> Iterator[tuple[object, ...]]:

@@ -38,7 +38,6 @@ from .rivals import RIVALS, doubt_rival
 
 PICTURES, PAGE = "pictures", "report.html"
 WIDTH, HEIGHT = 150, 216
-FEW = 6                     # scans that turn where fewer need a look
 MOST_CARRIED = 4_000_000    # bytes of pictures in the page itself, of the worst scans; the others stay files beside it
 FAR = 0.005                 # of the template's size: the dark end of the distances
 TURN = 20.0                 # degrees from the front
@@ -67,7 +66,8 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     shots = [folder / pictures_place(entries.get(verdict.name)) / verdict.name for verdict in verdicts]
     scenes = worst_that_turn([shot.with_name(f"{shot.name}.scene") for shot in shots])
     pictures = embed_files((shot.with_name(f"{shot.name}.webp") for shot in shots), MOST_CARRIED)
-    look = max(FEW, sum(verdict.suspect or verdict.failed for verdict in verdicts))
+    # scans that turn where fewer need a look
+    look = max(6, sum(verdict.suspect or verdict.failed for verdict in verdicts))
     for number, (verdict, scene, picture) in enumerate(zip(verdicts, scenes, pictures, strict=True)):
         entry = entries.get(verdict.name)
         shown = _scan_view(page, folder, pictures_place(entry), verdict.name, picture, scene if number < look else None)

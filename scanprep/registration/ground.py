@@ -27,7 +27,6 @@ NEAR = 0.04                  # metres from the skin of the feet within which poi
 FLAT = 0.002                 # metres from the plane within which a scan that ends flat ends
 REACH = 0.015                # metres along the floor between the outline of a foot and where the scan ends
 WALL = 0.006                 # metres above the floor where feet have an outline, wherever their soles came to lie
-FACING = 0.7                 # cosine to the vertical of what is sole, and no wall
 LEVEL = 0.7                  # cosine between the normal of a floor and the way from the feet to the rest of the body
 TRIED, ENDS = 500, 12        # planes through three points, and points that a plane is fitted to at least
 
@@ -147,9 +146,10 @@ def find_floor(body: Mesh, feet: np.ndarray, points: np.ndarray, normals: np.nda
     # share of the outline of the feet along which the scan ends there; seen from in front 0.67
     if not len(outline) or length @ (apart < REACH) < 0.7 * length.sum():
         return None
-    flat = near[(normals @ floor.normal < -FACING) & (np.abs(floor.height(near)) < FLAT)]
+    facing = 0.7  # cosine to the vertical of what is sole, and no wall
+    flat = near[(normals @ floor.normal < -facing) & (np.abs(floor.height(near)) < FLAT)]
     # what is beyond the end of the scan: an arch above it is seen where the rest of the sole is cut away
-    soles = x[feet & (height < 0) & (body.vertex_normals @ floor.normal < -FACING)]
+    soles = x[feet & (height < 0) & (body.vertex_normals @ floor.normal < -facing)]
     if not len(flat) or not len(soles):
         return floor
     scanned = cKDTree(floor.flat(flat)).query(floor.flat(soles))[0] < REACH / 2

@@ -25,9 +25,6 @@ from ..synthetic.people import PARENTS, PARTS, SyntheticPerson
 from .nonrigid import Registration, register, share_stretched
 from .schedule import RegistrationConfig
 
-LIMB_ENDS = 5                          # head, hands and feet
-MATCHING = 30                          # per cent of the time, before the person is registered
-
 
 @dataclass(frozen=True, eq=False)
 class PersonParts:
@@ -90,7 +87,8 @@ def _find_parts(template: Mesh, tell: Callable[[int, int], None]) -> PersonParts
 def has_limbs(template: Mesh) -> bool:
     """Whether a template has the ends of five limbs, as head, hands and feet of a person."""
     try:
-        return len(find_seeds(average_person().mesh, template)) >= LIMB_ENDS
+        # head, hands and feet
+        return len(find_seeds(average_person().mesh, template)) >= 5
     except ValueError:             # it has too few ends of limbs
         return False
 
@@ -99,6 +97,7 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
                tell: Callable[[int, int], None]) -> Registration | None:
     """The average person on a template, led by landmarks or by the ends of limbs; None where it does not lie on it."""
     person = average_person().mesh
+    matching = 30  # per cent of the time, before the person is registered
     if landmarks is not None:
         fit = register(person, template, landmarks, config, tell)
     else:
@@ -106,9 +105,9 @@ def _person_on(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None, 
             return None
         seeds = find_seeds(person, template)
         pairs = find_correspondences(person, template, (seeds.template_vertices, seeds.scan_points),
-                                     progress=lambda done, total: tell(round(MATCHING * done / total), 100))
+                                     progress=lambda done, total: tell(round(matching * done / total), 100))
         fit = register(person, template, None, config, correspondences=pairs, progress=lambda done, total: tell(
-            round(MATCHING + (100 - MATCHING) * done / total), 100))
+            round(matching + (100 - matching) * done / total), 100))
     # shares of a template and of the person on it beyond which it is no person
     return None if fit.uncovered > 0.02 or share_stretched(person, fit.mesh) > 0.05 else fit
 

@@ -26,7 +26,6 @@ from .rolls import other_rolls
 from .schedule import RegistrationConfig
 
 LESS_DOUBTED = 0.1                     # 1 is a doubt where it begins
-LESS_COVERED = 0.001                   # share of the scan
 
 
 @near_origin
@@ -88,10 +87,11 @@ def repair_limbs(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, par
 
 def better(template: Mesh, parts: PersonParts, trial: Registration, fit: Registration) -> bool:
     """Whether less is to be doubted in a registration than in another, on the scan as well and no more stretched."""
+    less_covered = 0.001  # share of the scan
     return (severity(limb_doubts(template, parts, trial.mesh.vertices)) + LESS_DOUBTED
             < severity(limb_doubts(template, parts, fit.mesh.vertices))
-            and trial.uncovered <= fit.uncovered + LESS_COVERED
-            and not trial.landmark_rms > fit.landmark_rms + LESS_COVERED * size(template)
+            and trial.uncovered <= fit.uncovered + less_covered
+            and not trial.landmark_rms > fit.landmark_rms + less_covered * size(template)
             and strain(template, trial.mesh) <= strain(template, fit.mesh))
 
 

@@ -28,12 +28,10 @@ from .schedule import RegistrationConfig
 
 FEW = 7                              # landmarks from which on they lead a template alone
 CLEARLY = 0.8                        # of the doubts that the first leaves, below which another registration is better
-EXCHANGED = 10.0                     # doubts that exchanged sides count as: more than any limb
 # Doubts that the model's bodies leave, from which on correspondences are tried too. Below, on six poses and two men,
 # they led to the same within a millimetre, or 3 mm farther off, and took a minute.
 GRAVE = 3.0
 UNCOVERED = 0.005                    # share of the scan off the template, from which on a limb may be lost
-WORST = 0.1                          # share of the vertices that tells two bodies apart: about that of an arm
 RIVAL = "another body explains the scan as well"
 
 
@@ -115,7 +113,8 @@ def find_rival(template: Mesh, best: Candidate, candidates: Sequence[Candidate])
     def apart(fit: Registration) -> float:
         shown = fit.seen | best.fit.seen
         far = np.sort(np.linalg.norm(fit.mesh.vertices - best.fit.mesh.vertices, axis=1)[shown])
-        return float(far[-max(1, int(WORST * len(far))):].mean()) if len(far) else 0.0
+        # share of the vertices that tells two bodies apart: about that of an arm
+        return float(far[-max(1, int(0.1 * len(far))):].mean()) if len(far) else 0.0
 
     others = [one for one in candidates if CLEARLY * one.doubt <= best.doubt and apart(one.fit) > HAND * size(template)]
     return min(others, key=attrgetter("doubt"), default=None)
@@ -127,7 +126,8 @@ def weigh_doubts(template: Mesh, parts: PersonParts | None, fit: Registration) -
     Each counts 1 where it begins to be doubted; 0 where nothing does.
     """
     lost = fit.uncovered / UNCOVERED
-    limbs = 0.0 if parts is None else severity(limb_doubts(template, parts, fit.mesh.vertices)) + EXCHANGED * (
+    # doubts that exchanged sides count as: more than any limb
+    limbs = 0.0 if parts is None else severity(limb_doubts(template, parts, fit.mesh.vertices)) + 10.0 * (
         find_exchanged_sides(template, parts, fit.mesh.vertices) is not None)
     return limbs + (lost if lost > 1 else 0.0)
 

@@ -70,9 +70,6 @@ def _met(points: np.ndarray, owner: np.ndarray, ahead: np.ndarray, number: int, 
     return np.asarray(shares)
 
 
-LARGEST = 120            # vertices of a loop whose triangulation is found by dynamic programming as a whole
-
-
 def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.ndarray,
                      price: np.ndarray | None = None) -> np.ndarray | None:
     """The triangles (n - 2, 3) across a loop (n, 3) that bend least and, where nothing bends, have the smallest area.
@@ -154,10 +151,11 @@ def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray
             return None
         return float(np.linalg.norm(points[a] - points[b])), i, a, b
 
-    heap = [e for e in map(entry, range(n)) if e] if n > LARGEST else []
+    largest = 120  # vertices of a loop whose triangulation is found by dynamic programming as a whole
+    heap = [e for e in map(entry, range(n)) if e] if n > largest else []
     heapq.heapify(heap)
     left = n
-    while heap and left > LARGEST:
+    while heap and left > largest:
         _, i, a, b = heapq.heappop(heap)
         if not alive[i] or before[i] != a or after[i] != b:
             continue

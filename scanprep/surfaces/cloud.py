@@ -12,7 +12,6 @@ from ..geometry.mesh import Mesh
 from ..repair.manifold import repair
 
 MOST = 40_000                          # points that are meshed: 7 mm apart on a person, as the triangles of a template
-LEAST = 100                            # points of anything that has a surface
 AWAY = 2.5                             # metres from which cameras look at people
 
 
@@ -106,7 +105,8 @@ def _thin(cloud: PointCloud | np.ndarray) -> tuple[np.ndarray, np.ndarray | None
     points = cloud.points if isinstance(cloud, PointCloud) else np.asarray(cloud, dtype=np.float64)
     normals = cloud.normals if isinstance(cloud, PointCloud) else None
     rows = np.unique(points, axis=0, return_index=True)[1]
-    if len(rows) < LEAST:
-        raise ValueError(f"cloud: expected at least {LEAST} points at different places, got {len(rows)}")
+    least = 100  # points of anything that has a surface
+    if len(rows) < least:
+        raise ValueError(f"cloud: expected at least {least} points at different places, got {len(rows)}")
     rows = np.random.default_rng(0).permutation(rows)[:MOST]
     return points[rows], None if normals is None else normals[rows]

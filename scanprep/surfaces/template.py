@@ -23,8 +23,6 @@ from ..skeleton.symmetry import find_symmetry
 from ..words import number_of
 from .cloud import AWAY, mesh_of_cloud, mesh_of_view
 
-OFF = 0.01                             # metres from the template at which a landmark was clicked on something else
-
 
 @dataclass(frozen=True)
 class TemplateConfig(Settings):
@@ -207,8 +205,9 @@ def carry_landmarks(places: Mapping[str, np.ndarray], mesh: Mesh) -> tuple[dict[
         return {}, {}
     points = np.array(list(places.values()))
     away, vertices = Surface(mesh).closest(points).distances, cKDTree(mesh.vertices).query(points)[1]
+    # metres from the template at which a landmark was clicked on something else
     return (dict(zip(places, vertices.tolist(), strict=True)),
-            {name: float(d) for name, d in zip(places, away, strict=True) if d > OFF})
+            {name: float(d) for name, d in zip(places, away, strict=True) if d > 0.01})
 
 
 def share_on_left(mesh: Mesh) -> float | None:

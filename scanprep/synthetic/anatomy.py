@@ -17,8 +17,6 @@ __all__ = ["MIRROR_PART", "PARENTS", "PARTS", "BodyShape", "RestFrames"]
 Sex = Literal["female", "male"]
 # of arms from the vertical, of forearms further ahead, of legs sideways and to behind, of feet from straight ahead
 ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, LEG_LEAN, TOE_OUT = np.radians([36.0, 14.0, 6.0, 2.3, 9.0])
-RAREST = 3.0                         # standard deviations: rarer people are so small or odd that results are doubted
-AVERAGE_STATURE = 1.75               # metres: lengths in tables of muscles and poses are those of somebody this tall
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,8 @@ class BodyShape:
         mean, covariance = population().moments[sex]
         root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(mean)))
         z = rng.standard_normal(len(mean))
-        while (far := np.abs(z) > RAREST).any():
+        # standard deviations: rarer people are so small or odd that results are doubted
+        while (far := np.abs(z) > 3.0).any():
             z[far] = rng.standard_normal(far.sum())
         return BodyShape(sex, tuple(mean + root @ z))
 
@@ -90,7 +89,8 @@ class RestFrames:
         n = len(population().weights)
         self.vertices, self.joints, self.ends, self.eye = rows[:n], rows[n:n + 16], rows[n + 16:n + 32], rows[n + 32]
         self.stature = float(self.vertices[:, 2].max())
-        self.scale = self.stature / AVERAGE_STATURE
+        # metres: lengths in tables of muscles and poses are those of somebody this tall
+        self.scale = self.stature / 1.75
 
         def put(side: float, front: float, up: float) -> np.ndarray:
             return np.array([side, -front, up])

@@ -6,9 +6,6 @@ import secrets
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-LONGEST_LINE = 200                   # characters of one line about a request
-LONGEST_NAME = 120                   # characters of the name of a stored file
-
 
 class Gate:
     """The secret of one server, and what a request must show to pass.
@@ -59,7 +56,8 @@ def same(secret: str, given: str) -> bool:
 def one_line(text: str) -> str:
     """Text of a request, fit for a terminal: no control characters, no line ends, not long."""
     text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= LONGEST_LINE else text[:LONGEST_LINE] + "..."
+    longest_line = 200  # characters of one line about a request
+    return text if len(text) <= longest_line else text[:longest_line] + "..."
 
 
 def file_name(name: str) -> str:
@@ -68,7 +66,8 @@ def file_name(name: str) -> str:
     last = re.sub(r"[^\w .()+-]", "_", last).strip(" ")
     if not last.strip(". "):
         raise ValueError("name: expected the name of a file")
-    return last if len(last) <= LONGEST_NAME else last[-LONGEST_NAME:].lstrip(" ")
+    longest_name = 120  # characters of the name of a stored file
+    return last if len(last) <= longest_name else last[-longest_name:].lstrip(" ")
 
 
 def file_inside(folders: Iterable[Path], name: str) -> Path:

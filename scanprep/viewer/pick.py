@@ -30,9 +30,6 @@ from .worker import Stopped
 
 TEMPLATE, SCAN = 0, 1                # panes
 ENOUGH = 4                           # landmarks from which the others can be predicted
-# of a scan's size, 13 cm on a person: of 192 landmarks predicted after four the worst was 7 cm off; left and right of
-# one kind are 15 cm apart or more, but for the eyes, 7 cm
-FAR = 0.06
 
 
 @dataclass(frozen=True)
@@ -160,12 +157,15 @@ class PickApp:
             return
         self.building |= pane == TEMPLATE
         self._change(self._number(pane), {self._scan_named(name): place}, drag)
+        # of a scan's size, 13 cm on a person: of 192 landmarks predicted after four the worst was 7 cm off; left and
+        # right of one kind are 15 cm apart or more, but for the eyes, 7 cm
+        far = 0.06
         if not drag:
             self.choose_next(name, pane)
             # a click on the scan that is far from where the landmark was predicted is questioned
             expected = one.predicted.get(name)
             away = 0.0 if expected is None else float(np.linalg.norm(place - expected))
-            if pane == SCAN and away > FAR * extent(one.body.points):
+            if pane == SCAN and away > far * extent(one.body.points):
                 self.chosen, self.alternating = name, None
                 self.question = {"name": name, "away": away,
                                  "text": f"This is {100 * away:.0f} cm from where “{name}” was expected: keep it?"}

@@ -18,8 +18,6 @@ from scanprep.ranges import TURNS
 
 from ..files.text import table_numbers
 
-USUAL_RATE = 30.0                    # frames a second between keys
-MOST_FRAMES = 200_000                # nearly two hours of them; more are times in other units than seconds
 PLACE = ("trans_x", "trans_y", "trans_z")
 
 
@@ -82,9 +80,11 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     if len(wrong):
         raise storage.StorageError(f"{path}: line {lines[wrong[0]]}: expected a time in seconds that is later than "
                                    f"that of the key before, found {times[wrong[0]]:g}")
-    rate = rate or USUAL_RATE
+    # frames a second between keys
+    rate = rate or 30.0
     span = (times[-1] - times[0]) * rate
-    if span >= MOST_FRAMES:
+    # nearly two hours of them; more are times in other units than seconds
+    if span >= 200_000:
         raise storage.StorageError(f"{path}: expected times in seconds, those from {times[0]:g} to {times[-1]:g} would "
                                    f"be {span:.3g} frames at {rate:g} a second")
     at = times[0] + np.arange(int(span + 1e-6) + 1) / rate

@@ -10,7 +10,6 @@ from ..pose.marked_body import median_of_known, stretches
 from .results import ArtefactConfig, BadKind, BadSpan
 
 SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within a tenth of a second
-STRAY_SMOOTH = 3.0                   # times the limit that a stray takes where no track jumps
 
 
 def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: ArtefactConfig,
@@ -131,7 +130,8 @@ def _stray(away: np.ndarray, limit: np.ndarray, jumps: np.ndarray, gap: np.ndarr
     All (n,): metres from its usual place and how far that may be; how far its track jumps there; after a gap.
     """
     leap, jumped = 0.5, 0.5         # share of the displacement that a jump is; of the limit that does between two jumps
-    out = away > STRAY_SMOOTH * limit
+    stray_smooth = 3.0  # times the limit that a stray takes where no track jumps
+    out = away > stray_smooth * limit
     ends = np.r_[0, np.flatnonzero((jumps > 0) | gap), len(away)]
     leaps, gaps = np.r_[jumps, 0.0], np.r_[gap, False]
     for begin, end in pairwise(ends):
@@ -141,6 +141,6 @@ def _stray(away: np.ndarray, limit: np.ndarray, jumps: np.ndarray, gap: np.ndarr
         torn = [leaps[at] > leap * far for at in (begin, end)]
         open_ended = [gaps[at] or at in (0, len(away)) for at in (begin, end)]
         both = all(a or b for a, b in zip(torn, open_ended, strict=True))
-        share = jumped if all(torn) else 1.0 if any(torn) and both else STRAY_SMOOTH
+        share = jumped if all(torn) else 1.0 if any(torn) and both else stray_smooth
         out[begin:end] |= far > share * np.median(limit[begin:end])
     return out

@@ -23,7 +23,6 @@ from .text import MarkerFileError, RawMarkers, distinct_labels
 BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 MOST_FRAMES = 65535                  # that the header can count: it means so many or more
-RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
 
@@ -299,7 +298,8 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     fresh = np.empty((*positions.shape[:2], 4))
     fresh[..., :3] = positions / scale
     old = np.take_along_axis(words[:, mine, 3], np.maximum(source, 0), axis=1)
-    fresh[..., 3] = np.where(source < 0, 0.0, np.where(old < RESIDUAL, old + RESIDUAL, old))
+    residual = 256  # one step of the residual in the fourth number of a point; below it are cameras
+    fresh[..., 3] = np.where(source < 0, 0.0, np.where(old < residual, old + residual, old))
     same = (source == np.arange(len(mine))) & (words[:, mine, 3] >= 0)
     fresh[same, :3] = words[:, mine][same, :3]                         # not a bit of them changes
     fresh[np.isnan(positions[..., 0])] = [0, 0, 0, -1]

@@ -20,8 +20,6 @@ from .c3d import (
 )
 from .text import MarkerFileError
 
-_MOST = 255                          # values along one dimension of a parameter, and blocks of all parameters
-
 
 def add_points(path: Path, data: bytes, labels: Sequence[str], descriptions: Sequence[str], positions: np.ndarray,
                unit: str | None = None) -> bytes:
@@ -103,17 +101,18 @@ def _section(path: Path, data: bytes, begin: int, table: PointTable, labels: lis
         and not (before_rotations and (number, name) == (turned, "DATA_START"))]
     order = table.numbers.order
     kept.append(_parameter(group, "USED", b"\x02\x00" + struct.pack(f"{order}H", len(labels))))
+    most = 255  # values along one dimension of a parameter, and blocks of all parameters
     for name, texts in (("LABELS", labels), ("DESCRIPTIONS", descriptions)):
-        for part, first in enumerate(range(0, len(texts), _MOST), start=1):
-            some = texts[first:first + _MOST]
-            width = min(max(map(len, some), default=1) or 1, _MOST)
+        for part, first in enumerate(range(0, len(texts), most), start=1):
+            some = texts[first:first + most]
+            width = min(max(map(len, some), default=1) or 1, most)
             cells = b"".join(text.encode("latin-1", "replace")[:width].ljust(width) for text in some)
             kept.append(_parameter(group, name + (str(part) if part > 1 else ""),
                                    bytes([255, 2, width, len(some)]) + cells))
     starts = [_parameter(group, "DATA_START", b"\x02\x00\x00\x00")]
     starts += [_parameter(turned, "DATA_START", b"\x02\x00\x00\x00")] if before_rotations else []
     blocks = -(-(4 + sum(len(record) + 2 for record in [*kept, *starts])) // BLOCK)
-    if blocks > _MOST:
+    if blocks > most:
         raise MarkerFileError(f"{path}: expected room for more points, the C3D parameters are full")
     first = begin // BLOCK + blocks + 1
     kept += [start[:-3] + struct.pack(f"{order}H", place) + start[-1:]

@@ -13,10 +13,6 @@ from .tracks import mean_along_tracks
 ALONE, AWAY = 6.0, 8.0
 WINDOW = 0.25                        # seconds to either side over which a track is judged
 MISSING = 0.3                        # share of frames below which a marker is sought elsewhere on its part of the body
-REACH = 0.25                         # metres from its usual place within which it is sought
-TIGHT = 0.03                         # metres within which it keeps its place on the part
-OFTEN = 0.5                          # share of frames in which a point has to be there
-FRAMES = 300                         # in which it is sought, at most
 
 
 def elect(votes: np.ndarray, tracks: np.ndarray) -> np.ndarray:
@@ -124,9 +120,11 @@ def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, 
     free = np.isfinite(points[..., 0])
     frames, rows = np.nonzero(columns >= 0)
     free[frames, columns[frames, rows]] = False
-    some = np.unique(np.linspace(0, len(points) - 1, FRAMES).astype(int))
+    # in which it is sought, at most
+    some = np.unique(np.linspace(0, len(points) - 1, 300).astype(int))
     missing = (columns >= 0).mean(axis=0) < MISSING
     (usual, _), offsets = mean_offsets(points, columns, places, turns), np.zeros((columns.shape[1], 3))
+    reach = 0.25  # metres from its usual place within which it is sought
     for of in np.unique(part[missing]):
         mine, known = np.flatnonzero(missing & (part == of)), np.flatnonzero(~missing & (part == of))
         # everything in the axes of the part, from the first of its missing markers
@@ -135,12 +133,13 @@ def find_displaced(points: np.ndarray, columns: np.ndarray, places: np.ndarray, 
         wanted += np.median(usual[known], axis=0) if len(known) else 0.0
         frame, column = np.nonzero(free[some])
         local = np.einsum("nji,nj->ni", R[frame], points[some[frame], column] - origin[frame])
-        near = (np.linalg.norm(local[:, None] - wanted, axis=2) < REACH).any(axis=1)
-        found = _steady_places(local[near], frame[near], OFTEN * len(some))
+        near = (np.linalg.norm(local[:, None] - wanted, axis=2) < reach).any(axis=1)
+        # share of frames in which a point has to be there
+        found = _steady_places(local[near], frame[near], 0.5 * len(some))
         if len(found):
             apart = np.linalg.norm(wanted[:, None] - found, axis=2)
             for row, place in zip(*linear_sum_assignment(apart), strict=True):
-                if apart[row, place] < REACH:
+                if apart[row, place] < reach:
                     begin = np.einsum("tji,tj->ti", R, places[some, mine[row]] - origin).mean(axis=0)
                     offsets[mine[row]] = found[place] - begin
     return offsets
@@ -151,7 +150,8 @@ def _steady_places(local: np.ndarray, frame: np.ndarray, often: float) -> np.nda
     places = list[np.ndarray]()
     while len(local):
         tries = local[:: max(1, len(local) // 500)]
-        close = ((tries[:, None] - local)**2).sum(axis=-1) < TIGHT**2
+        # metres within which it keeps its place on the part
+        close = ((tries[:, None] - local)**2).sum(axis=-1) < 0.03**2
         counts = [len(np.unique(frame[each])) for each in close]
         best = close[int(np.argmax(counts))]
         if max(counts) < often:

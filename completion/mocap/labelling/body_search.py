@@ -22,14 +22,9 @@ from ..pose.marked_body import MarkedBody
 
 ALONE = 0.8                          # cost of a marker without a point; a match costs 1/2 at its scale, at most 1
 JUDGED = 0.08                        # metres, the scale at which the final matches of a frame are judged
-LIKELY = 0.0003                      # cost of a squared deviation of the pose, which tells a head or foot turned about
-POSES = 120                          # poses of people that are tried, beside the typical ones of the model
 TURNS = 16                           # about the axis along which the body is long
-KEPT = 40                            # candidates whose poses are solved for
 FIRST, REST = 2, 6                   # rounds of all rigid candidates, and of the promising ones
 PROMISING = 300
-WIDE = 0.25                          # metres, scale of the distances while candidates are laid as rigid bodies
-CLEAR = 0.2                          # misfit below which no other axis is tried; wrong ones leave 0.29 at least
 SD = 0.03                            # metres: the mean person carries the markers only roughly
 # scale of the matches, metres, and weight of the pose prior, of each round of solves
 ROUNDS = ((0.3, 3.0), (0.2, 3.0), (0.2, 1.0), (0.15, 1.0), (0.12, 1.0), (0.1, 1.0), (0.1, 1.0))
@@ -100,7 +95,8 @@ class BodySearch:
         fixed = body.body
         assert fixed.pose_mean is not None and fixed.pose_covariance is not None, "a marked body has a pose prior"
         typical = typical_poses(fixed.pose_mean, fixed.pose_covariance, axes=6)
-        people = human_poses(subject.template, subject.skeleton, POSES, np.random.default_rng(0))
+        # poses of people that are tried, beside the typical ones of the model
+        people = human_poses(subject.template, subject.skeleton, 120, np.random.default_rng(0))
         self.poses = typical if people is None else np.concatenate([typical, people])
         self.limbs = limb_trees(subject.skeleton)
         self.upright = long_axis(subject.template)
@@ -110,7 +106,8 @@ class BodySearch:
         """The best body in a frame of points (N, 3), metres, whose long axis is along one of some axes of the file."""
         best = self._find_along(points, axes[0])
         for axis in axes[1:]:
-            if best.misfit < CLEAR:
+            # misfit below which no other axis is tried; wrong ones leave 0.29 at least
+            if best.misfit < 0.2:
                 break
             best = min(best, self._find_along(points, axis), key=lambda placement: placement.misfit)
         return best
@@ -121,7 +118,8 @@ class BodySearch:
         n = self.body.body.n_angles
         centre = points.mean(axis=0)
         R, t, scores = lay_rigidly(at + centre, points)
-        best = np.argsort(scores)[:KEPT]
+        # candidates whose poses are solved for
+        best = np.argsort(scores)[:40]
         x, moved = x[best].copy(), np.einsum("bij,blj->bli", R[best], at[best] + centre) + t[best, None]
         x[:, :3] = rotations.log(R[best] @ rotations.exp(x[:, :3]))
         x[:, n:n + 3] += (moved - self.body.positions(x)).mean(axis=1)
@@ -159,7 +157,8 @@ class BodySearch:
         matches, cost = match_points(self.body.positions(x), points, scale)
         pose, _, _ = self.body.body.split(x[None])
         off = self.body.prior.whitening @ (twists(pose).reshape(-1) - self.body.prior.mean)
-        return Placement(x, matches, cost + LIKELY * float(off @ off))
+        # cost of a squared deviation of the pose, which tells a head or foot turned about
+        return Placement(x, matches, cost + 0.0003 * float(off @ off))
 
     def restart_limbs(self, placement: Placement, points: np.ndarray, judged: float) -> Placement:
         """The best placement with one limb after the other from other poses: a foot may be turned about."""
@@ -198,11 +197,12 @@ def _closest_points(at: np.ndarray, points: np.ndarray, R: np.ndarray, t: np.nda
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some rounds of `lay_rigidly` from rotations and translations, and the costs after them."""
     y, length = at @ np.swapaxes(R, 1, 2) + t[:, None], (points**2).sum(axis=-1)
+    wide = 0.25  # metres, scale of the distances while candidates are laid as rigid bodies
     for _ in range(rounds):
         squared = np.maximum((y**2).sum(axis=-1)[..., None] + length - 2 * y @ points.T, 0)
         there, back = squared.argmin(axis=2), squared.argmin(axis=1)
         weights = np.concatenate([squared.min(axis=2), squared.min(axis=1)], axis=1)
-        weights = 1 / (1 + weights / WIDE**2)**2
+        weights = 1 / (1 + weights / wide**2)**2
         source = np.concatenate([y, np.take_along_axis(y, back[..., None], axis=1)], axis=1)
         target = np.concatenate([points[there], np.broadcast_to(points, (len(y), *points.shape))], axis=1)
         weights /= weights.sum(axis=1, keepdims=True)
@@ -215,7 +215,7 @@ def _closest_points(at: np.ndarray, points: np.ndarray, R: np.ndarray, t: np.nda
         t = (step @ (t - c)[..., None])[..., 0] + d
         R = step @ R
     squared = np.maximum((y**2).sum(axis=-1)[..., None] + length - 2 * y @ points.T, 0)
-    return R, t, sum((least / (least + WIDE**2)).mean(axis=1) for least in (squared.min(axis=2), squared.min(axis=1)))
+    return R, t, sum((least / (least + wide**2)).mean(axis=1) for least in (squared.min(axis=2), squared.min(axis=1)))
 
 
 def limb_trees(skeleton: Skeleton) -> list[list[int]]:

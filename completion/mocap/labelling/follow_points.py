@@ -10,13 +10,9 @@ import numpy as np
 from .body_search import ALONE, JUDGED, BodySearch, Placement, assign_columns, robust_weights
 
 EVERY = 0.1                          # seconds between key frames
-HELD = 0.3                           # what a track that has a label costs less with it
-NEAR = 0.15                          # metres from its place beyond which no point keeps a label
 GOOD = 0.7                           # share of markers within 10 cm, below which the body is sought anew
 BETTER = 0.2                         # markers of misfit that a new start has to gain; a turned foot costs 0.3 to 1
 WAIT, LONGEST = 0.5, 2.0             # seconds from a search that found nothing better to the next, doubled each time
-LONE = 2                             # markers and points without each other, from which on limbs are sought anew
-FORCED = 100.0                       # cost of a match that a label which is known forbids
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,8 @@ class Solution:
 
     def labels(self, tracks: np.ndarray) -> dict[int, int]:
         """Track -> marker, of those near their place."""
-        return {int(tracks[self.matches[row]]): int(row) for row in np.flatnonzero(self.near < NEAR)}
+        # metres from its place beyond which no point keeps a label
+        return {int(tracks[self.matches[row]]): int(row) for row in np.flatnonzero(self.near < 0.15)}
 
 
 Solutions = tuple[Solution, ...]     # of each person
@@ -145,7 +142,8 @@ def solve_again(searches: Sequence[BodySearch], keys: Sequence[KeyFrame], found:
         for i in some:
             taken = sum(np.count_nonzero(one.matches >= 0) for one in now[i])
             lone = min(np.count_nonzero(now[i][k].matches < 0), len(keys[i].points) - taken)
-            if now[i][k].strain > usual + BETTER or (lone >= LONE and (i - last) * EVERY >= WAIT):
+            # markers and points without each other, from which on limbs are sought anew
+            if now[i][k].strain > usual + BETTER or (lone >= 2 and (i - last) * EVERY >= WAIT):
                 now[i], last = solver.start_anew(now[i], k, keys[i]), i
     again = [now.get(i) for i in range(len(keys))]
     solver.reconcile(keys, again)
@@ -243,7 +241,8 @@ class _KeyFrameSolver:
             cost += 0.5 * squared / (squared + s**2)
         for j, track in enumerate(key.tracks):
             if int(track) in held:
-                cost[held[int(track)], j] -= HELD
+                # what a track that has a label costs less with it
+                cost[held[int(track)], j] -= 0.3
         return cost
 
     def start_anew(self, solutions: Solutions, k: int, key: KeyFrame) -> Solutions:
@@ -313,9 +312,10 @@ def _others_hidden(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 def forbid(cost: np.ndarray, known: np.ndarray) -> None:
     """Raise costs (L, N) of matches that labels which are known (N,) forbid, in place."""
     labelled = np.flatnonzero(known >= 0)
-    taken = cost[known[labelled], labelled] - FORCED                    # before its row and column are raised
-    cost[:, known != -1] += FORCED
-    cost[known[labelled]] += FORCED
+    forced = 100.0  # cost of a match that a label which is known forbids
+    taken = cost[known[labelled], labelled] - forced                    # before its row and column are raised
+    cost[:, known != -1] += forced
+    cost[known[labelled]] += forced
     cost[known[labelled], labelled] = taken
 
 

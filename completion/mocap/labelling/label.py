@@ -29,14 +29,11 @@ from .tracks import link_points
 UNKNOWN, GHOST = -1, -2              # in labels that are known: nothing is, and: this point is no marker
 FEWEST = 10                          # points in a frame, of which no body can be told otherwise
 STARTS = 5                           # frames in which the body is sought
-LYING = 2                            # of them, in which it is sought lying or upside down, if it stands nowhere
 # metres that half of a frame's points are from their middle at least and at most: 0.4 to 0.6 of one person
 SPREAD = 0.1, 5.0
 FOUND = 0.3                          # misfit of a frame above which no body was found; right ones had at most 0.18
 # metres from its place that a marker lies at least, in each direction, of the three passes at last
 DEVIATIONS = (0.03, 0.02, 0.012)
-SAME = 0.001                         # share of labels that may change without the person being found anew
-SOME = 0.1                           # share of key frames in which a marker has to be for its place to be told
 SURE = 0.9                           # confidence below which a label is doubted
 POSES = AnimateConfig(marker_sd=0.007)                                  # metres: markers where they sit, as in `mosh`
 
@@ -179,7 +176,8 @@ def label_people(people: Sequence[tuple[BodyModel | Subject, MarkerLayout]], poi
     # the motion of each tells the labels anew, and these the person, ever closer
     told = np.full_like(columns, -2)
     for i, sd in enumerate(DEVIATIONS):
-        changed = (columns != told).mean() > SAME
+        # share of labels that may change without the person being found anew
+        changed = (columns != told).mean() > 0.001
         told = columns
         for k, mine in enumerate(_of_each(bodies, columns)):
             model = people[k][0]
@@ -263,7 +261,8 @@ def _in_order(bodies: Sequence[_Person], columns: np.ndarray, keys: Sequence[Key
         turns = marked.shapes.rotations(np.swapaxes(pose, 0, 1))[part]                            # (L, K, 3, 3)
         off = np.stack([np.where(one.matches[:, None] >= 0, one.off, np.nan) for one in solved])
         local = np.einsum("lkji,klj->kli", turns, off)
-        enough = np.isfinite(local[..., 0]).mean(axis=0) > SOME
+        # share of key frames in which a marker has to be for its place to be told
+        enough = np.isfinite(local[..., 0]).mean(axis=0) > 0.1
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)                # a marker that was never seen
             places = body.layout.place(body.subject.template) + np.nanmedian(local, axis=0)
@@ -287,7 +286,8 @@ def find_start(searches: Sequence[BodySearch], points: np.ndarray, tell: Callabl
         frames, groups = separate_people(points[full], len(searches))
         frames = full[frames]
     tried = list[tuple[int, list[Placement]]]()
-    for axes, count in ((UPS, len(frames)), (OTHERS, LYING)):
+    # of them, in which it is sought lying or upside down, if it stands nowhere
+    for axes, count in ((UPS, len(frames)), (OTHERS, 2)):
         for i, (t, group) in enumerate(zip(frames[:count], groups[:count], strict=True)):
             tried.append((int(t), [search.find(some, axes) for search, some in zip(searches, group, strict=True)]))
             tell(i + 1)

@@ -9,10 +9,6 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 
-FARTHEST = 0.15                      # metres from its place, all markers of the part moved together, that still counts
-GAIN = 0.5                           # share of the squared distances that another order leaves at most
-LEAST = 0.015                        # metres by which each marker that changes has to come closer, in the square mean
-NEAR = 0.10                          # metres between markers of one plate or hand
 ROUNDS = 10
 
 
@@ -39,7 +35,10 @@ def order_by_layout(places: np.ndarray, usual: np.ndarray, part: np.ndarray) -> 
     """
     order = np.arange(len(places))
     # markers of one part, then those that are near each other: a plate may lie over two parts
-    _, plate = connected_components(np.linalg.norm(usual[:, None] - usual, axis=2) < NEAR)
+    # metres between markers of one plate or hand
+    _, plate = connected_components(np.linalg.norm(usual[:, None] - usual, axis=2) < 0.10)
+    gain = 0.5  # share of the squared distances that another order leaves at most
+    least = 0.015  # metres by which each marker that changes has to come closer, in the square mean
     for group in (part, plate):
         at = np.full_like(places, np.nan)
         at[order] = places                                             # under the labels they have by now
@@ -53,7 +52,7 @@ def order_by_layout(places: np.ndarray, usual: np.ndarray, part: np.ndarray) -> 
             best, chosen = min((_least(at[seen], usual[mine], start, fixed=False)
                                 for start in _starts(at[seen], usual[mine])), key=lambda one: one[0])
             changed = int((mine[chosen] != seen).sum())
-            if changed and best < GAIN * as_it_is and as_it_is - best > changed * LEAST**2:
+            if changed and best < gain * as_it_is and as_it_is - best > changed * least**2:
                 change[seen] = mine[chosen]
                 # labels that are given up go to the markers that lost theirs
                 change[np.setdiff1d(mine, seen)] = np.setdiff1d(mine, mine[chosen])
@@ -77,7 +76,8 @@ def _least(places: np.ndarray, usual: np.ndarray, chosen: np.ndarray, fixed: boo
     cost = np.inf
     for _ in range(ROUNDS):
         shift = np.median(places - usual[chosen], axis=0)
-        squared = np.minimum((((places - shift)[:, None] - usual)**2).sum(axis=-1), FARTHEST**2)
+        # metres from its place, all markers of the part moved together, that still counts
+        squared = np.minimum((((places - shift)[:, None] - usual)**2).sum(axis=-1), 0.15**2)
         better = chosen if fixed else linear_sum_assignment(squared)[1]
         cost = float(squared[np.arange(len(places)), better].sum())
         if (better == chosen).all():

@@ -8,12 +8,8 @@ from .follow_points import OWN_PERSON
 from .live_matching import find_unmatched
 
 WINDOW, LONG = 0.1, 2.0              # seconds over which strains are averaged, and what is usual
-RISE = 0.5                           # most markers by which a strain may lift what is usual
-BEGIN = 0.5                          # markers, what is usual at first
 # markers of strain above the usual at which a limb is sought: a foot turned about had 1.3 to 1.9, a right one below 0.8
 WORSE = 0.8
-BETTER = 0.6                         # markers of misfit that a search has to gain; a foot turned about gained 2.5 to 4
-NEAR = 0.2                           # metres from its place within which a free point may be a marker's
 POSES = 8                            # of the limb that are tried, half of them with what follows the second joint alone
 PATIENCE, LONGEST = 0.25, 4.0        # seconds from a search that found nothing to the next, doubled up to the longest
 
@@ -31,7 +27,8 @@ class LimbWatch:
         self.rows = [rows_of_limb(search, limb) for limb in search.limbs]
         # all poses take their turn
         self.order, self.tries = search.poses[np.random.default_rng(0).permutation(len(search.poses))], 0
-        self.usual = np.full(len(self.rows), BEGIN)
+        # markers, what is usual at first
+        self.usual = np.full(len(self.rows), 0.5)
         self.patience = np.full(len(self.rows), PATIENCE)
         self.begin()
 
@@ -56,11 +53,13 @@ class LimbWatch:
         free = find_unmatched(len(points), chosen)
         if len(free) and not there.all():
             apart = ((points[free] - places[~there][:, None])**2).sum(axis=-1).min(axis=1)
-            cost[~there] = np.where(apart < NEAR**2, ALONE, 0.0)
+            # metres from its place within which a free point may be a marker's
+            cost[~there] = np.where(apart < 0.2**2, ALONE, 0.0)
         self.cost = cost
         self.strain += (cost - self.strain) * min(1.0, dt / WINDOW)
         strain = self._of_limbs(self.strain)
-        self.usual += (np.minimum(strain, self.usual + RISE) - self.usual) * min(1.0, dt / LONG)
+        # most markers by which a strain may lift what is usual
+        self.usual += (np.minimum(strain, self.usual + 0.5) - self.usual) * min(1.0, dt / LONG)
         self.quiet -= dt
 
     def doubtful(self) -> np.ndarray:
@@ -83,7 +82,8 @@ class LimbWatch:
             return None
         now = self.search.judge(x, points, OWN_PERSON.judged)
         found = self.search.refine(self._starts(x, limb), points, LIMB_ROUNDS, OWN_PERSON.judged)
-        if (now.misfit - found.misfit) * self.search.body.count > BETTER:
+        # markers of misfit that a search has to gain; a foot turned about gained 2.5 to 4
+        if (now.misfit - found.misfit) * self.search.body.count > 0.6:
             self.strain[self.rows[limb]] = 0.0
             self.quiet[limb] = self.patience[limb] = PATIENCE
             return found, self.rows[limb], self.search.limbs[limb]

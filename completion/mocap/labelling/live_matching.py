@@ -12,11 +12,7 @@ from .body_search import assign_columns
 SEEN_SD = 0.004                      # metres that a point strays from its offset, besides what the filter does not know
 # cost of a marker without a point, and of each that is given up: 4.2 deviations of a marker that was just seen
 ALONE = 9.0
-SHIFT = 16.0                         # half squared deviations by which markers side by side may be off together
-SHIFTED_SD = 0.02                    # metres, how well they lie on points after they were moved together
-GROUP = 0.25                         # metres within which markers are side by side: those of a foot, a hand, a head
 TRIED = 8                            # shifts, the likeliest first
-GAIN = 1.0                           # cost that this has to save
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,20 +108,24 @@ def shift_groups(expected: Expected, slopes: np.ndarray, covariance: np.ndarray,
         Matches of each by itself.
     """
     free = find_unmatched(len(points), chosen)
-    best, most = chosen, GAIN
+    # cost that this has to save
+    best, most = chosen, 1.0
     if (chosen >= 0).all() or not len(free):
         return chosen
     off = expected.half_squares(points[free])
     order = np.argsort(off, axis=None)[:TRIED]
-    for marker, j in zip(*np.unravel_index(order[off.ravel()[order] < SHIFT], off.shape), strict=True):
+    # half squared deviations by which markers side by side may be off together
+    for marker, j in zip(*np.unravel_index(order[off.ravel()[order] < 16.0], off.shape), strict=True):
         shift = points[free[j]] - expected.places[marker]
-        group = np.flatnonzero(((expected.places - expected.places[marker])**2).sum(axis=1) < GROUP**2)
+        # metres within which markers are side by side: those of a foot, a hand, a head
+        group = np.flatnonzero(((expected.places - expected.places[marker])**2).sum(axis=1) < 0.25**2)
         if (chosen[group] >= 0).all():
             continue
         # points that no other marker has, after the shift
         pool = find_unmatched(len(points), np.delete(chosen, group))
         apart = expected.places[group][:, None] + shift - points[pool]
-        moved, _ = assign_columns(np.minimum((apart**2).sum(axis=-1) / (2 * SHIFTED_SD**2), 2 * ALONE), ALONE)
+        # metres, how well they lie on points after they were moved together
+        moved, _ = assign_columns(np.minimum((apart**2).sum(axis=-1) / (2 * 0.02**2), 2 * ALONE), ALONE)
         moved = np.where(moved >= 0, pool[moved], -1)
         if (moved == chosen[group]).all():
             continue

@@ -16,8 +16,6 @@ from .label import SURE, LabelledMarkers
 from .recording import NAMELESS, LabelledRecording, pack_tracks
 
 SHOWN = 30                           # stretches that are listed
-HARDLY = 0.5                         # confidence below which another label is the likelier one
-MOST_LOOSE = 15                      # rows of points without a label in the chart, at most
 # what the chart tells of a marker in a frame; where frames fall together the last of these is shown
 STATES = (("#a9c0d4", "labelled"), ("#54789a", "another track"), ("#f4f4f4", "no point"),
           ("#e39b3b", "doubtful"), ("#a8323e", "hardly believed"), ("#b7a3cc", "point without a label"))
@@ -114,10 +112,12 @@ def chart_labels(recording: LabelledRecording) -> Any:
     before = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
     changed = (before >= 0) & (np.take_along_axis(number, np.maximum(before, 0), axis=0) != number)
     sure = recording.confidence
-    state = np.select([columns < 0, sure < HARDLY, sure < SURE, changed], [GAP, UNLIKELY, DOUBTFUL, CHANGED], LABELLED)
+    # confidence below which another label is the likelier one
+    state = np.select([columns < 0, sure < 0.5, sure < SURE, changed], [GAP, UNLIKELY, DOUBTFUL, CHANGED], LABELLED)
     # points that are no marker, those first that are there longest
     loose = pack_tracks(tracks, recording.people[0].unlabelled) >= 0
-    longest = np.argsort(-loose.sum(axis=0), kind="stable")[:MOST_LOOSE]
+    # rows of points without a label in the chart, at most
+    longest = np.argsort(-loose.sum(axis=0), kind="stable")[:15]
     state = np.concatenate([state, np.where(loose[:, longest], LOOSE, GAP)], axis=1)
     names = [*recording.names, *(f"{NAMELESS}{i + 1}" for i in longest)]
     return chart_states(state, names, recording.points.rate, *zip(*STATES, strict=True))

@@ -6,7 +6,6 @@ from scipy.cluster.vq import kmeans2
 
 STARTS = 5                           # frames that are given, at most
 TRIED = 60                           # frames that are looked at
-FEWEST = 10                          # points of a person
 
 
 def separate_people(points: np.ndarray, people: int) -> tuple[np.ndarray, list[list[np.ndarray]]]:
@@ -25,20 +24,21 @@ def separate_people(points: np.ndarray, people: int) -> tuple[np.ndarray, list[l
         No frame in which they fall apart into groups of ten points.
     """
     best = list[tuple[float, int, list[np.ndarray]]]()
+    fewest = 10  # points of a person
     for t in np.unique(np.linspace(0, len(points) - 1, TRIED).astype(int)):
         seen = points[t, np.isfinite(points[t, :, 0])]
         for up in range(3):
             flat = np.delete(seen, up, axis=1)
             centres, group = kmeans2(flat, people, seed=0, minit="++")
             groups = [seen[group == k] for k in range(people)]
-            if min(map(len, groups)) < FEWEST:
+            if min(map(len, groups)) < fewest:
                 continue
             # how far centres are apart, against how far the points of a group are from theirs
             between = min(np.linalg.norm(centres[i] - centres[j]) for i in range(people) for j in range(i))
             within = max(np.linalg.norm(flat - centres[group], axis=1).mean(), 1e-6)
             best.append((float(between / within), int(t), groups))
     if not best:
-        raise ValueError(f"points: no frame in which {people} people with at least {FEWEST} points each stand apart")
+        raise ValueError(f"points: no frame in which {people} people with at least {fewest} points each stand apart")
     best.sort(key=lambda one: -one[0])
     chosen: dict[int, list[np.ndarray]] = {}
     for _, t, groups in best:

@@ -6,13 +6,10 @@ from scipy.optimize import linear_sum_assignment
 
 # At 120 Hz the markers of four recordings miss constant velocity by 0.6 mm at the median, 9 mm at the 99th percentile
 # and 18 mm at the 99.9th; other markers are 25 mm away at least, 55 mm at the first percentile.
-NOISE = 0.010                        # metres that a prediction may miss at any rate
 ACCELERATION = 100.0                 # m/s²; what it may miss besides, over the time since the last observation
 SPEED = 5.0                          # m/s of a marker that was seen once, whose velocity is not known
-FARTHEST = 0.08                      # metres that a prediction may miss at most
 BRIDGE = 0.1                         # seconds out of sight after which a track has ended
 RIVAL = 1.5                          # times the distance that any other candidate has to be away
-MARGIN = 0.004                       # and metres besides
 
 
 def link_points(points: np.ndarray, rate: float) -> np.ndarray:
@@ -45,6 +42,8 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
     # of every live track: last position, velocity, frame and column of it, number, and observations so far
     last, velocity = np.zeros((0, 3)), np.zeros((0, 3))
     when, column, number, age = (np.zeros(0, dtype=int) for _ in range(4))
+    noise = 0.010  # metres that a prediction may miss at any rate
+    margin = 0.004  # and metres besides
     for t in range(T):
         live = (t - when) / rate <= max(BRIDGE, 1.5 / rate)
         last, velocity, when, column, number, age = (
@@ -55,8 +54,9 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
 
         if len(number) and len(seen):
             apart = np.linalg.norm((last + velocity * passed[:, None])[:, None] - p, axis=2)
-            gate = np.where(age > 1, NOISE + 0.5 * ACCELERATION * passed**2, NOISE + SPEED * passed)
-            gate = np.minimum(gate, FARTHEST)
+            gate = np.where(age > 1, noise + 0.5 * ACCELERATION * passed**2, noise + SPEED * passed)
+            # metres that a prediction may miss at most
+            gate = np.minimum(gate, 0.08)
             same = steady & (column[:, None] == seen)
             # the same column is believed at twice the distance, whoever else is near
             cost = np.minimum(apart / gate[:, None] * np.where(same, 0.5, 1.0), 1.0)
@@ -66,7 +66,7 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
             others = apart.copy()
             others[rows, columns] = np.inf
             rival = np.minimum(others[rows].min(axis=1), others[:, columns].min(axis=0))
-            sure = (rival > RIVAL * apart[rows, columns] + MARGIN) | same[rows, columns]
+            sure = (rival > RIVAL * apart[rows, columns] + margin) | same[rows, columns]
             source[columns[sure]] = rows[sure]
 
         # points that continue a track update it, others begin one

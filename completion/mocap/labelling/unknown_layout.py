@@ -24,28 +24,16 @@ from ..subject.person import PersonFit, find_person, spread_frames
 from .body_search import OTHERS, UPS, BodySearch, Placement, match_points
 from .tracks import has_tracks, link_points
 
-SKIN = 250                           # points of the skin among which a body is sought: 9 cm apart
 STARTS = 5                           # frames in which it is sought
-BELOW = 0.025                        # metres from the skin, mean of the points, at which no other axis is tried
 TRIED = 4                            # of what was found there, that are followed through other frames
 # of the person and the places together: more frames than usual and poses hardly held, since the motions of a recording
 # are not the prior's: of 88 simulated markers 60% were within 15 mm, 48% with twelve frames and usual weights
 CLOSER = PersonConfig(frames=24, pose=0.02)
 ROUNDS = 5                           # each holds the places to those of the one before; 2 left 4 mm more
 NAMED = 4                            # rounds in which markers that a usual set has are held to its places
-WORSE = 1.15                         # ratio of what is left above which a usual set is not the one that is worn
 LIKE = 0.10                          # metres from the place of a usual set within which a marker may be its
-SHARE = 0.75                         # of the markers that a usual set has to explain
 LONG = 0.3                           # share of the frames that a track has to have
-FEWEST = 10                          # tracks
-REACH = (0.0, 0.04)                  # metres that a marker may be off the skin
 OUTLIER = 0.06                       # metres beyond which it does not matter how far a track is from a place
-LEFT_OUT = 0.035                     # metres, median distance from its place on which a track is no marker
-SAME = 0.025                         # metres between the places of two tracks, never seen together, that are one marker
-STILL = 0.25                         # radians that a joint turns at most in the frames of the fit, if it is still
-LIKE_NEXT = 1.15                     # ratio of what the next best body leaves, below which they cannot be told apart
-# metres that a place is uncertain by, beside what its residuals tell: of a marker of a usual set, and of another
-UNCERTAIN = 0.009, 0.025
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +69,14 @@ class FoundLayout:
         bad, check = [], []
         if self.person.residual > 0.02:
             bad.append(f"the tracks lie {1000 * self.person.residual:.0f} mm from the body: no person, or several?")
-        if self.margin < LIKE_NEXT:
+        # ratio of what the next best body leaves, below which they cannot be told apart
+        if self.margin < 1.15:
             check.append("another pose explains the tracks nearly as well: left and right, or front and back, may be "
                          "exchanged")
         turns = rotations.exp(self.person.poses[:, 1:])
         range_of_joint = np.linalg.norm(rotations.log(np.swapaxes(turns[:1], -1, -2) @ turns), axis=-1).max(axis=0)
-        if (range_of_joint < STILL).mean() > 0.5:
+        # radians that a joint turns at most in the frames of the fit, if it is still
+        if (range_of_joint < 0.25).mean() > 0.5:
             check.append("the person hardly moves: where markers sit on their limb is not told")
         if (self.uncertainty > 0.03).mean() > 0.2:
             check.append("many places are uncertain by more than 3 cm: markers of no usual set, or a poor fit")
@@ -148,7 +138,8 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
         if usual is None:
             break
         snapped = find_person(model, tracks, _snap(fit.layout, labels, usual), CLOSER)
-        if _cost(snapped) > WORSE * _cost(free):
+        # ratio of what is left above which a usual set is not the one that is worn
+        if _cost(snapped) > 1.15 * _cost(free):
             break
         fit, named = snapped, labels
     return _collect(model, tracks, fit, margin, named)
@@ -157,7 +148,8 @@ def find_layout(model: BodyModel, points: MarkerSequence, progress: Progress | N
 def name_markers(model: BodyModel, layout: MarkerLayout) -> tuple[MarkerLayout | None, dict[str, str]]:
     """The usual set that explains most markers of a layout, none if it is below `SHARE`, and label -> label in it."""
     places = layout.skin_points(model.template.vertices)
-    best: tuple[float, MarkerLayout | None, dict[str, str]] = (SHARE * len(layout.labels), None, {})
+    share = 0.75  # of the markers that a usual set has to explain
+    best: tuple[float, MarkerLayout | None, dict[str, str]] = (share * len(layout.labels), None, {})
     for name in layout_names():
         try:
             usual, _ = choose_layout(model, name, ())
@@ -168,7 +160,7 @@ def name_markers(model: BodyModel, layout: MarkerLayout) -> tuple[MarkerLayout |
         near = apart[rows, columns] < LIKE
         # a nearer set counts more, a larger one only as far as it is worn
         score = float((1 - (apart[rows, columns][near] / LIKE)**2 / 2).sum()) - 0.3 * (len(usual.labels) - near.sum())
-        if near.sum() >= SHARE * len(layout.labels) and score > best[0] * (best[1] is not None):
+        if near.sum() >= share * len(layout.labels) and score > best[0] * (best[1] is not None):
             best = score, usual, {layout.labels[r]: usual.labels[c]
                                   for r, c in zip(rows[near], columns[near], strict=True)}
     return best[1], best[2]
@@ -186,14 +178,15 @@ def _snap(layout: MarkerLayout, labels: dict[str, str], usual: MarkerLayout) -> 
 
 def long_tracks(points: MarkerSequence) -> MarkerSequence:
     """The tracks of a recording that are seen long enough: its columns, or pieces that its points were joined to."""
+    fewest = 10  # tracks
     if not has_tracks(points.positions, points.rate):
         number = link_points(points.positions, points.rate)
         frames, columns = np.nonzero(number >= 0)
         which = number[frames, columns]
         counts = np.bincount(which, minlength=number.max() + 1)
         kept = np.flatnonzero(counts >= LONG * len(number))
-        if len(kept) < FEWEST:
-            raise ValueError(f"points: expected at least {FEWEST} tracks that are seen in {100 * LONG:.0f}% of the "
+        if len(kept) < fewest:
+            raise ValueError(f"points: expected at least {fewest} tracks that are seen in {100 * LONG:.0f}% of the "
                              f"frames, found {len(kept)}; without tracks a layout has to be given")
         series = np.full((len(number), len(kept), 3), np.nan)
         place = np.full(number.max() + 1, -1)
@@ -202,8 +195,8 @@ def long_tracks(points: MarkerSequence) -> MarkerSequence:
         series[frames[mine], place[which[mine]]] = points.positions[frames[mine], columns[mine]]
         return MarkerSequence(series, tuple(f"track{k}" for k in kept), points.rate)
     long = points.seen.mean(axis=0) >= LONG
-    if long.sum() < FEWEST:
-        raise ValueError(f"points: expected at least {FEWEST} tracks that are seen in {100 * LONG:.0f}% of the frames, "
+    if long.sum() < fewest:
+        raise ValueError(f"points: expected at least {fewest} tracks that are seen in {100 * LONG:.0f}% of the frames, "
                          f"found {int(long.sum())}")
     return points.select([label for label, is_long in zip(points.labels, long, strict=True) if is_long])
 
@@ -211,7 +204,8 @@ def long_tracks(points: MarkerSequence) -> MarkerSequence:
 def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int], None]
                  ) -> list[tuple[int, Placement]]:
     """Frames, and bodies whose skin passes below the points there, the best first."""
-    vertices = farthest_points(model.template.vertices, SKIN)
+    # points of the skin among which a body is sought: 9 cm apart
+    vertices = farthest_points(model.template.vertices, 250)
     skin = MarkerLayout(tuple(f"skin{v}" for v in vertices), vertices)
     subject = model.subject()
     search = BodySearch(mean_person(subject, skin), subject)
@@ -228,7 +222,8 @@ def _search_skin(model: BodyModel, tracks: MarkerSequence, tell: Callable[[int],
             off = np.linalg.norm(at - visible[matches[matches >= 0]], axis=1)
             cost = float(np.minimum(off, OUTLIER).sum() + OUTLIER * (len(visible) - len(off))) / len(visible)
             found.append((cost, int(t), placement))
-            if cost < BELOW:
+            # metres from the skin, mean of the points, at which no other axis is tried
+            if cost < 0.025:
                 break
         tell(i + 1)
     found.sort(key=lambda one: one[0])
@@ -260,7 +255,8 @@ def _best_places(model: BodyModel, fit: PersonFit, tracks: MarkerSequence) -> Ma
             places.append(-1)
             distances.append(DISTANCE)
             continue
-        off, lift = stand_off(targets[seen], vertices[seen], normals[seen], *REACH)
+        # metres that a marker may be off the skin
+        off, lift = stand_off(targets[seen], vertices[seen], normals[seen], *(0.0, 0.04))
         best = int(np.minimum(off**2, OUTLIER**2).mean(axis=0).argmin())
         places.append(best)
         distances.append(float(lift[best]))
@@ -287,7 +283,8 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
     left_out, kept = {}, []
     for row, label in enumerate(fit.layout.labels):
         off = float(np.nanmedian(fit.residuals[:, row]))
-        if off > LEFT_OUT:
+        # metres, median distance from its place on which a track is no marker
+        if off > 0.035:
             left_out[label] = f"{1000 * off:.0f} mm from the body"
         else:
             kept.append(label)
@@ -297,14 +294,16 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
     seen = tracks.select(kept).seen
     groups: dict[str, list[str]] = {}
     for row, label in enumerate(kept):
+        # metres between the places of two tracks, never seen together, that are one marker
         other = next((first for first in groups if np.linalg.norm(
-            places[kept.index(first)] - places[row]) < SAME and not (seen[:, kept.index(first)] & seen[:, row]).any()),
+            places[kept.index(first)] - places[row]) < 0.025 and not (seen[:, kept.index(first)] & seen[:, row]).any()),
             None)
         groups.setdefault(label if other is None else other, []).append(label)
     layout = replace(layout.select(list(groups)), loose=())
     rows = [fit.layout.labels.index(label) for label in layout.labels]
     spread = np.sqrt(np.nanmean(fit.residuals[:, rows]**2, axis=0))
-    uncertainty = np.where([label in usual for label in layout.labels], *UNCERTAIN) + spread
+    # metres that a place is uncertain by, beside what its residuals tell: of a marker of a usual set, and of another
+    uncertainty = np.where([label in usual for label in layout.labels], *0.009, 0.025) + spread
     names = suggest_names(model, layout, usual)
     return FoundLayout(replace(layout, labels=names), dict(zip(names, map(tuple, groups.values()), strict=True)),
                        uncertainty, left_out, fit, margin)

@@ -22,7 +22,6 @@ from ..files.text import MarkerFileError
 from .layout import MarkerLayout
 from .opensim import opensim_places
 
-FEWEST = 3                           # labels by which a marker set is known
 FOLDER = Path(__file__).parent / "layouts"
 OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {LABEL: VERTEX, ...}}]} '
        "and load it with MarkerLayout.load (--layout FILE)")
@@ -104,9 +103,10 @@ def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | Non
     found = {name: load_layout(name, template, kept).with_spellings(labels) for name in layout_names()}
     known = {name: len(layout.match_labels(labels, 0)) for name, layout in found.items()}
     best = max(found, key=lambda name: (known[name], -len(found[name].labels)))
-    if known[best] < FEWEST:
+    fewest = 3  # labels by which a marker set is known
+    if known[best] < fewest:
         told = ", ".join(f"{name} {count}" for name, count in sorted(known.items(), key=lambda item: -item[1]))
-        raise ValueError(f"labels: expected at least {FEWEST} of a marker set, of these {len(labels)} the sets know "
+        raise ValueError(f"labels: expected at least {fewest} of a marker set, of these {len(labels)} the sets know "
                          f"{told}. The sets: scape layout list, scape layout show NAME; your own: --layout FILE, which "
                          f"scape pick makes of the model's template. Labels found: {', '.join(labels) or 'none'}")
     return found[best], best

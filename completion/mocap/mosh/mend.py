@@ -32,7 +32,6 @@ from .work import ERRORS
 
 MENDED = "scape mosh, mended in the browser"
 TOLD = "markers in the mean distance"
-LEAST = 3                            # markers that a person needs
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +190,8 @@ class MoshApp(ResultsApp):
             raise ValueError("nothing was corrected: move, exchange or take away a marker first")
         call = replace(self.result.call, layout=str(self.file))
         worn = {label for one in self.result.people for label in one.names}
-        apply_corrections(self.result.usual, self.spots).match_labels(sorted(worn), LEAST)
+        # markers that a person needs
+        apply_corrections(self.result.usual, self.spots).match_labels(sorted(worn), 3)
         # now, as they are worked out from files that the run writes anew
         before = {one.name: self.result.figures(one.name) for one in self.result.people}
 

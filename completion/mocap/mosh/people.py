@@ -26,8 +26,6 @@ from .call import Models
 from .pictures import person_in_mean_pose
 from .recordings import Actor, Recording
 
-FRAMES = 6                           # worst frames that are shown of a person
-
 
 @dataclass(frozen=True)
 class WorstFrame:
@@ -151,13 +149,14 @@ class FoundPerson:
     def worst(self) -> list[WorstFrame]:
         """The frames of all recordings in which the markers are farthest, the worst first."""
         found = []
+        frames = 6  # worst frames that are shown of a person
         for take, (one, motion) in enumerate(zip(self.recordings, self.motions, strict=True)):
-            for t in worst_frames(motion, FRAMES).tolist():
+            for t in worst_frames(motion, frames).tolist():
                 off = float(mean_over(motion.residuals[t], 0))
                 if np.isfinite(off):
                     told = f"{one.name}, {t / motion.rate:.2f} s: {1000 * off:.0f} mm"
                     found.append(WorstFrame(take, t, told, off))
-        return sorted(found, key=lambda frame: -frame.off)[:FRAMES] or [WorstFrame(0, 0, self.recordings[0].name, 0.0)]
+        return sorted(found, key=lambda frame: -frame.off)[:frames] or [WorstFrame(0, 0, self.recordings[0].name, 0.0)]
 
     def pane(self, frame: WorstFrame) -> Pane:
         """The body in a frame with the measured markers, coloured by how far they are from where it has them."""

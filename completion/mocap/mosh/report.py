@@ -27,8 +27,6 @@ from .mosh import MoshResult
 from .pictures import chart_artefacts, chart_frames, chart_map, chart_timeline
 from .takes import Take
 
-SOME = 56                            # frames that changes of the body are measured in
-
 
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
                 metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]], settings: Mapping[str, Any]
@@ -79,7 +77,8 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
 def take_page(take: Take, metrics: Sequence[Metric], picture: np.ndarray) -> Page:
     """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
     motion, held, artefacts = take.motion, take.held, take.artefacts
-    frames = spread_indices(len(take.shown.poses), SOME)
+    # frames that changes of the body are measured in
+    frames = spread_indices(len(take.shown.poses), 56)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}",
                 "Dots are the measured markers: red where they are believed, orange where they are seen but not "
                 "believed, green for held-out markers, which no stage has seen.")

@@ -17,7 +17,6 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
-FEWEST = 8                           # markers that tell of a body; six hold a pelvis and a head, and no limb
 # trajectories without a name, as Vicon, Motive and Qualisys write them
 UNNAMED = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"
 # points that Plug-in Gait computes: centres of mass, and of every segment its origin and the ends of its three axes
@@ -61,8 +60,9 @@ class Coverage:
         """Whether the markers can tell of a body."""
         failed, check = [], []
         some = f"{len(self.used)} of {self.count} markers used"
-        if len(self.used) < FEWEST:
-            failed.append(f"{some}, a body needs {FEWEST}: other labels than the marker set's? (scape layout show)")
+        fewest = 8  # markers that tell of a body; six hold a pelvis and a head, and no limb
+        if len(self.used) < fewest:
+            failed.append(f"{some}, a body needs {fewest}: other labels than the marker set's? (scape layout show)")
         elif len(self.parts) < 2:
             failed.append(f"all markers used are on one part of the body, the {self.parts[0]}")
         elif len(self.used) < 0.5 * self.count:

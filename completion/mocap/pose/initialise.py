@@ -9,8 +9,6 @@ from model.priors import typical_poses
 
 from .marked_body import AnimateConfig, MarkedBody, marker_misfit, marker_weights
 
-SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb has lost three quarters of its weight
-
 
 def search_pose(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
     """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen."""
@@ -53,7 +51,8 @@ def reinitialise_frames(body: MarkedBody, x: np.ndarray, targets: np.ndarray, co
 
 def _from_far(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
     """The unknowns (n, P) to which frames come from x, each by itself, while outliers lose their weight."""
-    for scale in SCALES:
+    # metres, at which a marker of a lost limb has lost three quarters of its weight
+    for scale in (1.0, 0.3, 0.1):
         weights = energy.geman_mcclure(np.nan_to_num(_apart(body, x, targets)), scale) / config.marker_sd**2
         x = body.solve(x, targets, weights, 8, 1e-3).x
     return x

@@ -13,8 +13,6 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
-DOUBTFUL = 0.018                     # of the size, 25 mm on a man; good motions are 4 to 25 mm off, shuffled frames 31
-
 
 def markers_told(motions: Sequence[Motion]) -> Metric:
     """Over which markers the mean distance of motions of one body is taken."""
@@ -58,7 +56,8 @@ def motion_doubts(motions: Sequence[Motion], markers: Sequence[MarkerSequence], 
     """Reasons to look at motions of one body, made from markers; `body` is the model's template."""
     reasons = [*hardly_seen(motions), *distrusted_marker_warnings(motions)]
     off = mean_off(motions)
-    if off > DOUBTFUL * size(body):
+    # of the size, 25 mm on a man; good motions are 4 to 25 mm off, shuffled frames 31
+    if off > 0.018 * size(body):
         reasons.append(f"the markers are {1000 * off:.0f} mm from where the body has them")
     return (*filter(None, (haste(one, body) for one in markers)), *reasons)
 

@@ -30,7 +30,6 @@ from .part_shapes import PartShapes, part_shapes
 
 BATCH = 64                           # frames whose parts are held at once
 MOST = 512                           # frames that are solved, each by itself, at once
-SAMPLES = 120                        # poses from which the turning of the normals is learned
 RATE = 120.0                         # frames per second for which the weight of the velocity is meant
 
 
@@ -266,10 +265,11 @@ def _sample_poses(subject: Subject) -> np.ndarray:
     """Poses (S, J, 3) of the prior, the root at rest."""
     assert subject.pose_mean is not None and subject.pose_covariance is not None, "a subject with a pose prior"
     prior = gaussian_prior(subject.pose_mean, subject.pose_covariance)
-    draws = np.random.default_rng(0).standard_normal((SAMPLES, len(prior.whitening)))
-    poses = np.zeros((SAMPLES, len(prior.mean)))
+    samples = 120  # poses from which the turning of the normals is learned
+    draws = np.random.default_rng(0).standard_normal((samples, len(prior.whitening)))
+    poses = np.zeros((samples, len(prior.mean)))
     poses[:, 3:] = prior.mean[3:] + np.linalg.solve(prior.whitening[:, 3:], draws.T).T
-    return poses.reshape(SAMPLES, -1, 3)
+    return poses.reshape(samples, -1, 3)
 
 
 def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:

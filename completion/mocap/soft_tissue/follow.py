@@ -24,7 +24,6 @@ from ..pose.foot_contact import FootContact
 from ..pose.marked_body import RATE, AnimateConfig, MarkedBody, batches, marker_weights, point_system
 from .soft_tissue import SkinMovement, SoftTissue, in_root, in_world, smooth_modes
 
-PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
 LOOSE = 3.0                          # sizes of the movement by which the prior allows it; at 1 it shrinks what it finds
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
@@ -168,7 +167,8 @@ class SoftFollower(ABC):
             poses = replace(poses, prior_shrinkage=0.0, place_acceleration=1e6)
         self.body = MarkedBody(model.subject(motion.betas), self.layout, config.pose, poses.prior_shrinkage)
         self.inertia = poses.inertia(markers.rate, self.body.n_unknowns)
-        self.weight = config.data * PER_SQUARE_METRE
+        # of a weight on square centimetres
+        self.weight = config.data * 1e4
 
     @abstractmethod
     def whitening(self, x: np.ndarray, targets: np.ndarray, share: np.ndarray) -> Whitening:

@@ -23,8 +23,6 @@ from .latent_fit import ON_SKIN, LatentFit, PersonConfig
 
 __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
-HAND_WIDTH = 0.08                    # metres: a marker that is moved farther is to be looked at
-
 
 @dataclass(frozen=True, eq=False)
 class PersonFit:
@@ -92,7 +90,8 @@ def judge_moves(moves: Mapping[str, float], count: int) -> Judgement:
     >>> str(judge_moves({"LTHI": 0.02, "LKNE": 0.18}, 39))
     "check: moved by more than a hand's width: LKNE by 18 cm"
     """
-    far = [f"{label} by {100 * moved:.0f} cm" for label, moved in moves.items() if moved > HAND_WIDTH]
+    # metres: a marker that is moved farther is to be looked at
+    far = [f"{label} by {100 * moved:.0f} cm" for label, moved in moves.items() if moved > 0.08]
     # share from which on the result means nothing; on 4 recordings of actors, 5 of clinics and 16 of other places
     # it is at most 0.1
     if len(far) > 0.25 * count:

@@ -27,7 +27,6 @@ from .latent_fit import distance_reach
 from .person import PersonConfig, PersonFit, common_markers, find_person, judge_moves
 
 FAR = 0.06                           # metres, RMS over frames, from its usual place: worn elsewhere
-GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,14 +320,15 @@ def _explain(at: _Frames, suspects: Collection[str]) -> Worn:
     labels, far, exchanged = at.layout.labels, at.far(FAR), []
     rows = {i for i, label in enumerate(labels) if label in suspects and at.off[i] > far}
     crossed = [(at.off_place(i, j), at.off_place(j, i), i, j) for i, j in combinations(sorted(rows), 2)]
+    gain = 0.4  # share of the distance from the usual place that another place leaves at most
     for one, other, i, j in sorted(crossed, key=lambda both: max(both[:2])):
-        if {i, j} <= rows and max(one, other) < FAR and one + other < GAIN * (at.off[i] + at.off[j]):
+        if {i, j} <= rows and max(one, other) < FAR and one + other < gain * (at.off[i] + at.off[j]):
             exchanged.append((labels[i], labels[j]))
             rows -= {i, j}
     # another place explains a marker within 2 cm, or 1.5 times what the others are from their usual places
     limit = max(0.02, 1.5 * float(np.nanmedian(at.off[[i for i, label in enumerate(labels) if label not in suspects]])))
     found = {row: _best_place(at, row) for row in sorted(rows)}
-    moved = {row: m for row, m in found.items() if m.after < limit and m.after < GAIN * m.before}
+    moved = {row: m for row, m in found.items() if m.after < limit and m.after < gain * m.before}
     return Worn(tuple(moved.values()), tuple(exchanged), tuple(labels[row] for row in found if row not in moved))
 
 

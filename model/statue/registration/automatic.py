@@ -21,7 +21,6 @@ from .features import FeatureFit, fit_features
 from .person_search import find_stand
 
 SHOWN = 0.3                      # share of the vertices around a joint or landmark, or of a limb, that must have data
-OWN = 0.02                       # metres from the rest of the body: points that are nearer say nothing of a limb
 # How far, metres, the posed body stays off a scan at most, and how many times farther, at least, when it faces another
 # way. Six synthetic persons: 11 to 13 mm, 1.7 to 3.3 times; nine real ones, five of them bent: 18 to 21 mm, 1.5 to 2.9;
 # fronts and sides alone 21 mm, 1.35 to 1.6. A cylinder 47 mm, 1.13; a chair 56 mm; two people 65 and 70 mm.
@@ -126,7 +125,8 @@ def _features(control: ControlModel, found: Registration, scan: Mesh | np.ndarra
         mine = np.isin(part, limb)
         if parent >= 0 and mine.any():
             rest = found.mesh.submesh(~np.isin(of_face, limb))[0]
-            own = Surface(rest).closest(nearest[mine]).distances > OWN
+            # metres from the rest of the body: points that are nearer say nothing of a limb
+            own = Surface(rest).closest(nearest[mine]).distances > 0.02
             shown[j] &= bool((own * seen[mine]).mean() > SHOWN)
         shown[j] &= parent <= 0 or shown[parent]
     joints = {name: centres[j] for j, name in enumerate(skeleton.names) if shown[j]}
