@@ -12,8 +12,6 @@ from model.motion.files import check_ours, read_motion_file
 from model.motion.onto import BodyMotion
 from scanprep.geometry import storage
 
-SURFACE_MODEL = "scape"
-OF_MARKERS = ("marker_residuals", "marker_labels", "converged", "marker_trusted")       # what else our files hold
 Progress = Callable[[int, int], None]            # called with (done, total)
 
 
@@ -92,7 +90,7 @@ class Motion:
             "poses": self.poses.reshape(len(self.poses), -1), "trans": self.trans,
             "betas": np.zeros(0) if self.betas is None else self.betas,
             "gender": np.array(self.gender), "mocap_frame_rate": np.array(float(self.rate)),
-            "surface_model_type": np.array(SURFACE_MODEL), "marker_residuals": self.residuals,
+            "surface_model_type": np.array("scape"), "marker_residuals": self.residuals,
             "marker_labels": np.array(self.labels, dtype=str), "converged": self.converged,
             "marker_trusted": self.trusted, **more}
         storage.save_arrays(path, arrays)
@@ -110,7 +108,8 @@ class Motion:
 
         `rate` is frames a second, where the file does not say or says it wrongly.
         """
-        stored = read_motion_file(path, OF_MARKERS, rate=rate)
+        # what else our files hold
+        stored = read_motion_file(path, ("marker_residuals", "marker_labels", "converged", "marker_trusted"), rate=rate)
         check_ours(path, stored, f"; scape animate {Path(path).name} -m MODEL -o OUT puts it on a model")
         with storage.taking_apart(path, "a whole motion"):
             a, T = stored.more, len(stored.poses)

@@ -38,7 +38,6 @@ FOLDERS = {"mhr_model.pt": ("body_models.mhr.numpy", "MHR"), "SOMA_neutral.npz":
 # our parts by the library's joints, and how its joints of the fingers are counted from the hand
 PARTS = {"shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand", "hip": "thigh", "knee": "shin", "ankle": "foot",
          "foot": "toes"}
-KNUCKLES = {"cmc": 1, "mcp": 1, "thumb_mcp": 2, "pip": 2, "dip": 3, "ip": 3}
 
 LONGER = 0.04                        # share of what a bone carries that a beta of it adds: statures spread by it
 BENT, POSES = 0.5, 32                # radians, standard deviation, and number of the poses of a joint to learn from
@@ -310,5 +309,6 @@ def our_name(joint: str) -> str:
     """Our name of the part at a joint of the library: forearm_left of left_elbow, index1_left of left_index_mcp."""
     plain, side = split_side(joint)
     finger, _, knuckle = plain.partition("_")
-    name = PARTS.get(plain, f"{finger}{KNUCKLES.get(plain, KNUCKLES.get(knuckle, ''))}")
+    knuckles = {"cmc": 1, "mcp": 1, "thumb_mcp": 2, "pip": 2, "dip": 3, "ip": 3}
+    name = PARTS.get(plain, f"{finger}{knuckles.get(plain, knuckles.get(knuckle, ''))}")
     return f"{name}_{side}" if side else name

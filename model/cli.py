@@ -36,7 +36,6 @@ COMMANDS = {
 
 
 LEFT_OUT = "poses left out of the learning, mean error"
-TOLD = ("left_out_error", "digest", "features")          # of a model's own notes: told in other rows, or for programs
 
 
 def group(argv: list[str]) -> int:
@@ -55,8 +54,9 @@ def info(model: ModelArg) -> Outcome:
     from .learning.scape import judge_model
 
     loaded = load_model(model)
+    # of a model's own notes: told in other rows, or for programs
     facts = [Metric(name.replace("_", " "), value) for name, value in loaded.info.items()
-             if isinstance(value, str | int | float) and name not in TOLD]
+             if isinstance(value, str | int | float) and name not in ("left_out_error", "digest", "features")]
     return Outcome(None, [
         Metric("kind", loaded.kind), *about(loaded), Metric("parts", ", ".join(loaded.skeleton.names)),
         Metric("vertices", len(loaded.template.vertices)), Metric("triangles", len(loaded.template.faces)),

@@ -19,7 +19,6 @@ Moments = tuple[np.ndarray, np.ndarray]         # mean (J, 3) and covariance (3J
 TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 WORTH = 8                            # training poses that what people do with their joints counts as
-HELD = ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")   # parts that stay at rest
 
 
 def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray | None:
@@ -72,7 +71,8 @@ def _limbs(skeleton: Skeleton) -> dict[tuple[str, str], list[int]]:
 
 def is_held(name: str) -> bool:
     """Whether a part, by its name, is one that poses of people here leave at rest: toes, fingers, face."""
-    return part_kind(name) in HELD
+    # parts that stay at rest
+    return part_kind(name) in ("toes", "fingers", "jaw", "eye", "index", "middle", "pinky", "ring", "thumb")
 
 
 def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.ndarray, covariance: np.ndarray

@@ -11,7 +11,6 @@ from scanprep.skeleton.roles import find_roles
 from .body import BodyModel
 
 ASKED = "betas are standard deviations, and hardly anybody is beyond 3"      # cause where somebody typed them
-HUMAN = {"skullbase", "l_hip", "r_hip", "l_knee", "r_knee"}    # joints that a horse has not under these names
 
 
 def person_judgement(model: BodyModel, betas: np.ndarray | None, cause: str = "") -> Judgement:
@@ -19,7 +18,8 @@ def person_judgement(model: BodyModel, betas: np.ndarray | None, cause: str = ""
 
     Without betas it is the template's own body. `cause` as in `beyond_people`.
     """
-    if not find_roles(model.skeleton.names).keys() >= HUMAN:
+    human = {"skullbase", "l_hip", "r_hip", "l_knee", "r_knee"}  # joints that a horse has not under these names
+    if not find_roles(model.skeleton.names).keys() >= human:
         return Judgement()
     body = model.subject(betas).vertices(np.zeros((len(model.skeleton.parents), 3)))
     return implausible_body(*stature_and_volume(model.template.with_vertices(body)), betas, cause)

@@ -26,7 +26,6 @@ GROUPS = {      # an argument has the same name and meaning in all commands; wha
     "method": "",
     "other": "interactive over serve seed workers preset config write_config force",
 }
-WORDS = ("none", "people", "people-fingers")   # stand for no landmarks and for built-in models where files are expected
 WIDTH = range(60, 101)              # of help: narrower is no table, wider cannot be read
 
 
@@ -156,7 +155,8 @@ class Argument:
         if self.group == "output" or value == self.default:
             return
         for path in value if isinstance(value, tuple) else (value,):
-            if isinstance(path, Path) and str(path) not in WORDS and not path.exists():
+            # stand for no landmarks and for built-in models where files are expected
+            if isinstance(path, Path) and str(path) not in ("none", "people", "people-fingers") and not path.exists():
                 beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
                 raise FileNotFoundError(f"{path}: no such file or folder{near(path.name, beside, 0.8)}")
 

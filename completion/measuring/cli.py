@@ -32,8 +32,6 @@ from ..cli import ModelOrNone, read_model
 from .bodies import Body, check_standing, landmarks_of, model_of, read_bodies
 from .page import likely_section, measures_page
 
-# of what was not asked for, what stands in the closing table; the page and the report have all
-ASKED_MOST = ("stature", "weight", "chest_girth", "waist_girth", "hip_girth", "thigh_girth_left", "crotch_height")
 BodiesArg = Annotated[tuple[Path, ...], Place("[BODY ...]")]
 
 
@@ -203,7 +201,9 @@ def _make_body(to: Sequence[str], output: Path, model: BodyModel, name: str, lan
             "ranges are those of that sex")
     rows += [Metric("from the mean person", made.deviations, "sd"),
              Metric("people as far from the mean in these measurements", 100 * made.rarer, "%")]
-    first = [word for word in ASKED_MOST if word in made.likely]
+    # of what was not asked for, what stands in the closing table; the page and the report have all
+    asked_most = ("stature", "weight", "chest_girth", "waist_girth", "hip_girth", "thigh_girth_left", "crotch_height")
+    first = [word for word in asked_most if word in made.likely]
     rows += [_row(word, made.likely[word][1], made.sex, f", likely {_number(word, made.likely[word][0])} to "
                   f"{_number(word, made.likely[word][2])}", word not in first)
              for word in [*first, *(word for word in CATALOGUE if word in made.likely and word not in first)]]

@@ -111,9 +111,6 @@ def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
     return dict(sorted(found.items()))
 
 
-START = "frames/"                    # of the names of what is kept
-
-
 @dataclass(frozen=True, eq=False)
 class TrackedFolder:
     """All frames of a folder."""
@@ -133,11 +130,12 @@ def follow_folder(tracker: BodyTracker, frames: FrameFolder, space: Workspace, k
     """
     done: list[TrackedFrame] = []
     state, fresh, names, at_once = tracker.state, 0, [], 5
+    start = "frames/"  # of the names of what is kept
     for first in (*range(0, len(frames), at_once), len(frames)):
         mine = range(first, min(first + at_once, len(frames)))
         files = [[(path.relative_to(frames.folder).as_posix(), path) for path in frames.paths(i)] for i in mine]
         key = space.digests.of(key, files)
-        names.append(f"{START}{first:08d}" if mine else f"{START}end")
+        names.append(f"{start}{first:08d}" if mine else f"{start}end")
 
         def follow(folder: Path, mine: range = mine, before: TrackerState = state
                    ) -> tuple[tuple[TrackedFrame, ...], TrackerState, tuple[str, ...]]:
@@ -160,5 +158,5 @@ def follow_folder(tracker: BodyTracker, frames: FrameFolder, space: Workspace, k
         frames.problems += [f"{frames.folder}{text}" for text in problems]
         if progress is not None:
             progress(first + len(mine), len(frames))
-    space.drop_others(START, names)                          # the recording was longer
+    space.drop_others(start, names)                          # the recording was longer
     return TrackedFolder(done, state, key, fresh)

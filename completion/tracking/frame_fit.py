@@ -29,7 +29,6 @@ from .settings import TrackConfig
 REACH, FINAL_REACH = 0.1, 0.03       # metres: limits on the distance of matches in the first round and the third
 SETTLED = 1e-3                       # metres, root mean square: a round that moves the body less is the last
 ROUGH, VERTICES = 2, 2000            # rounds that take few vertices, and how many
-DAMPING = np.array([1e-3])           # share of the diagonal that is added to the matrix of a step
 NEAR, EXPLAINED = 0.05, 0.7          # metres: points that have the body within this are explained; share that must be
 NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
@@ -71,8 +70,9 @@ class FrameFit:
             places = now.skin(x).places
             frame = by_rotations(now.match_at(x, fit.cloud, _reach(i)).equations(at).dense, at, n)
             off = step_between(goal, at, n)
+            # share of the diagonal that is added to the matrix of a step
             step, _ = Dense(frame.energy + (off**2) @ held, frame.gradient + held * off,
-                            frame.hessian + np.diag(held)).step(DAMPING)
+                            frame.hessian + np.diag(held)).step(np.array([1e-3]))
             x = retract_pose(n)(x, step[0])
             if i >= ROUGH and np.sqrt(((now.skin(x).places - places)**2).sum(axis=1).mean()) < SETTLED:
                 break

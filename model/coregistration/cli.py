@@ -25,8 +25,6 @@ from ..files import load_model
 from .config import CoregistrationConfig
 from .rounds import Coregistration, coregister, coregistration_doubts, coregistration_problem
 
-FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "starts")
-
 ScansArg = Annotated[Path, Place("SCANS")]
 
 
@@ -90,8 +88,9 @@ def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask]
         write_mesh(folder / mesh_file(task.name), r.mesh)
     done.model.skeleton.save(folder / "skeleton.json")
     write_landmarks(folder / "landmarks.json", first.info.get("landmarks", {}))
-    write_table(folder / "coregistration.csv", ["name", "good", *FIGURES], [
-        [task.name, bool(fine), *(getattr(r, figure) for figure in FIGURES)]
+    figures = ("rms", "explained", "apart", "landmark_rms", "inverted", "starts")
+    write_table(folder / "coregistration.csv", ["name", "good", *figures], [
+        [task.name, bool(fine), *(getattr(r, figure) for figure in figures)]
         for task, fine, r in zip(tasks, done.good, done.registrations, strict=True) if r is not None])
     done.model.save(folder / "model.npz")
 

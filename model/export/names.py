@@ -15,16 +15,12 @@ Names = Literal["mixamo", "vrm", "h-anim", "opensim"]
 # or r. H-Anim: joints of version 2; OpenSim: bodies of the usual models of the whole body.
 _TRUNK = {"mixamo": ("Hips", "Spine", "Spine1", "Spine2"), "vrm": ("hips", "spine", "chest", "upperChest"),
           "h-anim": ("sacroiliac", "vl5", "vt12", "vt5"), "opensim": ("pelvis",)}
-_CHEST = {"opensim": "torso"}        # always that of the part with the arms, how many there are below it
-_NECK = {"mixamo": "Neck", "vrm": "neck", "h-anim": "vc4"}
-_HEAD = {"mixamo": "Head", "vrm": "head", "h-anim": "skullbase", "opensim": "head"}
 _LIMBS = ("sternoclavicular", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 _SIDED = {
     "mixamo": ("{S}Shoulder", "{S}Arm", "{S}ForeArm", "{S}Hand", "{S}UpLeg", "{S}Leg", "{S}Foot"),
     "vrm": ("{s}Shoulder", "{s}UpperArm", "{s}LowerArm", "{s}Hand", "{s}UpperLeg", "{s}LowerLeg", "{s}Foot"),
     "h-anim": tuple("{l}_" + name for name in (*_LIMBS[:3], "radiocarpal", *_LIMBS[4:6], "talocrural")),
     "opensim": (None, "humerus_{l}", "ulna_{l}", "hand_{l}", "femur_{l}", "tibia_{l}", "calcn_{l}")}
-_PREFIX = {"mixamo": "mixamorig:"}
 
 
 def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
@@ -42,13 +38,16 @@ def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
     rising = [name for name in ("trunk", "pelvis", "abdomen", *(f"abdomen{k}" for k in range(1, len(parts))), "chest")
               if name in parts]
     found = dict(zip(rising, _TRUNK[kind], strict=False))
-    if kind in _CHEST and rising[1:]:
-        found[rising[-1]] = _CHEST[kind]
+    chest = {"opensim": "torso"}  # always that of the part with the arms, how many there are below it
+    if kind in chest and rising[1:]:
+        found[rising[-1]] = chest[kind]
     roles = find_numbered_roles(parts, skeleton.joints)
-    if "neck" in parts and kind in _NECK:
-        found["neck"] = _NECK[kind]
+    neck = {"mixamo": "Neck", "vrm": "neck", "h-anim": "vc4"}
+    if "neck" in parts and kind in neck:
+        found["neck"] = neck[kind]
     if "head" in parts:
-        found["head"] = _HEAD[kind]
+        head = {"mixamo": "Head", "vrm": "head", "h-anim": "skullbase", "opensim": "head"}
+        found["head"] = head[kind]
     for side in ("left", "right"):
         for joint, name in zip(_LIMBS, _SIDED[kind], strict=True):
             if name and f"{side[0]}_{joint}" in roles:
@@ -56,7 +55,8 @@ def names_of(skeleton: Skeleton, kind: Names) -> dict[str, str]:
     if not found:
         raise ValueError(f"names: expected a person's parts (pelvis, thigh_left, ...) for the names of {kind}, found "
                          f"{', '.join(parts[:4])}{', ...' if len(parts) > 4 else ''}; see scape prep skeleton")
-    return {part: _PREFIX.get(kind, "") + name for part, name in found.items()}
+    prefix = {"mixamo": "mixamorig:"}
+    return {part: prefix.get(kind, "") + name for part, name in found.items()}
 
 
 def rename_bones(rig: Rig, kind: Names) -> Rig:

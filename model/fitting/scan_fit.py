@@ -170,7 +170,8 @@ class ScanFit:
         template, skeleton = self.body.template, self.body.skeleton
         rings = [skeleton.ring(template, j) for j in range(1, len(skeleton.parents))]
         # vertices that a search takes
-        some = self.some(np.concatenate([spread_points(template.vertices, 3000), *rings]), self.config.model_points // 2)
+        some = self.some(np.concatenate([spread_points(template.vertices, 3000), *rings]),
+                         self.config.model_points // 2)
         return replace(some, scan_points=self.config.scan_points // 2)
 
     def mesh(self, x: np.ndarray) -> Mesh:

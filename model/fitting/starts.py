@@ -19,13 +19,9 @@ from .upright import SPREAD, SPREAD_OF_MANY
 AXES = 4                             # directions of the training poses along which a search from landmarks starts
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
 FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
-# of a body's length: a scan that is shorter is of a part of it; half a man had 0.49
-HALF = 0.65
 VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns, or all draws
 PROMISING, STANDING = 0.4, 0.15      # share of all placements, those least denied by the camera, that are compared
 AT_ONCE = 1000                       # points that are compared at a time
-# placements that are compared on all points, after a first look on a third: fifteen times as many as are kept
-FINE = 3000
 BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
 
 
@@ -191,7 +187,9 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     cost[likely] += distance_cost(*few, turns, shift, scan.some(np.arange(0, len(scan.points), 3)), likely)[likely]
 
     # then the best of these on all
-    best = cost <= np.partition(cost, min(FINE, cost.size - 1), axis=None)[min(FINE, cost.size - 1)]
+    # placements that are compared on all points, after a first look on a third: fifteen times as many as are kept
+    fine = 3000
+    best = cost <= np.partition(cost, min(fine, cost.size - 1), axis=None)[min(fine, cost.size - 1)]
     best &= np.isfinite(cost)
     whole = free_space_cost(fit, places, turns, shift, best) + distance_cost(places, normals, turns, shift, scan, best)
     cost = np.where(best, whole, np.inf)
@@ -246,7 +244,8 @@ def candidate_rotations(fit: ScanFit) -> tuple[np.ndarray, np.ndarray, np.ndarra
         extent = np.ptp(fit.body.template.vertices, axis=0)
         off = fit.cloud.points - fit.cloud.points.mean(axis=0)
         length = np.ptp(off @ np.linalg.svd(off[::1 + len(off) // 5000], full_matrices=False)[2][0])
-        if fit.data.cameras or length > HALF * extent.max():
+        # of a body's length: a scan that is shorter is of a part of it; half a man had 0.49
+        if fit.data.cameras or length > 0.65 * extent.max():
             return every, np.zeros(len(every)), None
         turns, up, lift = every, every[:, :, extent.argmax()], np.array([0, 0.5, 1])
     return np.repeat(turns, len(lift), axis=0), np.tile(lift, len(turns)), np.repeat(up, len(lift), axis=0)

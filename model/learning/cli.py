@@ -34,7 +34,6 @@ from .scape import judge_model, learn_blendscape, learn_scape
 from .sexes import learn_by_sex
 from .skinning import SkinConfig, learn_skinning
 
-SEXES = "sexes.csv"                  # in a plain folder of shapes
 Kind = Literal["scape", "blendscape", "skinning", "mixed"]
 WITH_PRIOR = "scape", "blendscape"
 
@@ -180,9 +179,10 @@ def _read_sexes(folder: Path) -> list[str]:
         whole = RegisteredSet.load(folder)
         first = {entry.subject: entry.sex for entry in reversed(whole.entries)}
         return [first[subject] for subject in whole.subjects]
-    path = folder / SEXES
+    sexes = "sexes.csv"  # in a plain folder of shapes
+    path = folder / sexes
     if not path.exists():
-        raise ValueError(f"{folder}: a plain folder does not say the sex; write {SEXES} in it, with the columns "
+        raise ValueError(f"{folder}: a plain folder does not say the sex; write {sexes} in it, with the columns "
                          "name,sex")
     table = {row["name"]: row["sex"] for _, row in read_table(path, ("name", "sex"))}
     names = [name_of(mesh) for mesh in list_meshes(folder)]

@@ -15,7 +15,6 @@ MEASURED = (*FEET, "top of head", "neck front", "neck back", "navel", "back", "c
             *(f"{side} {name}" for side in ("left", "right") for name in (
                 "ear", "shoulder", "armpit", "nipple", "hip", "knee", "knee inside", "elbow outside", "elbow inside",
                 "middle finger")))
-ABOVE = ("top of head", "neck front", "neck back", "left ear", "right ear")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +53,12 @@ def body_landmarks(mesh: Mesh, landmarks: Mapping[str, int]) -> BodyLandmarks:
     """
     known = translate_landmarks(landmarks)
     lacking = [name for name in FEET if name not in known]
-    if lacking or not set(ABOVE) & set(known):
-        raise ValueError(f"landmarks: expected at least {', '.join(FEET)}, and one of {', '.join(ABOVE)}; there is no "
+    above = ("top of head", "neck front", "neck back", "left ear", "right ear")
+    if lacking or not set(above) & set(known):
+        raise ValueError(f"landmarks: expected at least {', '.join(FEET)}, and one of {', '.join(above)}; there is no "
                          f"{', '.join(lacking) or 'landmark of head or neck'}")
-    at = {name: mesh.vertices[known[name]] for name in (*FEET, *ABOVE) if name in known}
-    feet, head = (np.mean([at[name] for name in names if name in at], axis=0) for names in (FEET, ABOVE))
+    at = {name: mesh.vertices[known[name]] for name in (*FEET, *above) if name in known}
+    feet, head = (np.mean([at[name] for name in names if name in at], axis=0) for names in (FEET, above))
     up = (head - feet) / np.linalg.norm(head - feet)
     axis = int(np.abs(up).argmax())
     if np.abs(up[axis]) > 0.97:

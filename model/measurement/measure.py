@@ -12,7 +12,6 @@ from scanprep.geometry.mesh import Mesh
 from .reading import NotMeasured, Reading, Standing, read_measurement
 from .tapes import Tapes
 
-TURNED = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}       # degrees from the standard pose that change little
 # Chosen on half views of the ten even people of `tests/benchmarks/measures.py`, which tells how far the odd ones agree.
 MOST, SHARE = 0.010, 0.02            # metres, and of the value: more is an error of the pose, which repose takes away
 MANY = 2000                          # vertices, whose distances from each other are 100 megabytes
@@ -120,12 +119,13 @@ def stands(vertices: np.ndarray, tapes: Tapes) -> bool:
 def find_turned_limbs(tapes: Tapes, body: Standing, share: float = 1.0) -> tuple[str, ...]:
     """Limbs that point elsewhere than on the template, by more than a share of what changes little, in words."""
     found = []
+    turned = {"upper arm": 30.0, "forearm": 35.0, "shin": 15.0}  # degrees from the standard pose that change little
     for name, (first, second) in tapes.limbs.items():
         ways = [(second.at(vertices) - first.at(vertices)) @ axes.T for vertices, axes in (
             (tapes.template.vertices, tapes.axes), (body.vertices, body.axes))]
         cosine = ways[0] @ ways[1] / (np.linalg.norm(ways[0]) * np.linalg.norm(ways[1]))
         angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-        if angle > share * TURNED[name.split(" ", 1)[1]]:
+        if angle > share * turned[name.split(" ", 1)[1]]:
             found.append(f"the {name} is turned by {angle:.0f} degrees from the standard pose")
     return tuple(found)
 

@@ -14,8 +14,6 @@ from .reading import DENSITY_SPREAD
 from .tapes import Tapes
 
 OFTEN = 1.6449                       # standard deviations within which 90% of people are
-FACTORS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
-HEAVY_FACTORS = {"grams": 0.001}     # pounds look like kilograms
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +94,15 @@ def check_wanted(given: Mapping[str, float]) -> dict[str, float]:
     {'stature': 1.8, 'weight': 78.0}
     """
     wanted = dict[str, float]()
+    factors = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
+    heavy_factors = {"grams": 0.001}  # pounds look like kilograms
     for word, value in given.items():
         for name in find_measurements(word):
             usual = CATALOGUE[name]
             if not usual.low <= value <= usual.high:
                 unit = "metres" if usual.unit == "m" else "kilograms"
                 seems = [(factor * value, other) for other, factor in (
-                    FACTORS if usual.unit == "m" else HEAVY_FACTORS).items()
+                    factors if usual.unit == "m" else heavy_factors).items()
                     if usual.low <= factor * value <= usual.high]
                 hint = (f"; it is in {unit}: did you mean {word}={seems[0][0]:.4g}, which is {value:g} {seems[0][1]}?"
                         if seems else f"; the nearest is {word}={float(np.clip(value, usual.low, usual.high)):g}")

@@ -18,9 +18,6 @@ from ..body import BodyModel, Progress
 from ..linear import check_pose
 from ..shape_statistics import PLANE
 
-# registrations of the template, each from where the last one left it: one alone does not stretch so far
-REGISTRATIONS = 2
-
 
 @dataclass(frozen=True)
 class CharacterConfig(Settings):
@@ -146,9 +143,11 @@ def _register_character(template: Mesh, mesh: Mesh, vertices: np.ndarray, points
     tell = progress or (lambda done, total: None)
     size = _spread(template.vertices[vertices]) / _spread(points)
     start = template.with_vertices(template.vertices / size)
-    for k in range(REGISTRATIONS):
+    # registrations of the template, each from where the last one left it: one alone does not stretch so far
+    registrations = 2
+    for k in range(registrations):
         def told(done: int, total: int, before: int = k) -> None:
-            tell(before * total + done, REGISTRATIONS * total)
+            tell(before * total + done, registrations * total)
 
         fit = register(start, mesh, (vertices, points), config.register, told)
         start = fit.mesh

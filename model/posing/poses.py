@@ -16,8 +16,6 @@ from scanprep.skeleton.tree import Skeleton
 
 Frame = Literal["parent", "world", "own"]
 
-_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-
 
 def pose_from_angles(skeleton: Skeleton, angles: Mapping[str | int, Any]) -> np.ndarray:
     """A pose in which some parts are turned against their parents and all others are at rest.
@@ -104,11 +102,12 @@ def part_number(skeleton: Skeleton, part: str | int) -> int:
 
 def rotation_vector(given: Any, name: str) -> np.ndarray:
     """The axis-angle vector (3,), radians, of a vector or of an axis with degrees."""
+    axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
     if isinstance(given, tuple | list) and len(given) == 2:
         axis, degrees = given
-        if isinstance(axis, str) and axis not in _AXES:
+        if isinstance(axis, str) and axis not in axes:
             raise ValueError(f"{name}: expected an axis x, y or z, got '{axis}'")
-        along = _finite(_AXES[axis] if isinstance(axis, str) else axis, name)
+        along = _finite(axes[axis] if isinstance(axis, str) else axis, name)
         length = float(np.linalg.norm(along))
         if not length:
             raise ValueError(f"{name}: the axis has no direction")
@@ -124,8 +123,6 @@ def _finite(given: Any, name: str) -> np.ndarray:
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"{name}: expected an axis-angle vector of 3 numbers, or an axis and degrees, got {given!r}")
     return vector
-
-
 
 
 @dataclass(frozen=True, eq=False)

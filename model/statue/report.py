@@ -26,7 +26,6 @@ from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
 MOVED = MOST // 2                    # triangles of one of several bodies beside each other
-THINNED = "Shown with fewer triangles than it has."
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
 
 
@@ -60,7 +59,8 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
     """The page of `scape statue fit`: levels, coarsest first, the figures, the statue in other poses."""
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
-    page.bodies(first_panes(scan, statue, levels[-1]), THINNED + " The control mesh can also be coloured by what the "
+    thinned = "Shown with fewer triangles than it has."
+    page.bodies(first_panes(scan, statue, levels[-1]), thinned + " The control mesh can also be coloured by what the "
                 "scan told: blue was measured, red is folded, not one-to-one with it, yellow is a hole of the scan.",
                 HEIGHT, webp_bytes(picture))
     page.figures(metrics)
@@ -99,11 +99,11 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
         # to 3 mm, the end of the colours
         solid = Solid(one.mesh, Heat(far, 0.0, 0.003, "distance to the scan"), shades={"plain": np.array(CLAY)})
         panes.append(Pane([thin_solid(solid, MOVED)], camera, f"{one.name}: {len(one.mesh.faces):,} triangles"))
-    page.bodies(panes, THINNED, 420)
+    page.bodies(panes, thinned, 420)
     if frames:
         page.section("In motion", "The skeleton moves the control mesh, and the detail stands on its moving normals.")
         page.bodies([Pane([thin_solid(Solid(mesh), MOVED)], cameras(statue, mesh, (20,))[0], label)
-                     for label, mesh in frames], THINNED, HEIGHT)
+                     for label, mesh in frames], thinned, HEIGHT)
     return page
 
 

@@ -21,8 +21,6 @@ from .values import PACKAGES
 
 DIGITS = 32
 INSTALLED = Path(__file__).parents[2]   # the folder of the three packages
-COMPUTES = {".py", ".json", ".npz"}     # endings of what changes results: modules, layouts, the humanoid, people
-UNUSED = "scanprep/viewer/source/"      # sources of viewer.js, which wheels do not have
 SETTLED = 2_000_000_000        # nanoseconds after which a file's time of change tells of every later change
 
 
@@ -178,10 +176,12 @@ def _program_in(folder: Path) -> str:
     except importlib.metadata.PackageNotFoundError:
         version = "not installed"
     sources = hashlib.sha256()
+    computes = {".py", ".json", ".npz"}  # endings of what changes results: modules, layouts, the humanoid, people
     found = {path.relative_to(folder).as_posix(): path for name in PACKAGES for path in (folder / name).rglob("*")
-             if path.suffix in COMPUTES}
+             if path.suffix in computes}
     for name in sorted(found):
-        if not name.startswith(UNUSED):
+        # sources of viewer.js, which wheels do not have
+        if not name.startswith("scanprep/viewer/source/"):
             content = found[name].read_bytes()
             sources.update(f"{name} {len(content)} ".encode() + content)
     return f"{version}, sources {sources.hexdigest()[:12]}"

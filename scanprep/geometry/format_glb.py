@@ -25,8 +25,6 @@ _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 51
 VERTICES, _INDICES = 34962, 34963     # what a graphics card will use the numbers for
 _NUMBERS = {np.dtype(kind).str: number for number, kind in _COMPONENTS.items()}
 GENERATOR = "scapekit"
-_TURNS = {"x": 0, "y": 1, "z": 2}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 _DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
@@ -245,7 +243,8 @@ def up_of(tree: dict[str, Any]) -> int:
     asset = tree.get("asset")
     if not isinstance(asset, dict) or asset.get("generator") != GENERATOR or not isinstance(asset.get("extras"), dict):
         return 1
-    return _TURNS.get(str(asset["extras"].get("up")), 1)
+    turns = {"x": 0, "y": 1, "z": 2}
+    return turns.get(str(asset["extras"].get("up")), 1)
 
 
 def item(values: list[Any], number: Any) -> Any:
@@ -317,7 +316,8 @@ def accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> n
     kind, count = np.dtype(_COMPONENTS[entry["componentType"]]), entry["count"]
     if entry["type"] not in types:
         raise ValueError(f"accessor {number} is of type {entry['type']!r}, expected {' or '.join(types)}")
-    width = _WIDTHS[entry["type"]]
+    widths = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+    width = widths[entry["type"]]
     if "bufferView" in entry:
         values = _values(tree, binary, f"accessor {number}", entry, kind, count, width)
     elif isinstance(count, int) and 0 <= count * width * kind.itemsize <= 10**6 + 100 * len(binary):

@@ -13,7 +13,6 @@ from ..geometry.sparse import unique_integers
 # Directions of the lights in the camera's frame (right, up, back) and their linear strengths.
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
 SKY, BOUNCE = np.array([0.32, 0.34, 0.38]), np.array([0.20, 0.175, 0.16])
-BACK_FACE = np.array([0.30, 0.33, 0.40])      # tint of the inner side of an open surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +111,8 @@ class Scene:
         normal, color, ambient, key_light = found[:, :3], found[:, 3:6], found[:, 6, None], found[:, 7, None]
         inner = np.einsum("nd,nd->n", self.outward[face], directions) > 0
         normal = _unit(normal) * np.where(inner, -1, 1)[:, None].astype(np.float32)
-        color = np.where(inner[:, None], color * BACK_FACE.astype(np.float32), color)
+        # tint of the inner side of an open surface
+        color = np.where(inner[:, None], color * np.array([0.30, 0.33, 0.40]).astype(np.float32), color)
         lights = [(_unit(np.array(d)) @ self.axes).astype(np.float32) for d, _ in (KEY, FILL, RIM)]
         key, fill, rim = (np.maximum(normal @ d, 0)[:, None] for d in lights)
         upward = 0.5 + 0.5 * (normal @ self.vertical.astype(np.float32))[:, None]

@@ -34,7 +34,6 @@ ROUNDS = 3                          # models that are learned at most; another o
 CLEARLY = 0.8                       # of what was wrong with a scan, below which its next registration is better
 MOST = 40                           # poses that teach: learning takes a second a pose, and more hardly help a search
 MODEL = "set_model.npz"             # what the set taught, in the folder of the round
-OWN = "of this set"                 # what such a lead is called in figures: "model of this set"
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +140,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
     best = {name: judge_alone(f, work) for name, f in first.items()}
     files = {name: mesh_file(name) for name in best}
     chosen = {name for name in best if is_chosen(space.folder, name)}
+    own = "of this set"  # what such a lead is called in figures: "model of this set"
     for number in range(1, ROUNDS + 1):
         kept = f"{folder_of(number)}/"
         doubted = [task for task in tasks if task.landmarks is None and task.name not in chosen
@@ -158,7 +158,7 @@ def bootstrap_set(space: Workspace, work: RegisterScan, tasks: Sequence[ScanTask
         space.step(f"model {number}", (work.template, work.parts, skeleton, lessons), teach)
         lead = lead_of(work.template, str(model))
         assert lead is not None, "a model was named"
-        again = RegisterAgain(replace(work, lead=replace(lead, name=OWN)), number)      # type: ignore[type-var]
+        again = RegisterAgain(replace(work, lead=replace(lead, name=own)), number)      # type: ignore[type-var]
         given = [DoubtedScan(replace(task, model=model), best[task.name].badness if task.name in best else np.inf)
                  for task in doubted]
         done = space.run(again, [Task(kept + one.scan.name, one) for one in given], workers, progress)

@@ -28,8 +28,6 @@ from .rivals import has_rival
 from .scan import mesh_file
 from .scans import ScanTask, means_none
 
-WORK = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
-
 
 class MendApp(ResultsApp):
     """The state of `scape pick SET`.
@@ -106,13 +104,14 @@ class MendApp(ResultsApp):
                 send(self.state())
             return tell
 
+        work = ("registering", "finding the skeleton", "finding the parts of a person", "registering the scan")
         def do(space: Workspace, _: Progress) -> tuple[Outcome, str]:
             given = self.call.inputs(lambda line: None)
-            outcome = carry_out(self.call, given, space, *map(telling, WORK))
+            outcome = carry_out(self.call, given, space, *map(telling, work))
             fresh = next(metric.value for metric in outcome.metrics if metric.name == "of them in this run")
             return outcome, f"{fresh} of {len(given[0])} scans registered again; the page of the set is new"
 
-        self.do_again(WORK[0], f"scape pick {self.folder}", do, send, "nothing was registered",
+        self.do_again(work[0], f"scape pick {self.folder}", do, send, "nothing was registered",
                       lambda: self.changed.update(before))
 
     def on_take_rival(self, send: Send) -> None:

@@ -18,7 +18,6 @@ from .nonrigid import Registration, share_stretched
 
 UNSEEN = 0.15                  # share of vertices that four views of a person leave without data
 NONE = "none"                  # what a table says where a figure has no value
-EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
 # Weights of the logarithms of evidence; `certain` is the log-odds of a registration that nothing speaks against. By
 # `fit_weights` of tests/benchmarks/reliability.py on 72 scans. Weights of one half of these told of the other with a
 # Brier score of 0.16, where the share of right ones has 0.22. Inverted triangles were hardly seen: they keep one half.
@@ -65,7 +64,8 @@ _READ: dict[str, Callable[[str], Any]] = {"str": str, "float": lambda text: np.n
 def read_figures(folder: Path) -> list[ScanFigures]:
     """The figures of all scans of a set, as they stand in its tables; ValueError for other columns or values."""
     seconds = {row["name"]: float(row["seconds"]) for row in _read(folder / TIMES)}
-    rows = [{EARLIER.get(name, name): text for name, text in row.items()} for row in _read(folder / FIGURES)]
+    earlier = {"guide": "init", "flipped": "inverted"}  # names of columns in tables written before
+    rows = [{earlier.get(name, name): text for name, text in row.items()} for row in _read(folder / FIGURES)]
     try:
         return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED if f.name in row},
                             seconds=seconds.get(row["name"], np.nan)) for row in rows]

@@ -16,8 +16,6 @@ from ..geometry.mesh import Mesh
 from ..skeleton.tree import Skeleton
 from .person import PersonParts, has_limbs
 
-GROUP = "scapekit.leads"
-
 
 class Lead(Protocol):
     """Finds bodies on scans: where the template's vertices (N, 3), metres, are on each, the likeliest body first.
@@ -79,8 +77,9 @@ def learn_model(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: n
 
 def _load_entry_point(name: str, wanted: str) -> Callable[..., Any]:
     """What the package `model` makes known by a name; ValueError where it is not installed."""
-    found = [entry for entry in entry_points(group=GROUP) if entry.name == name]
+    group = "scapekit.leads"
+    found = [entry for entry in entry_points(group=group) if entry.name == name]
     if not found:
-        raise ValueError(f"{wanted}: scapekit is not installed whole, nothing is known as '{GROUP}' {name}; "
+        raise ValueError(f"{wanted}: scapekit is not installed whole, nothing is known as '{group}' {name}; "
                          "install it, or leave the model out with --through none")
     return found[0].load()

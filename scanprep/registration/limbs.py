@@ -23,7 +23,6 @@ from .limb_ends import bending
 from .person import PersonParts, average_person
 
 ROLL, BEND, SIDE = range(3)
-MOVED = ("rolled", "bent", "bent sideways")
 # Degrees by which joints of real people go beyond those of the built-in ones (roll, bend, side), found on the true
 # bodies of 56 scans of one man, none of them held out. Rolls hold for 99 in 100, so that rolled limbs are told; bends
 # are five degrees beyond the largest, as registered hands bend a little more than they should.
@@ -67,6 +66,7 @@ class LimbMeasures:
     def doubts(self, skeleton: Skeleton) -> tuple[PlausibilityIssue, ...]:
         """What is unlikely, the gravest first."""
         found: list[PlausibilityIssue] = []
+        moved = ("rolled", "bent", "bent sideways")
         for part in range(1, len(PARTS)):
             name, parent = (in_words(skeleton.names[k]) for k in (part, skeleton.parents[part]))
 
@@ -76,7 +76,7 @@ class LimbMeasures:
                 angle = abs(self.angles[part, kind])
                 found.append(PlausibilityIssue(
                     1 + float(self.beyond[part, kind]) / GRAVE,
-                    f"the {name} is {MOVED[kind]} by {angle:.0f} degrees against the {parent}", part))
+                    f"the {name} is {moved[kind]} by {angle:.0f} degrees against the {parent}", part))
 
             # skin that is no enlarged copy of the template's
             if part in LIMBS and self.bending[part] > self.most[part]:

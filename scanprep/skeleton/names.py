@@ -10,9 +10,6 @@ from .roles import missing_joints
 from .symmetry import Symmetry
 from .tree import Skeleton
 
-ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
-LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
-
 
 def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
     """Names of the parts of a person: pelvis, abdomen, chest, head, upper_arm_left, ..., foot_right.
@@ -30,7 +27,9 @@ def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[
     if left is None:
         return skeleton.names
     names = dict(zip(person.spine, _spine_names(person), strict=True))
-    for limbs, kinds, first in ((person.arms, ARM, "shoulder"), (person.legs, LEG, "hip")):
+    arm = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
+    leg = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
+    for limbs, kinds, first in ((person.arms, arm, "shoulder"), (person.legs, leg, "hip")):
         for limb in limbs:
             side = "left" if (_middle(template, skeleton, limb) - person.centre) @ left > 0 else "right"
             for part, name in zip(limb, _limb_names(template, skeleton, limb, kinds, first), strict=True):

@@ -9,7 +9,6 @@ from .messages import Message
 from .waiting import Waiting
 
 LONGEST_QUEUE = 2**29                # bytes that wait for one tab; beyond, it is closed, and greeted when it returns
-ACKNOWLEDGED = "acknowledged"
 
 Frames = Iterable[tuple[bytes, str]]
 
@@ -109,7 +108,8 @@ class Tabs:
 
     def acknowledgement(self, name: str) -> tuple[bytes, str]:
         """The same as a frame and its key."""
-        return Message(ACKNOWLEDGED, {"number": self._last.get(name, 0)}).pack(), ACKNOWLEDGED
+        acknowledged = "acknowledged"
+        return Message(acknowledged, {"number": self._last.get(name, 0)}).pack(), acknowledged
 
     def put(self, frame: bytes, key: str = "") -> None:
         """Tell every tab."""

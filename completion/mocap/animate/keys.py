@@ -18,8 +18,6 @@ from scanprep.ranges import TURNS
 
 from ..files.text import table_numbers
 
-PLACE = ("trans_x", "trans_y", "trans_z")
-
 
 def holds_keys(path: Path) -> bool:
     """Whether a table has columns of joint angles, as joint_angles.csv has them, and not those of markers."""
@@ -64,7 +62,8 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
     separator, rows = tables.table_rows(path, storage.read_bytes(path, "a table of keys"))
     head, names = [word.lower() for word in rows[0][1]] if rows else [], subject.skeleton.names
     known = {f"{name}_r{axis}".lower(): (j, k) for j, name in enumerate(names) for k, axis in enumerate("xyz")}
-    unknown = [word for word in head if word not in known and word not in ("time", *PLACE)]
+    place = ("trans_x", "trans_y", "trans_z")
+    unknown = [word for word in head if word not in known and word not in ("time", *place)]
     if unknown:
         raise storage.StorageError(f"{path}: line 1: expected the columns time, PART_rx, PART_ry, PART_rz, ..., "
                                    f"trans_x, trans_y, trans_z, of the parts {', '.join(names)}, found {unknown[0]!r}")
@@ -97,7 +96,7 @@ def read_keys(path: Path, subject: Subject, unit: str | None = None, rate: float
         if keyed.any():
             TURNS.check(np.radians(angles[keyed]), f"{path}: {name}")
             poses[:, j] = interpolate_rotations(times[keyed], np.radians(angles[keyed]), at)
-    places = _coordinates(path, table, columns, PLACE, lines)
+    places = _coordinates(path, table, columns, place, lines)
     keyed = np.isfinite(places[:, 0])
     trans = _between(times[keyed], UNITS[unit or "m"] * places[keyed], at) if keyed.any() else np.zeros((len(at), 3))
     return BodyMotion(poses, trans, subject.betas, rate, how=f"between {len(times)} keys")

@@ -30,7 +30,6 @@ SD = 0.03                            # metres: the mean person carries the marke
 ROUNDS = ((0.3, 3.0), (0.2, 3.0), (0.2, 1.0), (0.15, 1.0), (0.12, 1.0), (0.1, 1.0), (0.1, 1.0))
 LIMB_ROUNDS = ((0.2, 1.0), (0.12, 1.0), (0.1, 1.0))
 LIMB_POSES = 8
-TRUNK = ("pelvis", "abdomen", "chest", "trunk", "spine", "neck", "head")
 Axis = tuple[float, float, float]
 UPS: tuple[Axis, ...] = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))             # axes that files have upwards
 # where nobody stands: heads down, and people who lie along four directions
@@ -222,8 +221,9 @@ def limb_trees(skeleton: Skeleton) -> list[list[int]]:
     """The joints of each limb: where a part that is none of the trunk's begins, and all that follow it."""
     parents, names = skeleton.parents, skeleton.names
     trees = []
+    trunk = ("pelvis", "abdomen", "chest", "trunk", "spine", "neck", "head")
     for joint, parent in enumerate(parents):
-        if parent >= 0 and names[parent].startswith(TRUNK) and not names[joint].startswith(TRUNK[:-2]):
+        if parent >= 0 and names[parent].startswith(trunk) and not names[joint].startswith(trunk[:-2]):
             tree = [joint]
             tree += [later for later in range(joint + 1, len(parents)) if _is_below(parents, later, joint)]
             trees.append(tree)

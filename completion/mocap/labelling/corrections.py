@@ -12,8 +12,6 @@ from scanprep.geometry.storage import StorageError
 from .label import GHOST, UNKNOWN
 
 COLUMNS = ("track", "point", "begin", "end", "label", "confidence", "fixed")
-YES = ("yes", "y", "x", "1", "true")
-NO = ("", "no", "n", "0", "false")
 
 
 def write_labels(path: Path, points: Sequence[str], tracks: np.ndarray, rows: np.ndarray, names: Sequence[str],
@@ -73,8 +71,8 @@ def read_corrections(path: Path, tracks: np.ndarray, names: Sequence[str]) -> np
     known = np.full(tracks.shape, UNKNOWN)
     for line, row in tables.read_table(path, COLUMNS, ("track", "begin", "end", "label", "fixed")):
         said = row["fixed"].strip().lower()
-        if said not in YES:
-            if said not in NO:
+        if said not in ("yes", "y", "x", "1", "true"):
+            if said not in ("", "no", "n", "0", "false"):
                 raise StorageError(f"{path}: line {line}: expected yes or nothing in the column fixed, found '{said}'")
             continue
         try:

@@ -9,7 +9,6 @@ from scipy.optimize import linear_sum_assignment
 ACCELERATION = 100.0                 # m/s²; what it may miss besides, over the time since the last observation
 SPEED = 5.0                          # m/s of a marker that was seen once, whose velocity is not known
 BRIDGE = 0.1                         # seconds out of sight after which a track has ended
-RIVAL = 1.5                          # times the distance that any other candidate has to be away
 
 
 def link_points(points: np.ndarray, rate: float) -> np.ndarray:
@@ -66,7 +65,8 @@ def link_points(points: np.ndarray, rate: float) -> np.ndarray:
             others = apart.copy()
             others[rows, columns] = np.inf
             rival = np.minimum(others[rows].min(axis=1), others[:, columns].min(axis=0))
-            sure = (rival > RIVAL * apart[rows, columns] + margin) | same[rows, columns]
+            # times the distance that any other candidate has to be away
+            sure = (rival > 1.5 * apart[rows, columns] + margin) | same[rows, columns]
             source[columns[sure]] = rows[sure]
 
         # points that continue a track update it, others begin one

@@ -256,7 +256,7 @@ def _best_places(model: BodyModel, fit: PersonFit, tracks: MarkerSequence) -> Ma
             distances.append(DISTANCE)
             continue
         # metres that a marker may be off the skin
-        off, lift = stand_off(targets[seen], vertices[seen], normals[seen], *(0.0, 0.04))
+        off, lift = stand_off(targets[seen], vertices[seen], normals[seen], 0.0, 0.04)
         best = int(np.minimum(off**2, OUTLIER**2).mean(axis=0).argmin())
         places.append(best)
         distances.append(float(lift[best]))
@@ -303,7 +303,7 @@ def _collect(model: BodyModel, tracks: MarkerSequence, fit: PersonFit, margin: f
     rows = [fit.layout.labels.index(label) for label in layout.labels]
     spread = np.sqrt(np.nanmean(fit.residuals[:, rows]**2, axis=0))
     # metres that a place is uncertain by, beside what its residuals tell: of a marker of a usual set, and of another
-    uncertainty = np.where([label in usual for label in layout.labels], *0.009, 0.025) + spread
+    uncertainty = np.where([label in usual for label in layout.labels], 0.009, 0.025) + spread
     names = suggest_names(model, layout, usual)
     return FoundLayout(replace(layout, labels=names), dict(zip(names, map(tuple, groups.values()), strict=True)),
                        uncertainty, left_out, fit, margin)

@@ -16,7 +16,6 @@ from .labelled_file import LABELLED, TABLE
 from .page import label_page
 from .recording import DOUBTFUL, LABELLED_SHARE, label_recording
 
-PAGE = "report.html"
 __all__ = ["DOUBTFUL", "LABELLED_SHARE", "LabelWork"]
 
 
@@ -36,7 +35,7 @@ class LabelWork:
 
     def __call__(self, path: Path, room: TaskContext) -> list[Metric]:
         """Label a recording into the folder of a room; the figures, the first says what the labels are worth."""
-        return self.write(path, room, LABELLED, TABLE, PAGE)
+        return self.write(path, room, LABELLED, TABLE, "report.html")
 
     def write(self, path: Path, room: TaskContext, recording: str, table: str, page: str) -> list[Metric]:
         """The same under other names of the three files."""

@@ -18,7 +18,6 @@ from .layout import MarkerLayout
 from .symmetry import label_pairs
 
 HEIGHT = 1000
-SIDES = ("front", "its left", "back", "its right")
 FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
 
 
@@ -54,7 +53,7 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) 
             taken.append((free or boxes)[0])
             draw.text(taken[-1][:2], layout.labels[i], fill=(24, 40, 92), font=size)
         images.append(np.asarray(image))
-    return contact_sheet(images, SIDES)
+    return contact_sheet(images, ("front", "its left", "back", "its right"))
 
 
 def layout_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = None) -> list[tuple[str, ...]]:

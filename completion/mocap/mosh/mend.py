@@ -30,9 +30,6 @@ from .mended_layout import Spot, apply_corrections, changes, next_file
 from .people import FoundPerson, load_people
 from .work import ERRORS
 
-MENDED = "scape mosh, mended in the browser"
-TOLD = "markers in the mean distance"
-
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -63,7 +60,7 @@ class Result:
         known = [1000 * far for far in off.values() if np.isfinite(far)] or [np.nan]
         return [Metric("distance of all markers, mean", float(np.mean(known)), "mm"),
                 Metric("distance of the worst marker", float(np.max(known)), "mm"),
-                *(m for m in self.rows[name] if m.name in (*ERRORS, TOLD))]
+                *(m for m in self.rows[name] if m.name in (*ERRORS, "markers in the mean distance"))]
 
 
 class MoshApp(ResultsApp):
@@ -195,13 +192,14 @@ class MoshApp(ResultsApp):
         # now, as they are worked out from files that the run writes anew
         before = {one.name: self.result.figures(one.name) for one in self.result.people}
 
+        mended = "scape mosh, mended in the browser"
         def do(space: Workspace, tell: Progress) -> tuple[Outcome, str]:
-            outcome = carry_out(call, space, Workers(workers=1), MENDED, lambda done, total: None, tell)
+            outcome = carry_out(call, space, Workers(workers=1), mended, lambda done, total: None, tell)
             self.before = before
             failed = f"; failed: {'; '.join(outcome.failures)}" if outcome.failures else ""
             return outcome, f"run again with {Path(str(call.layout)).name}{failed}"
 
-        self.do_again("finding shape, markers and motion", MENDED, do, send, "it could not be run again")
+        self.do_again("finding shape, markers and motion", mended, do, send, "it could not be run again")
 
     # the state itself
 

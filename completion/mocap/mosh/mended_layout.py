@@ -13,8 +13,6 @@ from scanprep.geometry.surface import Surface
 
 from ..marker_sets.layout import MarkerLayout
 
-FILE = "corrected_layout_{}.json"    # numbered: one that was run with is never written again
-
 
 @dataclass(frozen=True, eq=False)
 class Spot:
@@ -88,5 +86,6 @@ def _spread(spot: Spot) -> dict[int, float]:
 def next_file(folder: Path, used: str | None) -> Path:
     """Where the corrections of the layout that a folder was made with are written: after those it was made with."""
     folder, before = folder.absolute(), Path(used or "").absolute()
-    number = re.fullmatch(FILE.format(r"(\d+)"), before.name) if before.parent == folder else None
-    return folder / FILE.format(int(number[1]) + 1 if number else 1)
+    file = "corrected_layout_{}.json"  # numbered: one that was run with is never written again
+    number = re.fullmatch(file.format(r"(\d+)"), before.name) if before.parent == folder else None
+    return folder / file.format(int(number[1]) + 1 if number else 1)

@@ -17,8 +17,6 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
-# trajectories without a name, as Vicon, Motive and Qualisys write them
-UNNAMED = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"
 # points that Plug-in Gait computes: centres of mass, and of every segment its origin and the ends of its three axes
 COMPUTED, AXES = r"CentreOfMass(Floor)?", "OALP"             # PELO, PELA, PELL, PELP of the pelvis
 
@@ -114,7 +112,9 @@ def marker_labels(labels: Iterable[str]) -> set[str]:
     every = set(labels)
     segments = {label[:-1] for label in every if all(label[:-1] + axis in every for axis in AXES)}
     axes = {stem + axis for stem in segments for axis in AXES}
-    return {label for label in every - axes if not re.fullmatch(f"{UNNAMED}|{COMPUTED}", label.rpartition(":")[2])}
+    # trajectories without a name, as Vicon, Motive and Qualisys write them
+    unnamed = r"\*\d+|U_?\d+|Unlabell?ed.*|Unidentified.*"
+    return {label for label in every - axes if not re.fullmatch(f"{unnamed}|{COMPUTED}", label.rpartition(":")[2])}
 
 
 def between(skeleton: Skeleton, seen: np.ndarray) -> np.ndarray:

@@ -20,7 +20,6 @@ from .chart import Chart, automatic_chart, chart_problem
 from .model import ControlModel, control_problem, surface_problem
 
 KIND, VERSION = "control model", 1
-WHAT = "a GLB file with one mesh that hangs on joints"
 STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
 
 
@@ -77,9 +76,10 @@ def _load(path: Path) -> ControlModel:
 
 
 def _read_skinned(path: Path) -> ControlModel:
-    data = storage.read_bytes(path, WHAT, MeshFileError)
+    what = "a GLB file with one mesh that hangs on joints"
+    data = storage.read_bytes(path, what, MeshFileError)
     tree, binary = glb.chunks_of(path, data)
-    with storage.taking_apart(path, WHAT, MeshFileError):
+    with storage.taking_apart(path, what, MeshFileError):
         # the one node with a mesh on joints, and its skin
         nodes = list(glb.nodes_of(tree))
         skinned = [node for _, node, _ in nodes if "mesh" in node and "skin" in node]

@@ -21,7 +21,6 @@ _PATTERNS = {
     7: [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)],
     8 + 3: [(3, 1, 4), (0, 3, 2), (3, 4, 2)], 8 + 6: [(4, 2, 5), (1, 4, 0), (4, 5, 0)],
     8 + 5: [(5, 0, 3), (2, 5, 1), (5, 3, 1)]}
-_DIAGONALS = {3: ((0, 4), (3, 2)), 6: ((1, 5), (4, 0)), 5: ((2, 3), (5, 1))}        # of the two ways
 PROBES = np.arange(1, 8) / 8                                # places along an edge where its displacement is looked at
 INNER = np.array([(2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4)]) / 6      # and in a triangle
 
@@ -110,7 +109,8 @@ def _split(now: _Corners, marked: np.ndarray, mesh: Mesh) -> _Corners:
     uv = np.concatenate([now.uv, 0.5 * now.uv[halved].sum(axis=1)])
     bary = np.concatenate([now.bary, middle], axis=1)
     pattern = marked @ np.array([1, 2, 4])
-    for number, ways in _DIAGONALS.items():                 # of two diagonals the shorter
+    diagonals = {3: ((0, 4), (3, 2)), 6: ((1, 5), (4, 0)), 5: ((2, 3), (5, 1))}  # of the two ways
+    for number, ways in diagonals.items():                 # of two diagonals the shorter
         which = np.flatnonzero(pattern == number)
         points = np.einsum("fkc,fcd->fkd", bary[which], mesh.corners[now.parent[which]])
         one, other = (np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in ways)

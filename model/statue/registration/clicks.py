@@ -14,8 +14,6 @@ from scanprep.geometry.surface import check_surface
 
 from ..control.model import ControlModel
 
-WANTED = 'features {name: [x, y, z]} or {name: {"ray": [[x, y, z], [x, y, z]], "depth": d}}'
-
 
 def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | None = None
                   ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -46,8 +44,9 @@ def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | Non
 def _read_clicks(path: Path, unit: str | None) -> tuple[dict[str, tuple[np.ndarray, np.ndarray, float]],
                                                         dict[str, np.ndarray]]:
     """Origin, direction and depth of the clicks of a file, and its plain places; nothing where it has no click."""
-    tree, metre = read_json(path, WANTED), metres_of(unit)
-    with taking_apart(path, WANTED):
+    wanted = 'features {name: [x, y, z]} or {name: {"ray": [[x, y, z], [x, y, z]], "depth": d}}'
+    tree, metre = read_json(path, wanted), metres_of(unit)
+    with taking_apart(path, wanted):
         if not isinstance(tree, dict) or not any(isinstance(one, dict) and "ray" in one for one in tree.values()):
             return {}, {}
         rays, places = {}, {}
