@@ -74,7 +74,7 @@ def clicking(app):
     told = []
     script = START % CONNECTION.read_text(encoding="utf-8").replace("export function", "function")
     with Server(app, say=told.append, script=script, style="body { color: navy }") as server:
-        server.residuals_of_trusted = told
+        server.told = told
         yield server
         app.go.set()
 

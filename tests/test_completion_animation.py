@@ -121,7 +121,7 @@ def body(subject, layout):
 
 def smooth_step(body, x, targets):
     weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
-    return body.smoothed(x, PLAIN.inertia(100.0, 15), body.system, targets, weights)
+    return body.smooth_step(x, PLAIN.inertia(100.0, 15), body.system, targets, weights)
 
 
 def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
@@ -144,7 +144,7 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
     rows.append(D)
     values.append((np.sqrt(stiffness) * np.diff(body.step_to(x[:-1], x[1:]), axis=0)).ravel())
     step = -np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0].reshape(5, 15)
-    got = body.smoothed(x, stiffness, body.system, targets, weights)
+    got = body.smooth_step(x, stiffness, body.system, targets, weights)
     assert np.abs(step).max() > 0.01
     np.testing.assert_allclose(got[:, -3:] - x[:, -3:], step[:, -3:], atol=1e-5)
 

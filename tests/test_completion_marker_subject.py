@@ -87,7 +87,7 @@ def test_loose_markers_are_found_where_they_are(model, layout):
         usual = int(layout.vertices[row][np.argmax(layout.weights[row])])
         far = np.linalg.norm(rest_at - rest_at[usual], axis=1)
         true[layout.labels[row]] = int(np.argmin(np.where(part == part[usual], np.abs(far - 0.1), np.inf)))
-    _, sequence = carried(model, layout.moved(true), BETAS)
+    _, sequence = carried(model, layout.with_places(true), BETAS)
     found = find_person(model, sequence, layout, CONFIG)
     stays = find_person(model, sequence, replace(layout, loose=()), CONFIG)
     places = found.layout.place(model.template)

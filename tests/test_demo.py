@@ -77,7 +77,7 @@ def test_every_seed_of_the_default_demo_finds_the_parts_by_name(light_person, se
     """Its poses as registration leaves them, some millimetres along the skin: the search is that of `prep run`."""
     person, mesh, vertices = light_person
     rng = np.random.default_rng(seed)
-    poses = [person.posed(subject_pose(k, np.random.default_rng([seed, 1, k]))[1])[vertices]
+    poses = [person.in_pose(subject_pose(k, np.random.default_rng([seed, 1, k]))[1])[vertices]
              for k in range(DemoConfig().poses)]
     skeleton = find_skeleton(mesh, slid_poses(mesh, np.stack(poses), 0.005, rng), PrepareConfig().skeleton)
     assert set(skeleton.names) >= NEEDED, skeleton.names

@@ -149,7 +149,7 @@ def test_soles_on_the_ground_and_face_to_the_viewer(person, turn):
     R = rotations.exp(np.array([0, 0, turn]))
     poses, trans = swaying(person)
     poses[:, 0] *= 0.1
-    before = person.moved(R, np.array([3.0, 4, 5]))
+    before = person.transform(R, np.array([3.0, 4, 5]))
     turns = poses @ R.T
     turns[:, 0] = rotations.log(rotations.exp(turns[:, 0]) @ rotations.exp(np.array([0, 0, 2.0])))
     rig, new, places = for_programs(before, turns, trans, 2, "vl5", None, ground=True, front=True)

@@ -114,7 +114,7 @@ def test_a_turned_rig_moves_as_the_turned_body(model, rig, up):
     assert np.allclose(U @ U.T, np.eye(3)) and np.linalg.det(U) > 0 and np.allclose(U @ np.eye(3)[up], [0, 1, 0])
     rng = np.random.default_rng(1)
     pose, trans = random_poses(model, 1, rng)[0], rng.normal(size=3)
-    assert np.abs(rig.turned(up).vertices(pose @ U.T, U @ trans) - rig.vertices(pose, trans) @ U.T).max() < 1e-12
+    assert np.abs(rig.with_up(up).vertices(pose @ U.T, U @ trans) - rig.vertices(pose, trans) @ U.T).max() < 1e-12
 
 
 def test_a_skinning_model_keeps_its_weights(model):

@@ -132,8 +132,8 @@ def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies
 
 def test_killed_twice_in_the_poses(bodies, monkeypatch):
     undisturbed = learned(bodies, "a.npz", refinements=3)
-    killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
-    killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the second
+    killed(scape, "_refine", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
+    killed(scape, "_refine", 1, words(bodies, "b.npz", refinements=3))       # after the second
     real, calls = scape._refine, []
     monkeypatch.setattr(scape, "_refine", lambda *given, **named: calls.append(1) or real(*given, **named))
     monkeypatch.setattr(scape, "by_edges", None)
@@ -142,7 +142,7 @@ def test_killed_twice_in_the_poses(bodies, monkeypatch):
 
 
 @pytest.mark.parametrize("kind, module, name, after", [
-    ("skinning", skinning, "_with_joints", 2), ("skinning", skinning, "_unposed_person", 3),
+    ("skinning", skinning, "_with_joints", 2), ("skinning", skinning, "_unpose_person", 3),
     ("blendscape", scape, "shape_gradients", 2)])
 def test_every_kind_goes_on(bodies, kind, module, name, after):
     given = ["--kind", kind]
@@ -163,8 +163,8 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
 
     assert run(learn, "scape learn", given("a.npz")) == 0
     killed(restarts, "_search", 1, given("b.npz"))                              # after the first restart
-    killed(parts, "_left_out_error", 0, given("b.npz"))                           # after the last
-    killed(parts, "_tried", 1, given("b.npz"))                                    # before more parts are tried
+    killed(parts, "_leave_out_error", 0, given("b.npz"))                           # after the last
+    killed(parts, "_try_parts", 1, given("b.npz"))                                    # before more parts are tried
     tried, real = [], parts._try_parts
     monkeypatch.setattr(parts, "_try_parts", lambda *given: tried.append(given[1]) or real(*given))
     monkeypatch.setattr(restarts, "_search", lambda search: pytest.fail("searched again"))

@@ -228,7 +228,7 @@ def test_derivatives_are_finite_differences(person, tapes, smooth, monkeypatch):
 def test_moved_limbs_are_told(person, tapes):
     pose = np.zeros((16, 3))
     pose[4, 1] = 1.2
-    assert [line.split(" is ")[0] for line in measure(person.posed(pose), tapes).turned] == [
+    assert [line.split(" is ")[0] for line in measure(person.in_pose(pose), tapes).turned] == [
         "the left upper arm", "the left forearm"]
 
 

@@ -45,7 +45,7 @@ def person() -> SyntheticPerson:
 
 @pytest.fixture(scope="module")
 def kicking(person) -> Mesh:
-    return person.mesh.with_vertices(person.posed(find_pose("kick_left")))
+    return person.mesh.with_vertices(person.in_pose(find_pose("kick_left")))
 
 
 @pytest.fixture(scope="module")

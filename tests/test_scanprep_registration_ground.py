@@ -136,7 +136,7 @@ def views(person):
     yield "ankles", whole, cut(whole, 0.1)
     yield "front", whole, cut(whole.submesh(whole.face_normals[:, 1] < 0)[0], 0.004)
     yield "no feet", whole, whole.submesh((x[whole.faces, 2] > 0.9).all(axis=1))[0]
-    jump = whole.with_vertices(person.posed(find_pose("kick_left")))
+    jump = whole.with_vertices(person.in_pose(find_pose("kick_left")))
     yield "kick", jump, jump.submesh(jump.face_normals[:, 2] > -0.9)[0]
     head = x[:, 2].max() - 0.01
     yield "crown", whole, whole.submesh((x[whole.faces, 2] < head).all(axis=1))[0]

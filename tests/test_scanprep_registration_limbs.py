@@ -51,7 +51,7 @@ def test_angles_are_those_that_a_joint_was_given(person):
 
 @pytest.mark.parametrize("name", NAMED_POSES[::7])
 def test_what_people_do_is_not_doubted(person, parts, name):
-    turned = person.posed(find_pose(name)) @ rotations.exp(np.array([0.3, -2.0, 0.5])).T
+    turned = person.in_pose(find_pose(name)) @ rotations.exp(np.array([0.3, -2.0, 0.5])).T
     assert not words(person, parts, turned)
 
 
@@ -60,7 +60,7 @@ def test_what_people_do_is_not_doubted(person, parts, name):
 def test_a_limb_rolled_about_its_own_axis_is_told(person, parts, part, name, parent):
     pose, p = np.zeros((len(PARTS), 3)), PARTS.index(part)
     pose[p] = np.radians(150) * frames()[p, 0]
-    first = words(person, parts, person.posed(pose))[0]
+    first = words(person, parts, person.in_pose(pose))[0]
     assert first.startswith(f"the {name} is rolled by ") and first.endswith(f" degrees against the {parent}")
     assert 130 < int(first.split(" by ")[1].split()[0]) < 165        # skin lags behind bones
 
@@ -127,7 +127,7 @@ def test_a_hand_bent_at_the_wrist_is_found(person):
     mine = np.flatnonzero(person.part_of_vertex[end.vertices] == hand)
     for axis, degrees in ((1, 50), (1, 80), (2, -40), (2, 80)):    # farther back: as one turned over
         pose[hand] = np.radians(degrees) * frames()[hand, axis]
-        scan = template.with_vertices(person.posed(pose))
+        scan = template.with_vertices(person.in_pose(pose))
         tried = rotate_ends(template, end, template.vertices, RigidFit(target_of(scan), size(template)))
         off = min(np.linalg.norm(places[mine] - scan.vertices[end.vertices[mine]], axis=1).mean() for places in tried)
         assert off < 0.025, (axis, degrees)

@@ -110,7 +110,7 @@ def test_a_motion_is_found_from_where_it_took_the_template(person):
 
 def test_a_limb_rolls_about_its_bone_and_nothing_else_moves(person, parts):
     graph = build_graph(person.mesh, 300)
-    body = person.posed(find_pose("run"))
+    body = person.in_pose(find_pose("run"))
     start, angles = motion_of(graph, body), np.zeros(len(PARTS))
     np.testing.assert_allclose(roll_parts(graph, start, person.mesh, parts, body, angles).positions, start.positions,
                                atol=1e-12)
@@ -130,7 +130,7 @@ def test_a_limb_rolls_about_its_bone_and_nothing_else_moves(person, parts):
 
 @pytest.mark.parametrize("part, angle", [(FOREARM, np.pi), (SHIN, 2.5)])
 def test_a_limb_rolled_in_a_registration_is_put_right(person, parts, part, angle):
-    body = person.posed(find_pose("run"))
+    body = person.in_pose(find_pose("run"))
     scan = person.mesh.with_vertices(body)
     before = registration(person, scan, with_rolled_skin(person, body, part, angle))
     told = []
@@ -143,7 +143,7 @@ def test_a_limb_rolled_in_a_registration_is_put_right(person, parts, part, angle
 
 
 def test_shins_rolled_on_both_sides_mean_that_left_and_right_are_exchanged(person, parts):
-    body = person.posed(find_pose("run"))
+    body = person.in_pose(find_pose("run"))
     one = with_rolled_skin(person, body, SHIN, 2.3)
     both = with_rolled_skin(person, one, MIRROR_PART[SHIN], -2.3)
     assert find_exchanged_sides(person.mesh, parts, body) is find_exchanged_sides(person.mesh, parts, one) is None
@@ -151,7 +151,7 @@ def test_shins_rolled_on_both_sides_mean_that_left_and_right_are_exchanged(perso
 
 
 def test_what_needs_no_repair_stays(person, parts):
-    body = person.posed(find_pose("run"))
+    body = person.in_pose(find_pose("run"))
     scan = person.mesh.with_vertices(body)
     right, wrong = (registration(person, scan, x) for x in (body, with_rolled_skin(person, body, FOREARM, np.pi)))
     assert repair_limbs(person.mesh, scan, right, parts, config=QUICK) is right
@@ -162,7 +162,7 @@ def test_what_needs_no_repair_stays(person, parts):
 
 def test_fewer_doubts_are_not_bought(person, parts):
     """Not with the scan, the landmarks or the shape of the body."""
-    body = person.posed(find_pose("run"))
+    body = person.in_pose(find_pose("run"))
     scan = person.mesh.with_vertices(body)
     right, wrong = (registration(person, scan, x) for x in (body, with_rolled_skin(person, body, FOREARM, np.pi)))
     marked = [replace(fit, landmark_rms=0.002) for fit in (right, wrong)]

@@ -26,7 +26,7 @@ def person():
 
 @pytest.fixture(scope="module")
 def poses(person):
-    return np.stack([person.posed(find_pose(name)) for name in ("sitting", "twist_left", "bow", "run", "boxer")])
+    return np.stack([person.in_pose(find_pose(name)) for name in ("sitting", "twist_left", "bow", "run", "boxer")])
 
 
 def faces(skeleton, name):

@@ -134,14 +134,14 @@ def test_left_and_right_are_mirror_images(bodies):
 def test_mirrored_pose_gives_the_mirrored_body(man):
     twin = topology.load_topology().mirror
     pose = people.find_pose("throw_right")
-    assert np.abs(man.posed(people.mirror_synthetic_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 1e-9
+    assert np.abs(man.in_pose(people.mirror_synthetic_pose(pose))[twin] * [-1, 1, 1] - man.in_pose(pose)).max() < 1e-9
 
 
 def test_joints_lie_inside_the_body(bodies):
     for person in bodies:
         pose = people.find_pose("run")
         for mesh, joints in ((person.mesh, person.joints),
-                             (person.mesh.with_vertices(person.posed(pose)), person.joints_in_pose(pose))):
+                             (person.mesh.with_vertices(person.in_pose(pose)), person.joints_in_pose(pose))):
             inside = igl.fast_winding_number(mesh.vertices, mesh.faces, np.ascontiguousarray(joints))
             assert (np.asarray(inside) > 0.5).all(), np.array(PARTS)[np.asarray(inside) < 0.5]
 
@@ -189,7 +189,7 @@ def test_shapes_that_nobody_has_are_refused(given, why):
 
 def test_pose_zero_is_rest(bodies):
     for person in bodies[:2]:
-        assert np.abs(person.posed(np.zeros((16, 3))) - person.mesh.vertices).max() < 1e-9
+        assert np.abs(person.in_pose(np.zeros((16, 3))) - person.mesh.vertices).max() < 1e-9
 
 
 def test_turning_the_root_turns_the_body(man):
@@ -197,15 +197,15 @@ def test_turning_the_root_turns_the_body(man):
     turned = pose.copy()
     R = rotations.exp(np.array([0.4, -0.9, 1.3]))
     turned[0] = rotations.log(R @ rotations.exp(pose[0]))
-    expected = (man.posed(pose) - man.joints[0]) @ R.T + man.joints[0] + [1, 2, 3]
-    assert np.abs(man.posed(turned, np.array([1.0, 2, 3])) - expected).max() < 1e-9
+    expected = (man.in_pose(pose) - man.joints[0]) @ R.T + man.joints[0] + [1, 2, 3]
+    assert np.abs(man.in_pose(turned, np.array([1.0, 2, 3])) - expected).max() < 1e-9
     joints = (man.joints_in_pose(pose) - man.joints[0]) @ R.T + man.joints[0]
     assert np.abs(man.joints_in_pose(turned) - joints).max() < 1e-9
 
 
 def test_root_part_stays_centred(man):
     for name in ("squat", "run"):
-        v = man.posed(people.find_pose(name))
+        v = man.in_pose(people.find_pose(name))
         assert np.abs(v[man.part_of_vertex == 0].mean(axis=0) - man.joints[0]).max() < 1e-9
 
 
@@ -214,7 +214,7 @@ def test_parts_follow_their_rotations(man):
     for name in ("run", "point_right", "kick_left"):
         pose = people.find_pose(name)
         R = man.part_rotations(pose)
-        fitted = man.skeleton.fit_rotations(man.mesh, man.posed(pose))
+        fitted = man.skeleton.fit_rotations(man.mesh, man.in_pose(pose))
         angle = np.degrees(np.linalg.norm(rotations.log(np.swapaxes(R, 1, 2) @ fitted), axis=1))
         assert np.median(angle) < 3 and angle.max() < 15, dict(zip(PARTS, angle.round(1), strict=True))
 
@@ -222,7 +222,7 @@ def test_parts_follow_their_rotations(man):
 def test_posing_is_not_linear_blend_skinning(man):
     """What the best linear blend of the parts' rigid motions leaves over, vertex by vertex."""
     poses = [people.find_pose(name) for name in NAMED_POSES]
-    posed = np.stack([man.posed(pose) for pose in poses])
+    posed = np.stack([man.in_pose(pose) for pose in poses])
     affine = np.empty((len(poses), 16, 3, 4))
     for k, pose in enumerate(poses):
         R, place = man._poser.part_motion(pose)
@@ -260,7 +260,7 @@ def test_raised_arms_raise_the_shoulders(man):
 
 @pytest.mark.parametrize("name", NAMED_POSES)
 def test_named_poses_keep_the_volume_and_do_not_collapse(man, name):
-    mesh = man.mesh.with_vertices(man.posed(people.find_pose(name)))
+    mesh = man.mesh.with_vertices(man.in_pose(people.find_pose(name)))
     assert abs(mesh.volume / man.mesh.volume - 1) < 0.09
     stretch = mesh.edge_lengths / man.mesh.edge_lengths
     assert np.percentile(stretch, 0.5) > 0.25 and np.percentile(stretch, 99.9) < 3.0
@@ -294,7 +294,7 @@ def test_walk_goes_ahead_with_a_foot_on_the_floor(man):
     assert poses.shape == (44, 16, 3) and trans.shape == (44, 3)
     assert 0.8 < -(trans[-1, 1] - trans[0, 1]) / (43 / 20) < 2.0            # metres a second, towards -y
     assert (-np.diff(trans[:, 1]) * 20).min() > 0.6, "nobody steps back between the feet"
-    lowest = np.array([(man.posed(p, t))[:, 2].min() for p, t in zip(poses[::4], trans[::4], strict=True)])
+    lowest = np.array([(man.in_pose(p, t))[:, 2].min() for p, t in zip(poses[::4], trans[::4], strict=True)])
     assert np.abs(lowest).max() < 0.03
     once, _ = people.synthesise_walk(1, rate=20.0)
     again, _ = people.synthesise_walk(23, rate=20.0)
@@ -319,5 +319,5 @@ def test_landmarks_and_markers(bodies):
 def test_the_poses_of_the_demonstration_are_ones_that_people_do(man):
     """No limb lies so that its registration would be doubted, whatever the seed."""
     poses = [subject_pose(k, np.random.default_rng([seed, 1, k]))[1] for seed in range(6) for k in range(1, 12)]
-    bodies = np.stack([man.posed(pose) for pose in poses])
+    bodies = np.stack([man.in_pose(pose) for pose in poses])
     assert not angle_excess(anatomical_angles(man.skeleton.fit_rotations(man.mesh, bodies))).any()

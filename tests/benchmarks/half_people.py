@@ -53,7 +53,7 @@ def nearest(bodies: list[Any], cloud: Any, landmarks: tuple[np.ndarray, np.ndarr
     """
     from scanprep.geometry import rotations
 
-    scan, best = cloud.thinned(800), (np.inf, np.zeros(0), -1)
+    scan, best = cloud.thin(800), (np.inf, np.zeros(0), -1)
     for i, body in enumerate(bodies):
         R, t = rotations.procrustes(landmarks[1], body.points[landmarks[0]])
         for _ in range(7):

@@ -54,7 +54,7 @@ def half_views(model: Any, own: np.ndarray, people: list[Any]) -> dict[str, floa
     marks = {name: here[v] for name, v in landmarks().items() if v in here}
     rows = []
     for k, (person, pose) in enumerate(people):
-        body = model.template.with_vertices(person.posed(pose)[own])
+        body = model.template.with_vertices(person.in_pose(pose)[own])
         view = half_view(body, k, marks, np.random.default_rng(k))
         found, seconds = tried(lambda: complete(model, view.points, view.landmarks))                    # noqa: B023
         off = np.linalg.norm(found.completed.vertices - body.vertices, axis=1)
@@ -80,7 +80,7 @@ def walking(model: Any, own: np.ndarray, people: list[Any], frames: int) -> dict
     poses, trans = synthesise_walk(frames, RATE)
     rows: dict[str, list[Any]] = {"markers, shape known": [], "MoSh": []}
     for person, _ in people[:2]:
-        bodies = np.stack([person.posed(pose, t)[own] for pose, t in zip(poses, trans, strict=True)])
+        bodies = np.stack([person.in_pose(pose, t)[own] for pose, t in zip(poses, trans, strict=True)])
         seen = MarkerSequence(np.stack([layout.place(model.template.with_vertices(y)) for y in bodies]),
                               layout.labels, RATE)
         subject = model.subject(fit_shape(model, person.mesh.vertices[own]).betas)
