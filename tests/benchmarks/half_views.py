@@ -96,13 +96,13 @@ def main() -> None:
     data = load_real()
     model = load_model(args.model) if args.model else learned(data, args.people, args.fold)
     bodies = data.shapes[spring_split(len(data.shapes))[1]] if args.people else data.poses[scape_fold(args.fold)[1]]
-    subject = model if args.people or args.from_paper else model.subject(None)      # the paper's way takes models only
+    subject = model if args.people or args.published else model.subject(None)      # the paper's way takes models only
     part = model.skeleton.part_of_vertex(data.template)
     rows = []
     for k in args.only if args.only is not None else range(len(bodies)):
         body = data.template.with_vertices(bodies[k])
         view = half_view(body, k, data.landmarks, np.random.default_rng(k))
-        config = CompletionConfig.from_paper() if args.from_paper else CompletionConfig()
+        config = CompletionConfig.from_paper() if args.published else CompletionConfig()
         config = dataclasses.replace(config, viewpoint=tuple(view.camera) if args.known_viewpoint else None)
         start, cpu = time.perf_counter(), time.process_time()
         result = complete(subject, view.points, view.landmarks if args.marks else None, config)

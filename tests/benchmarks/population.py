@@ -87,7 +87,7 @@ def main() -> None:
     args = parser.parse_args()
     report: dict[str, object] = {"machine": machine()}
     for sex in SEXES:
-        found = drawn(sex, args.find_matches, args.crossed)
+        found = drawn(sex, args.drawn, args.crossed)
         report[sex] = found | ({"made_anew": made_anew(args.rows, sex)} if args.rows else {})
         print(sex, json.dumps(report[sex]), flush=True)
     write_report(args.output, report)

@@ -130,7 +130,7 @@ def main() -> None:
     data = load_real()
     poses, men = (tuple(int(k) for k in text.split(",") if k) if text is not None else default
                   for text, default in zip((args.poses, args.men), SETS[args.chosen], strict=True))
-    config = replace(RegistrationConfig.from_paper() if args.from_paper else RegistrationConfig(), method=args.method)
+    config = replace(RegistrationConfig.from_paper() if args.published else RegistrationConfig(), method=args.method)
     parts = person_parts(data.template)
     assert parts is not None, "the template is a person"
     lead = lead_of(data.template, args.through) if len(MARKS[args.marks]) < FEW else None
@@ -149,7 +149,7 @@ def main() -> None:
             print(f"{row['scan']}: {row['verdict']}")
     print("flags:", told)
     if args.output:
-        write_report(args.output, {"marks": args.marks, "front": args.front, "published": args.from_paper,
+        write_report(args.output, {"marks": args.marks, "front": args.front, "published": args.published,
                                  "through": args.through if lead else "none",
                                  "method": args.method,
                                  "machine": machine(), "summary": summary, "flags": told, "rows": rows})
