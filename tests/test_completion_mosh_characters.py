@@ -7,9 +7,16 @@ from cartoons import CARTOONS, CartoonShape, cartoon
 from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
-from completion import Motion, deformation, motion_pictures, retarget_soft_tissue
+from completion import Motion, motion_pictures
 from completion.mocap.retargeting.retarget import world_up
-from completion.mocap.retargeting.soft_tissue import Creases, moving_character, picture_transfer, write_character
+from completion.mocap.retargeting.soft_tissue import (
+    Creases,
+    deformation,
+    moving_character,
+    picture_transfer,
+    retarget_soft_tissue,
+    write_character,
+)
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from model.fitting.bodies import at_rest
 from model.posing.character import CharacterConfig, character_model, points_inside

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion import MarkerLayout, MarkerSequence, mosh_by_sex
-from completion.mocap.mosh.mosh import MoshConfig, check_models
+from completion import MarkerLayout, MarkerSequence
+from completion.mocap.mosh.mosh import MoshConfig, check_models, mosh_by_sex
 from completion.mocap.subject.person import PersonConfig
 from model.learning.sexes import PLANE, learn_sex_plane
 

@@ -52,15 +52,18 @@ def test_many_people_at_once(model):
 def test_sums_sizes_and_types(model):
     rng = np.random.default_rng(0)
     pose, (one, other) = random_poses(model, 1, rng)[0], (model.operator(rng.normal(size=3)) for _ in range(2))
-    np.testing.assert_allclose(one.plus(-0.5, other).relative_positions(pose), one.relative_positions(pose) - 0.5 * other.relative_positions(pose),
+    np.testing.assert_allclose(one.plus(-0.5, other).relative_positions(pose),
+                               one.relative_positions(pose) - 0.5 * other.relative_positions(pose),
                                rtol=0, atol=1e-12)
-    np.testing.assert_allclose(one.scale_by(1.3).relative_positions(pose), 1.3 * one.relative_positions(pose), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.scale_by(1.3).relative_positions(pose), 1.3 * one.relative_positions(pose), rtol=0,
+                               atol=1e-12)
     half = one.astype(np.float32)
     assert half.relative_positions(pose).dtype == np.float32
     np.testing.assert_allclose(half.relative_positions(pose), one.relative_positions(pose), rtol=0, atol=3e-6)
     mixed = rng.dirichlet(np.ones(5), 4) @ np.eye(one.count)[rng.choice(one.count, 5)]
     for asked in (one, replace(one)):                    # a second one without the products that the first has made
-        np.testing.assert_allclose(asked.combine(mixed).relative_positions(pose), one.relative_positions(pose) @ mixed.T, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(asked.combine(mixed).relative_positions(pose),
+                                   one.relative_positions(pose) @ mixed.T, rtol=0, atol=1e-12)
         assert one.products.count == one.count
 
 
@@ -71,15 +74,18 @@ def test_points_of_free_shape(model):
     ids = np.array([17, 3, 250])
     other, whole = model.points(ids), model.everywhere
     both = whole.concatenate(other).operator(betas).relative_positions(pose)
-    np.testing.assert_allclose(both[:, :whole.count], whole.operator(betas).relative_positions(pose), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(both[:, :whole.count], whole.operator(betas).relative_positions(pose), rtol=0,
+                               atol=1e-12)
     np.testing.assert_allclose(both[:, whole.count:], both[:, ids], rtol=0, atol=1e-12)
     np.testing.assert_allclose(both[:, whole.count:].T, model.vertices_of(pose, betas)[ids], rtol=0, atol=1e-12)
     assert whole.combine(np.zeros((0, whole.count))).operator(betas).relative_positions(pose).shape == (3, 0)
     mixed = np.random.default_rng(1).dirichlet(np.ones(whole.count), 2)
-    np.testing.assert_allclose(whole.combine(mixed).operator(betas).relative_positions(pose), both[:, :whole.count] @ mixed.T,
+    np.testing.assert_allclose(whole.combine(mixed).operator(betas).relative_positions(pose),
+                               both[:, :whole.count] @ mixed.T,
                                rtol=0, atol=1e-12)
     turned = whole.along(np.eye(3)[[2, 0]]).operator(np.array([0.5, 1.0]))
-    np.testing.assert_allclose(turned.relative_positions(pose), whole.operator(np.array([1.0, 0, 0.5])).relative_positions(pose), rtol=0,
+    np.testing.assert_allclose(turned.relative_positions(pose),
+                               whole.operator(np.array([1.0, 0, 0.5])).relative_positions(pose), rtol=0,
                                atol=1e-12)
 
 

@@ -7,7 +7,8 @@ import pytest
 from model_bodies import worm_model
 
 from completion.__main__ import main
-from model import load_built_in_model, sample_bodies
+from model import load_built_in_model
+from model.evaluation.sampling import sample_bodies
 from model.measurement.survey import survey
 from model.posing.cli import read_subject
 from model.shape_statistics import SEXES, draw_betas, list_sexes, shape_statistics
